@@ -78,6 +78,7 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
         if folder.is_done(number):
             status[number] = STATUS.index("done")
             metrics = read_json(place / METRICS, "metrics of a point")
+            # points may have different metrics: those of others are NaN
             for key, value in metrics.items():
                 if not key.startswith("timing."):
                     values.setdefault(key, np.full(total, np.nan))[number] = value
@@ -115,6 +116,7 @@ def _data_set(
             about["units"] = units[name]
         if scales.get(name):
             about["scale"] = scales[name]
+        # objects: NetCDF then stores text of any length
         coords[name] = (dim, np.array(found, object if isinstance(found[0], str) else None), about)
     if MEMBER in dims:
         coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})

@@ -318,6 +318,7 @@ class _Dispatch:
 
     def _submit(self, number: int) -> None:
         first, ready = self._renderings(number)
+        # a key of its own: dask returns the old result of a key that it knows
         future = self.client.submit(
             carry_out,
             self.path,
@@ -381,6 +382,7 @@ class _Dispatch:
             ) from error
         finally:
             future.release()
+        # the longest so far: a point is started if even that one would end in time
         self.longest = max(self.longest, outcome.seconds.get("total", 0.0))
         self.state.add(outcome)
         self.watch(self.state)
@@ -436,6 +438,7 @@ def _make_ready(client: Client, threads: int, *, own_cache: bool) -> None:
 
 
 def _has_dashboard() -> bool:
+    # without bokeh dask links to a page that only asks for it
     try:
         import bokeh  # noqa: F401
     except ImportError:

@@ -187,6 +187,7 @@ def _sampled(campaign: Campaign) -> Dimension:
     sample = campaign.sample
     assert sample is not None  # as `_dimensions` has asked
     kinds = {"sobol": qmc.Sobol, "latin_hypercube": qmc.LatinHypercube}
+    # the same points at every start of the campaign
     random = np.random.default_rng(campaign.seed or 0)
     unit = kinds[sample.method](len(sample.over), rng=random).random(sample.n)
     columns = [
@@ -238,6 +239,7 @@ def _refuse_overlaps(dimensions: Sequence[Dimension]) -> None:
 
 
 def _overlap(one: str, other: str) -> bool:
+    # a section overlaps its keys: the dots keep scan apart from scanner
     return f"{one}.".startswith(f"{other}.") or f"{other}.".startswith(f"{one}.")
 
 

@@ -104,6 +104,7 @@ def count(folder: CampaignFolder, number: int, status: Status) -> None:
     outcome = folder.outcome(number)
     if folder.is_done(number):
         status.add(outcome or Outcome("done", "", {}, 0, 0))
+    # before the outcome: a failed point that is tried again has both files
     elif (place / ATTEMPTS).is_file():
         status.running += 1
     elif outcome is not None:

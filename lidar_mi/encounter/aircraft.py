@@ -149,6 +149,7 @@ def loads_in_wind(
     """
     at = np.asarray(state.time if time is None else time, dtype=float)[..., None]
     to_path = attitude(state.roll, state.pitch, state.yaw).as_matrix()
+    # only x advances: a preview does not predict the aircraft's own motion across the path
     x, y, z = (strips.places @ to_path.T + np.array([state.x, state.y, state.z])).T
     found = wind(x + state.airspeed * (at - state.time), y, z, at)
     body = np.stack(np.broadcast_arrays(*found), -1) @ to_path
@@ -180,5 +181,6 @@ def deflected(
     change = target - deflection
     after = deflection + np.clip(change, -limits.rate * dt, limits.rate * dt)
     moved = np.abs(after - deflection)
+    # the rate of a control that the model does not have is 0
     time = np.divide(moved, limits.rate, out=np.zeros(3), where=limits.rate > 0)
     return after, np.minimum(time, dt)

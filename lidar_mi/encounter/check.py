@@ -154,6 +154,7 @@ def _first_slab(experiment: Experiment) -> Experiment:
     scan = experiment.scan.model_copy(
         update={"range": encounter.look_ahead, "thickness": gates.depth}
     )
+    # the preflight of a run then covers the instrument of the flight, too
     changes = {"encounter": None, "platform": platform, "scan": scan}
     ranged = at_the_slabs(experiment, gates)
     return ranged.model_copy(update=changes).read_from(experiment.folder)
@@ -178,6 +179,7 @@ def _strongest(experiment: Experiment, aircraft: AircraftModel) -> float:
     times = np.linspace(0, duration(encounter), _INSTANTS)
     loads = loads_in_wind(aircraft.strips, aircraft.state, wake.wind, aircraft.density, times)
     largest = float(np.abs(loads.moment[:, 0]).max())
+    # without ailerons any wake is too strong
     return largest / most if most else float("inf")
 
 

@@ -77,6 +77,7 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
     """
     level, cancel = wings_level(aircraft, levelling_time), cancelling(aircraft, None)
     limits, moments = aircraft.limits, aircraft.control_moments
+    # without an aileron that moves there is no roll to plan
     if not (moments[0, 0] and limits.deflection[0] and limits.rate[0]):
         return cancel
     has_others = bool(moments[:, 1:].any())

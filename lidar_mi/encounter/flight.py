@@ -17,6 +17,7 @@ from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
 from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
+from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.own_controller import name_of, own_controller
 from lidar_mi.encounter.preview import Lidar, WakeTracker, preview_in
 from lidar_mi.encounter.roll_model import RollModel
@@ -66,8 +67,6 @@ def aircraft_of(encounter: Encounter) -> AircraftModel:
     """The aircraft of an encounter at its start."""
     if encounter.aircraft.model == "roll":
         return RollModel(encounter.aircraft, encounter.path)
-    from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
-
     return JSBSimAircraft(encounter.aircraft, encounter.path)
 
 
@@ -126,6 +125,7 @@ def simulate_flights(
             tracker = WakeTracker(instrument, period, stride, _last_scan(encounter), recorder.add)
             found[mode] = fly(steering, preview_at=partial(tracker.preview, model))
             track, slabs = track_dataset(tracker.slabs, wake), recorder.dataset()
+    # from no help to all help; simulated in another order, so that the slow one comes last
     order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in found]
     series = flights_dataset({mode: found[mode] for mode in order})
     return FlightData(series.assign_attrs({CONTROLLER: name} if name else {}), track, slabs)

@@ -49,6 +49,7 @@ class EncounterFolder:
         self.path = Path(path)
         self.figures, self.log = self.path / FIGURES, self.path / LOG
         self.record = new_record(experiment, experiment.folder)
+        # trajectories depend on the version of JSBSim, where it is used
         if encounter_of(experiment).aircraft.model != "roll":
             self.record["versions"]["jsbsim"] = version("jsbsim")
         self.made_by = made_by(self.record)

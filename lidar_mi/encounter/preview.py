@@ -113,6 +113,7 @@ class WakeTracker:
         x, y, z, time = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
         away = [np.abs(x[..., None] - [one.x for one in t.slabs]).min(-1) for t in self._usable]
         nearest = np.argmin(away, axis=0)
+        # u stays 0: the pair of two images has no wind along the path
         u, v, w = found = np.zeros((3, *x.shape))
         for k, track in enumerate(self._usable):
             here = nearest == k

@@ -56,11 +56,13 @@ class RollModel:
         self.deflection, moving = deflected(self.deflection, commands, dt, self.limits)
         after = self.deflection[0]
         roll, rate = state.roll, state.roll_rate
+        # the aileron moves at its rate, then rests: the moment is linear in both parts
         for duration, start, end in ((moving[0], before, after), (dt - moving[0], after, after)):
             if duration > 0:
                 moments = loads.moment[0] + self.control_moments[0, 0] * np.array([start, end])
                 roll, rate = self._rolled(roll, rate, duration, *(moments / self.roll_inertia))
         time = state.time + dt
+        # not "beyond": a roll angle that is no number is an upset, too
         self.state = replace(
             state,
             time=time,

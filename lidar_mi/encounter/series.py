@@ -68,6 +68,7 @@ class FlightRecorder:
         """Record one instant: deflections in rad, moments per deflection in N m per rad."""
         row = {field.name: float(getattr(state, field.name)) for field in fields(state)}
         row |= _named(loads, "")
+        # every instant has all columns
         nothing = Loads(np.full(3, np.nan), np.full(3, np.nan))
         row |= _named(predicted or nothing, "predicted_")
         row |= {name: float(getattr(commands, name)) for name in _COMMANDS}
@@ -106,6 +107,7 @@ def _named(loads: Loads, prefix: str) -> dict[str, float]:
 
 def flights_dataset(flights: dict[str, xr.Dataset]) -> xr.Dataset:
     """Flights of the same duration as one data set, dims (flight, time)."""
+    # times of the flights of an encounter are equal to the last bit: a difference is a fault
     names = xr.DataArray(list(flights), dims="flight", attrs={"long_name": "what steers"})
     return xr.concat(list(flights.values()), names.rename("flight"), join="exact")
 
@@ -197,6 +199,7 @@ def _numbers(pair: VortexPairFit | None) -> dict[str, float]:
         k = PARAMETERS.index(name.replace("core_radius", "log_radius"))
         value = float(np.exp(pair.parameters[k]) if logarithm else pair.parameters[k])
         found[name] = value
+        # to first order the standard error of exp(q) is exp(q) times that of q
         found[f"{name}_stderr"] = float(stderr[k]) * (value if logarithm else 1.0)
     return found
 

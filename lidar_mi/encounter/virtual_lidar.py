@@ -166,6 +166,7 @@ class VirtualLidar:
             if self._store:
                 self._store.write(number, pose, scan)
         before, came_from = self._scans.get(number - 1), self._poses.get(number - 1)
+        # this scan for the next slab, the one before for a step that is repeated
         self._scans = {number: scan} | ({number - 1: before} if before else {})
         self._poses = {number: pose} | ({number - 1: came_from} if came_from else {})
         period = self.gates.period
@@ -210,6 +211,7 @@ class VirtualLidar:
     def _completion(self, x: float, midway: Midway, pose: AircraftPose) -> Completion:
         """The errors of a slab's wind by unknown pointing, and the origin of its lines of sight."""
         pointing, period = self.experiment.retrieval.pointing, self.gates.period
+        # an unknown rotation between the scans displaces the second image by range times angle
         return Completion(
             pointing.stderr * (self.gates.look_ahead - self.gates.stride / 2) / period,
             pointing.roll / period,
@@ -236,6 +238,7 @@ class VirtualLidar:
         plan = gates.plan(ahead)
         misalignment = pointing_error(experiment, number, number * gates.period)
         air = self.air.at_scan(number, (pose.y, pose.z), ahead, misalignment)
+        # a lidar of another variant may have been stepped meanwhile
         use_variant(experiment.render.variant)
         if self._renderer is None:
             self._renderer = self._renderer_of(air, plan, self._settings)
