@@ -107,6 +107,11 @@ def test_faults_are_one_line(changes, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
+def test_a_lidar_without_a_step_is_refused():
+    with pytest.raises(InputError, match="lidar: object is not allowed; expected Lidar or None"):
+        lm.fly(experiment(), lidar=object(), notice=silent)
+
+
 def test_off_needs_no_quotes(tmp_path):
     """YAML reads it as false."""
     path = tmp_path / "calm.yaml"

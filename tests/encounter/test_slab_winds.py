@@ -97,6 +97,21 @@ def test_a_wind_is_completed_where_it_is_found_and_the_next_starts_without(here,
         assert float(abs(off).max()) < 0.01
 
 
+def failing(wind):
+    raise ValueError("a completion that fails")
+
+
+@pytest.mark.parametrize("form", [InThisProcess, InOwnProcess])
+def test_a_fault_surfaces_with_the_result(drifting, form):
+    """Not as the wind is asked for: the vortices are fitted meanwhile."""
+    winds = form(ImageMethod.CC, WINDOWS)
+    images = drifting[0][0]
+    winds.prepare(FirstImage(images.first, DT, NOISE), None).result()
+    future = winds.retrieve(images.second, failing)
+    with pytest.raises(ValueError, match="a completion that fails"):
+        future.result()
+
+
 def test_what_limits_the_wind_of_most_vectors_is_said(drifting):
     """A pattern at rest as strong as the texture, and unrelated images."""
     images, random = drifting[0][0], np.random.default_rng(5)
