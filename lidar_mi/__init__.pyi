@@ -2,7 +2,7 @@
 
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
-from .encounter.fly import Flight, fly
+from .encounter.fly import Flights, fly
 from .encounter.pose import AircraftPose
 from .encounter.virtual_lidar import VirtualLidar
 from .errors import InputError
@@ -39,7 +39,7 @@ __all__ = [
     "Calibration",
     "Experiment",
     "Flag",
-    "Flight",
+    "Flights",
     "Gap",
     "InputError",
     "Rings",

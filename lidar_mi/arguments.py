@@ -21,6 +21,7 @@ _WORDS = {
     str: "text",
     bool: "True or False",
     types.NoneType: "None",
+    Any: "anything",
     Path: "a path (255 bytes a name)",
 }
 

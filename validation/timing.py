@@ -57,7 +57,7 @@ PATTERNS = {
 
 
 def wind_of(told, wind=WIND, pattern="raster", duration=DURATION, missed=(0.0, 0.0, 0.0)):
-    """Vectors of two scans; ``missed``: roll, pitch, yaw (rad) of scan 2 that nobody knows."""
+    """Vectors of two scans; ``missed``: unknown roll, pitch, yaw (rad) of scan 2."""
     plan = plan_scans(Scan(range="500 m"), Y, Z, [0.0])[0]
     count = Y.size * Z.size
     name = pattern.split()[0].lower()
@@ -163,7 +163,7 @@ def pointing(effort):
         )
     )
     text = "Air at rest, and a pose of scan 2 that differs from the reported one."
-    return Check("Pose that nobody knows", text, tuple(rows))
+    return Check("Unknown pointing error", text, tuple(rows))
 
 
 CHECKS = (duration, patterns, pointing)

@@ -20,6 +20,7 @@ from lidar_mi.progress import Notice
 
 STATUS = ("done", "failed", "missing")
 
+# Points between two notices.
 _EVERY = 200
 
 
@@ -55,8 +56,8 @@ def open_campaign(folder: str | Path) -> xr.Dataset:
 def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
     """Collect the metrics of all points, and write ``campaign.nc``.
 
-    The same points give the same file, whoever computed them and in whichever order. Durations are
-    left out: they are never the same.
+    The same points give the same file, by whichever workers and in whichever order they were
+    computed. Durations are omitted: they are never the same.
 
     Returns
     -------
@@ -77,6 +78,7 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
         if folder.is_done(number):
             status[number] = STATUS.index("done")
             metrics = read_json(place / METRICS, "metrics of a point")
+            # points may have different metrics: those of others are NaN
             for key, value in metrics.items():
                 if not key.startswith("timing."):
                     values.setdefault(key, np.full(total, np.nan))[number] = value
@@ -88,7 +90,14 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
     return data
 
 
-def _data_set(folder, values, status, messages, places) -> xr.Dataset:
+def _data_set(
+    folder: CampaignFolder,
+    values: dict[str, np.ndarray],
+    status: np.ndarray,
+    messages: np.ndarray,
+    places: np.ndarray,
+) -> xr.Dataset:
+    """The data set of arrays over all points, shape (points,)."""
     points, campaign = folder.points, folder.campaign
     dims = [one.name for one in points.dimensions]
     shape = points.shape
@@ -107,6 +116,7 @@ def _data_set(folder, values, status, messages, places) -> xr.Dataset:
             about["units"] = units[name]
         if scales.get(name):
             about["scale"] = scales[name]
+        # objects: NetCDF then stores text of any length
         coords[name] = (dim, np.array(found, object if isinstance(found[0], str) else None), about)
     if MEMBER in dims:
         coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})

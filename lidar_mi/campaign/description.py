@@ -1,8 +1,9 @@
 """The description of a campaign in YAML: which experiments, over which values, how often."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -26,21 +27,21 @@ class Span(Description):
     Attributes
     ----------
     linear, log : tuple of (number or text), optional
-        Both ends, on a linear or a logarithmic scale: one of the two is given.
+        Both ends, on a linear or a logarithmic scale: exactly one of the two.
     """
 
     linear: tuple[Any, Any] | None = None
     log: tuple[Any, Any] | None = None
 
     @model_validator(mode="after")
-    def _one_scale(self):
+    def _one_scale(self) -> Self:
         if (self.linear is None) == (self.log is None):
             raise ValueError("expected linear: [FIRST, LAST] or log: [FIRST, LAST]")
         first, last = self.ends()
         if first == last:
-            raise ValueError(f"{self._given()} is not allowed; expected two different ends")
+            raise ValueError(f"{self._ends()} is not allowed; expected two different ends")
         if self.log and not (first > 0 and last > 0):
-            raise ValueError(f"{self._given()} is not allowed; expected ends above 0 for log")
+            raise ValueError(f"{self._ends()} is not allowed; expected ends above 0 for log")
         return self
 
     @property
@@ -51,7 +52,7 @@ class Span(Description):
     @property
     def unit(self) -> str:
         """The unit of both ends, as it stands."""
-        return split_quantity(self._given()[0])[1]
+        return split_quantity(self._ends()[0])[1]
 
     def ends(self) -> tuple[float, float]:
         """Both ends in `unit`.
@@ -61,16 +62,16 @@ class Span(Description):
         ValueError
             No quantities, or of two units.
         """
-        (first, unit), (last, other) = map(split_quantity, self._given())
+        (first, unit), (last, other) = map(split_quantity, self._ends())
         if unit != other:
             raise ValueError(
-                f"{self._given()} is not allowed; expected one unit, not {unit or 'none'} and "
+                f"{self._ends()} is not allowed; expected one unit, not {unit or 'none'} and "
                 f"{other or 'none'}"
             )
         return first, last
 
     def at(self, fractions: list[float]) -> list[float]:
-        """Values at fractions of the interval, in `unit`; ends exact."""
+        """Values at fractions of the interval, in `unit`; ends without rounding."""
         first, last = self.ends()
         found = []
         for fraction in fractions:
@@ -86,9 +87,10 @@ class Span(Description):
         """Values at fractions of the interval, as an experiment file has them."""
         return [f"{v!r} {self.unit}" if self.unit else v for v in self.at(fractions)]
 
-    def _given(self) -> tuple[Any, Any]:
+    def _ends(self) -> tuple[Any, Any]:
+        """Both ends as they are written."""
         found = self.linear or self.log
-        assert found is not None
+        assert found is not None  # `_one_scale`
         return found
 
 
@@ -124,7 +126,8 @@ class Sample(Description):
     random: Literal["common", "independent"] = "common"
 
     @model_validator(mode="after")
-    def _balanced(self):
+    def _balanced(self) -> Self:
+        # Sobol points fill space evenly in numbers of 2^m alone
         if self.method == "sobol" and self.n & (self.n - 1):
             below = 1 << (self.n.bit_length() - 1)
             raise ValueError(
@@ -178,7 +181,7 @@ class Campaign(Description):
         return {str(key): _dimension(str(key), values) for key, values in value.items()}
 
     @model_validator(mode="after")
-    def _one_kind(self):
+    def _one_kind(self) -> Self:
         if self.sweep and self.sample:
             raise ValueError("sweep and sample: not allowed together; expected one of the two")
         if not self.sweep and not self.sample and self.members == 1:
@@ -190,7 +193,7 @@ class Campaign(Description):
         return self
 
 
-def _dimension(key: str, values: Any) -> Range | list | dict:
+def _dimension(key: str, values: Any) -> Range | list[Any] | dict[str, dict[str, Any]]:
     """One dimension of a sweep; a fault is a ValueError."""
     place = f"sweep.{key}"
     if isinstance(values, dict) and {"linear", "log", "n"} & set(values):
@@ -215,9 +218,10 @@ def _dimension(key: str, values: Any) -> Range | list | dict:
     return values
 
 
-def _check_list(place: str, values: list) -> None:
+def _check_list(place: str, values: list[Any]) -> None:
     """Values must differ and be of one unit."""
-    seen: list = []
+    # a list: values may be lists themselves, which no set holds
+    seen: list[Any] = []
     for value in values:
         if value in seen:
             raise ValueError(f"{place}: {value!r} twice is not allowed; expected each once")
@@ -289,8 +293,8 @@ def read_campaign(
     return checked_campaign(data, str(path))
 
 
-def _coarser(data: dict, coarse: dict) -> dict:
-    """A description with other values in some places; a list of names picks out of named sets."""
+def _coarser(data: dict[str, Any], coarse: dict[str, Any]) -> dict[str, Any]:
+    """A description with other values of some keys; a list of names selects named sets."""
     found, scales = dict(data), {"linear", "log"}
     for key, value in coarse.items():
         before = data.get(key)
@@ -303,10 +307,11 @@ def _coarser(data: dict, coarse: dict) -> dict:
     return found
 
 
-def checked_campaign(data: dict, origin: str) -> Campaign:
+def checked_campaign(data: Mapping[str, Any], origin: str) -> Campaign:
     """A campaign from a nested dictionary; errors as of `read_campaign`."""
     try:
         return Campaign.model_validate(data)
     except ValidationError as error:
+        # faults of a dimension name it already
         fault = first_fault(error, Campaign).replace("sweep: sweep.", "sweep.", 1)
         raise InputError(f"{origin}: {fault}") from None

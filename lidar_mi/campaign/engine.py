@@ -1,9 +1,9 @@
-"""A campaign on `dask.distributed`: points are handed out, results are files."""
+"""A campaign on `dask.distributed`: points are submitted to workers, results are files."""
 
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.campaign.collect import collect
 from lidar_mi.campaign.description import checked_campaign, read_campaign
-from lidar_mi.campaign.folder import CampaignFolder, create, read_base, signatures
+from lidar_mi.campaign.folder import CampaignFolder, Outcome, create, read_base, signatures
 from lidar_mi.campaign.points import Points
 from lidar_mi.campaign.spawning import (
     check_spawning,
@@ -33,7 +33,7 @@ from lidar_mi.experiment.shipped import campaign_file
 from lidar_mi.progress import Notice
 
 MOST_UNASKED = 100_000
-"""Points of a campaign that is run without being confirmed."""
+"""Points of a campaign that runs without a confirmation."""
 
 PATIENCE = 15.0
 """Seconds for a scheduler to answer."""
@@ -41,6 +41,7 @@ PATIENCE = 15.0
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 _TRIES = 10
+"""Workers that may be lost while they are made ready."""
 
 _AT_ONCE = 4
 """Tasks per thread that the scheduler holds: enough that no worker waits."""
@@ -48,13 +49,13 @@ _AT_ONCE = 4
 
 @dataclass(repr=False)
 class State(Status):
-    """How far a campaign is that is being computed.
+    """Progress of a running campaign.
 
     Attributes
     ----------
     started : float
         Clock at the start.
-    before : int
+    finished_before : int
         Points that were finished before this start.
     workers : int
     dashboard : str
@@ -62,15 +63,15 @@ class State(Status):
     """
 
     started: float = field(default_factory=time.monotonic)
-    before: int = 0
+    finished_before: int = 0
     workers: int = 0
     dashboard: str = ""
 
     def rate(self) -> float:
         """Points a second since the start; 0: none yet."""
-        return (self.finished - self.before) / max(time.monotonic() - self.started, 1e-9)
+        return (self.finished - self.finished_before) / max(time.monotonic() - self.started, 1e-9)
 
-    def left(self) -> float:
+    def remaining(self) -> float:
         """Seconds until the end at this rate."""
         rate = self.rate()
         return (self.total - self.finished) / rate if rate else float("nan")
@@ -82,30 +83,30 @@ Watcher = Callable[[State], None]
 
 @checked_arguments
 def run_campaign(
-    campaign: str | Path | dict,
+    campaign: str | Path | Mapping[str, Any],
     folder: str | Path | None = None,
     *,
-    client: Any = None,
+    client: Client | str | None = None,
     workers: int | None = None,
     threads: int = 1,
     quick: bool = False,
     confirmed: bool = False,
     lifetime: float | None = None,
     notice: Notice | None = None,
-    watch: Any = None,
+    watch: Watcher | None = None,
 ) -> xr.Dataset:
     """Run all points of a campaign that are not done, and collect them.
 
     Parameters
     ----------
-    campaign : path or dict
+    campaign : path or mapping
         A campaign file, the name of a shipped one, an experiment with variants, or the keys of a
         description.
     folder : path, optional
         Default: ``outputs/NAME``. A folder with a part of this campaign is completed.
-    client : distributed.Client, optional
-        Of any scheduler whose workers see this folder under the same path. Default: processes on
-        this machine.
+    client : distributed.Client or str, optional
+        Of any scheduler whose workers see this folder under the same path; or its address, or the
+        file that it wrote. Default: processes on this machine.
     workers : int, optional
         Processes on this machine. Default: one per core.
     threads : int
@@ -115,9 +116,9 @@ def run_campaign(
     confirmed : bool
         Also with more than 100 000 points.
     lifetime : float, optional
-        Seconds after which no further point is begun that would not end in time.
+        Seconds; no further point is started that would not end in time.
     notice : callable, optional
-        Called with what is done before the first point, and how far it is (0 to 1, or None).
+        Called with the running step before the first point, and its progress (0 to 1, or None).
     watch : callable, optional
         Called with a `State` whenever a point has ended.
 
@@ -148,7 +149,7 @@ def run_campaign(
 
 
 def prepare_campaign(
-    campaign: str | Path | dict | Points,
+    campaign: str | Path | Mapping[str, Any] | Points,
     folder: str | Path | None = None,
     *,
     quick: bool = False,
@@ -159,7 +160,7 @@ def prepare_campaign(
     """The folder of a campaign whose points were all checked; parameters of `run_campaign`."""
     if isinstance(campaign, Points):
         origin, points = campaign.campaign.name, campaign
-    elif isinstance(campaign, dict):
+    elif isinstance(campaign, Mapping):
         origin = "campaign"
         described = checked_campaign(campaign, origin)
         points = Points(described, *read_base(described, origin))
@@ -205,7 +206,7 @@ def connected(
         raise InputError(f"workers: {workers} is not allowed; expected 1 or more")
     notice(f"starting {count} workers", None)
     check_spawning(count)
-    # a point is given up by its own count of killed workers, not by that of the scheduler
+    # a point fails by its own count of killed workers, not by that of the scheduler
     settings: dict[str, Any] = {
         "distributed.scheduler.allowed-failures": 10**6,
         "distributed.scheduler.worker-saturation": 1.1,
@@ -239,7 +240,7 @@ def connected(
 def execute(
     folder: CampaignFolder, client: Client, *, watch: Watcher, lifetime: float | None = None
 ) -> State:
-    """Hand out the points that are not done, and wait for them.
+    """Submit the points that are not done, and wait for them.
 
     Returns
     -------
@@ -254,7 +255,8 @@ def execute(
             count(folder, number, state)
         else:
             waiting.append(number)
-    state.before = state.finished
+    state.finished_before = state.finished
+    # the slowest step is that of this start
     state.seconds.clear()
     watch(state)
     _Dispatch(folder, client, state, watch, lifetime).run(waiting)
@@ -262,24 +264,43 @@ def execute(
 
 
 class _Dispatch:
-    """The points in flight, and what has to be there first."""
+    """Submits points in their order, after the renderings that they share.
 
-    def __init__(self, folder, client, state, watch, lifetime):
+    Attributes
+    ----------
+    numbers : dict of Future to int
+        Points that the scheduler has.
+    shared : dict of str to Future
+        Renderings by their signature.
+    needed : dict of str to int
+        Number of unfinished points that need the images of a signature.
+    longest : float
+        Duration of the longest point, s.
+    """
+
+    def __init__(
+        self,
+        folder: CampaignFolder,
+        client: Client,
+        state: State,
+        watch: Watcher,
+        lifetime: float | None,
+    ) -> None:
         self.folder, self.client, self.state, self.watch = folder, client, state, watch
         self.path, self.session = str(folder.path.resolve()), uuid.uuid4().hex[:12]
         self.end = None if lifetime is None else state.started + lifetime
         self.longest = 0.0
-        self.numbers: dict[Future, int] = {}
-        self.shared: dict[str, Future] = {}
+        self.numbers: dict[Future[Outcome], int] = {}
+        self.shared: dict[str, Future[int]] = {}
 
     def run(self, waiting: list[int]) -> None:
         """All of some points, in their order."""
         self.needed = signatures(self.folder.index, waiting)
-        self.rest = iter(waiting)
-        self.flying = as_completed(loop=self.client.loop)
+        self.next = iter(waiting)
+        self.pending = as_completed(loop=self.client.loop)
         self._fill()
-        for future in self.flying:
-            self._land(future)
+        for future in self.pending:
+            self._finish(future)
             self._fill()
 
     def _fill(self) -> None:
@@ -289,14 +310,15 @@ class _Dispatch:
         while len(self.numbers) < _AT_ONCE * threads:
             if self.end is not None and time.monotonic() + self.longest > self.end:
                 break
-            number = next(self.rest, None)
+            number = next(self.next, None)
             if number is None:
                 break
-            self._launch(number)
+            self._submit(number)
         self.state.running = min(len(self.numbers), threads)
 
-    def _launch(self, number: int) -> None:
+    def _submit(self, number: int) -> None:
         first, ready = self._renderings(number)
+        # a key of its own: dask returns the old result of a key that it knows
         future = self.client.submit(
             carry_out,
             self.path,
@@ -308,9 +330,9 @@ class _Dispatch:
             pure=False,
         )
         self.numbers[future] = number
-        self.flying.add(future)
+        self.pending.add(future)
 
-    def _renderings(self, number: int) -> tuple[list[int], list[Future]]:
+    def _renderings(self, number: int) -> tuple[list[int], list[Future[int]]]:
         """Tasks that render what this point shares with others, each submitted once.
 
         Returns
@@ -319,13 +341,14 @@ class _Dispatch:
             Which of them were submitted for this point.
         tasks : list of Future
         """
-        signatures_ = self.folder.index[number].images
-        if all(self.needed[one] < 2 for one in signatures_):
+        images = self.folder.index[number].images
+        # most points share nothing: their experiment need not be made here
+        if all(self.needed[one] < 2 for one in images):
             return [], []
         stages = storing_stages(stages_of(self.folder.points.experiment(number)))
         first: list[int] = []
-        tasks: list[Future] = []
-        for signature, stage in zip(signatures_, stages, strict=True):
+        tasks: list[Future[int]] = []
+        for signature, stage in zip(images, stages, strict=True):
             if self.needed[signature] > 1 and signature not in self.shared:
                 first.append(len(tasks))
                 self.shared[signature] = self.client.submit(
@@ -341,13 +364,14 @@ class _Dispatch:
                 tasks.append(self.shared[signature])
         return first, tasks
 
-    def _land(self, future: Future) -> None:
+    def _finish(self, future: Future[Outcome]) -> None:
+        """Count the outcome of a point, and remove images that no other point needs."""
         number = self.numbers.pop(future)
         try:
             outcome = future.result()
         except KilledWorker:
             # of a scheduler that gives up before the point's own count does
-            self._launch(number)
+            self._submit(number)
             return
         except InputError:  # the folder, not the point
             raise
@@ -358,6 +382,7 @@ class _Dispatch:
             ) from error
         finally:
             future.release()
+        # the longest so far: a point is started if even that one would end in time
         self.longest = max(self.longest, outcome.seconds.get("total", 0.0))
         self.state.add(outcome)
         self.watch(self.state)
@@ -413,6 +438,7 @@ def _make_ready(client: Client, threads: int, *, own_cache: bool) -> None:
 
 
 def _has_dashboard() -> bool:
+    # without bokeh dask links to a page that only asks for it
     try:
         import bokeh  # noqa: F401
     except ImportError:

@@ -1,7 +1,7 @@
 """The folder of a campaign: its description, its points, images that points share.
 
-Files are the truth: a point is done when its folder has `metrics.json`. Whatever was killed while
-writing left no such file, and is done again.
+The state of a campaign is that of its files: a point is done when its folder has `metrics.json`.
+A process that is killed leaves no such file, and its point is done again.
 """
 
 import shutil
@@ -32,7 +32,7 @@ DATA, REPORT = "campaign.nc", "report.html"
 POINTS, IMAGES = "points", "images"
 ATTEMPTS = "attempts.txt"
 RUN = "run"
-"""Run folder in that of a point, if everything is kept."""
+"""Run folder in that of a point, with ``keep: everything``."""
 
 _SHORT = 20
 """Characters of a hash that name a folder: 80 bits, for which 10^7 points collide never."""
@@ -49,7 +49,7 @@ class Row(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a point.
+    """The outcome of a point.
 
     Attributes
     ----------
@@ -122,13 +122,13 @@ class CampaignFolder:
         return (self.place(number) / METRICS).is_file()
 
     def outcome(self, number: int) -> Outcome | None:
-        """What became of a point; None: nothing yet."""
+        """The outcome of a point; None: there is none yet."""
         return read_outcome(self.place(number))
 
     def drop_images(self, signature: str) -> None:
         """Remove images that no point needs any more."""
         shutil.rmtree(self.images(signature), ignore_errors=True)
-        with suppress(OSError):  # others are left in it
+        with suppress(OSError):  # it holds images of other signatures
             (self.path / IMAGES).rmdir()
 
     def claimed(self) -> AbstractContextManager[None]:
@@ -143,7 +143,7 @@ class CampaignFolder:
 
 
 def read_outcome(place: Path) -> Outcome | None:
-    """What became of the point in a folder; None: nothing yet."""
+    """The outcome of the point in a folder; None: there is none yet."""
     path = place / OUTCOME
     if not path.is_file():
         return None
@@ -155,7 +155,7 @@ def read_outcome(place: Path) -> Outcome | None:
 
 
 def write_outcome(place: Path, outcome: Outcome) -> None:
-    """Write what became of a point."""
+    """Write the outcome of a point."""
     write_text(place / OUTCOME, to_json(outcome._asdict()))
 
 
@@ -167,8 +167,8 @@ def read_base(campaign: Campaign, origin: str | Path) -> tuple[dict[str, Any], P
     InputError
         No such experiment; one with variants.
     """
-    beside = Path(origin).parent / campaign.base
-    path = beside if beside.is_file() else experiment_file(campaign.base)
+    neighbour = Path(origin).parent / campaign.base
+    path = neighbour if neighbour.is_file() else experiment_file(campaign.base)
     base = dict(reading.read_keys(path))
     variants = base.pop("variants", None)
     if variants and "variant" not in campaign.sweep:
@@ -205,6 +205,7 @@ def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder
         return found
     rows = _checked(points, notice)
     make_folder(folder)
+    # the record last: with it the folder is that of a campaign
     lines = [" ".join((row.point, *row.images)) for row in rows]
     write_text(folder / INDEX, "\n".join(lines) + "\n")
     write_text(folder / RECORD, to_yaml(record))
@@ -252,7 +253,7 @@ def _record(points: Points) -> dict[str, Any]:
     return {
         "campaign": points.campaign.model_dump(mode="json", exclude_defaults=True),
         "base": points.base,
-        "beside": str(points.beside),
+        "beside": str(points.search_path),
         "version": __version__,
     }
 
@@ -266,7 +267,7 @@ def _checked(points: Points, notice: Notice) -> list[Row]:
         if number % 100 == 0:
             notice(f"checking {len(points)} points", number / len(points))
         experiment = points.experiment(number)
-        row = _row(experiment, points.beside)
+        row = _row(experiment, points.search_path)
         if row.point in seen:
             raise InputError(
                 f"{_differing(points, seen[row.point], number)}: changes nothing between "
@@ -278,8 +279,8 @@ def _checked(points: Points, notice: Notice) -> list[Row]:
     return rows
 
 
-def _row(experiment: Experiment, beside: Path) -> Row:
-    record = new_record(experiment, beside)
+def _row(experiment: Experiment, search_path: Path) -> Row:
+    record = new_record(experiment, search_path)
     graph = stages_of(experiment)
     images = [made_by(record, graph.keys(stage)) for stage in storing_stages(graph)]
     return Row(made_by(record)[:_SHORT], tuple(images))

@@ -39,7 +39,7 @@ class Dimension:
     """
 
     name: str
-    labels: tuple
+    labels: tuple[Any, ...]
     changes: tuple[dict[str, Any], ...]
     named: bool
     scale: str = ""
@@ -53,7 +53,7 @@ class Points:
     campaign : Campaign
     base : dict
         Keys of the base experiment.
-    beside : path
+    search_path : path
         Folder in which files named by the experiments are searched first.
 
     Raises
@@ -62,8 +62,8 @@ class Points:
         Two dimensions that change one key.
     """
 
-    def __init__(self, campaign: Campaign, base: dict[str, Any], beside: str | Path):
-        self.campaign, self.beside = campaign, Path(beside)
+    def __init__(self, campaign: Campaign, base: dict[str, Any], search_path: str | Path) -> None:
+        self.campaign, self.search_path = campaign, Path(search_path)
         self.dimensions = tuple(_dimensions(campaign))
         # a name of a point is no part of what it is
         self.base = reading.merged(base, _nested(campaign.set))
@@ -105,9 +105,9 @@ class Points:
         independent = self.campaign.sample and self.campaign.sample.random == "independent"
         data = data | {"seed": member_seed(self.seed, member, *(index if independent else ()))}
         found = reading.check(data, self.title(number))
-        return found.read_from(self.beside)
+        return found.read_from(self.search_path)
 
-    def coordinates(self) -> dict[str, tuple[str, list]]:
+    def coordinates(self) -> dict[str, tuple[str, list[Any]]]:
         """Values of every key and name by the dimension along which they vary.
 
         Returns
@@ -116,7 +116,7 @@ class Points:
             By name: the dimension, and numbers in SI units, text or numbers from 0 on. Units are
             those of `units`.
         """
-        found: dict[str, tuple[str, list]] = {}
+        found: dict[str, tuple[str, list[Any]]] = {}
         for axis, dimension in enumerate(self.dimensions):
             if dimension.name == SAMPLE:
                 found[SAMPLE] = (SAMPLE, list(dimension.labels))
@@ -145,8 +145,9 @@ class Points:
                     found[key] = value.partition(" ")[2]
         return found
 
-    def _values(self, axis: int, key: str) -> list:
+    def _values(self, axis: int, key: str) -> list[Any]:
         """Values of a key along a dimension, as the experiments have them."""
+        # the first points along this dimension; of others the same values follow
         stride = math.prod(self.shape[axis + 1 :])
         found = [
             _at(reading.settings(self.experiment(k * stride), si=True), key)
@@ -159,9 +160,9 @@ class Points:
 
 
 def member_seed(seed: int, *numbers: int) -> int:
-    """Seed of a member: the same at every point, so that differences between points are sharp.
+    """Seed of a member: the same at every point, so that differences between points have no noise.
 
-    Points that are to have random numbers of their own add theirs to the member's number.
+    Points with random numbers of their own add theirs to the member's number.
     """
     state = np.random.SeedSequence((seed, *numbers)).generate_state(1)
     return int(state[0]) % 2**31
@@ -184,8 +185,9 @@ def _dimensions(campaign: Campaign) -> Iterator[Dimension]:
 def _sampled(campaign: Campaign) -> Dimension:
     """The points of a space-filling sample, scrambled by the campaign's seed."""
     sample = campaign.sample
-    assert sample is not None
+    assert sample is not None  # as `_dimensions` has asked
     kinds = {"sobol": qmc.Sobol, "latin_hypercube": qmc.LatinHypercube}
+    # the same points at every start of the campaign
     random = np.random.default_rng(campaign.seed or 0)
     unit = kinds[sample.method](len(sample.over), rng=random).random(sample.n)
     columns = [
@@ -204,7 +206,7 @@ def tied(keys: str) -> list[str]:
     return [key.strip() for key in keys.split(",")]
 
 
-def _quantities(labels: Sequence[str]) -> tuple[list, str]:
+def _quantities(labels: Sequence[str]) -> tuple[list[Any], str]:
     """Names of sets of changes; those that are all quantities of one kind as numbers in SI."""
     try:
         found = [UNITS.Quantity(*split_quantity(_plain(label))).to_base_units() for label in labels]
@@ -237,6 +239,7 @@ def _refuse_overlaps(dimensions: Sequence[Dimension]) -> None:
 
 
 def _overlap(one: str, other: str) -> bool:
+    # a section overlaps its keys: the dots keep scan apart from scanner
     return f"{one}.".startswith(f"{other}.") or f"{other}.".startswith(f"{one}.")
 
 

@@ -36,11 +36,12 @@ def slurm_cluster(
         dask-jobqueue is missing; a walltime that is none.
     """
     try:
-        from dask_jobqueue import SLURMCluster
+        from dask_jobqueue.slurm import SLURMCluster
     except ImportError:
         raise InputError(
             "--slurm: dask-jobqueue is not installed; expected pip install 'lidar-mi[slurm]'"
         ) from None
+    # workers that end themselves lose no point; those that SLURM kills do
     lifetime = _seconds(walltime) - 120
     if lifetime <= 0:
         raise InputError(f"--walltime: {walltime} is not allowed; expected more than 2 minutes")

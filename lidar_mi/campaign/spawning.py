@@ -2,7 +2,7 @@
 
 A worker is a new interpreter that imports the main module of the program (``spawn``). What stops
 it shows in that process alone, and dask notices after a minute. So one process that does nothing
-is started first, and what it says is kept from the terminal.
+is started first, with its output hidden from the terminal.
 """
 
 import errno
@@ -44,9 +44,9 @@ def check_spawning(count: int) -> None:
     """
     if not _may_open(_FILES + _FILES_EACH * count):
         raise _refused(_TOO_FEW)
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as output:
         try:
-            with _output_to(said.fileno()):
+            with _output_to(output.fileno()):
                 one = multiprocessing.get_context("spawn").Process(target=os.getpid)
                 one.start()
             one.join(PATIENCE)
@@ -58,8 +58,8 @@ def check_spawning(count: int) -> None:
             one.kill()
             one.join()
             raise _refused(f"the first had not started after {PATIENCE:g} s")
-        said.seek(0)
-        text = said.read().decode(errors="replace").strip()
+        output.seek(0)
+        text = output.read().decode(errors="replace").strip()
     if _GUARD in text or _IMPORTING in text:
         raise _refused(_GUARD)
     interpreter = os.fsdecode(spawn.get_executable())
@@ -94,6 +94,7 @@ def quiet_loggers() -> Iterator[None]:
 
 
 def _may_open(number: int) -> bool:
+    # tried, since limits of the process, of the user and of the machine all apply
     opened: list[int] = []
     try:
         while len(opened) < number:
@@ -122,13 +123,13 @@ def _refused(reason: str) -> InputError:
 @contextmanager
 def _output_to(target: int) -> Iterator[None]:
     """Standard output and error of processes that start meanwhile, to a file descriptor."""
-    kept = {}
+    own = {}
     try:
         for number in (1, 2):
-            kept[number] = os.dup(number)
+            own[number] = os.dup(number)
             os.dup2(target, number)
         yield
     finally:
-        for number, before in kept.items():
+        for number, before in own.items():
             os.dup2(before, number)
             os.close(before)

@@ -1,6 +1,6 @@
 """How far a campaign is, from its files alone."""
 
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,11 +16,11 @@ class Status(Tabular):
     ----------
     name : str
     total, done, failed, running : int
-        Points; ``running`` ones have begun and not ended, or were killed.
+        Points; ``running`` ones have started and not ended, or were killed.
     rendered, reused : int
         Images.
-    seconds : Counter
-        Time in each step, summed over points.
+    seconds : dict of str to float
+        Time in each step, summed over points; 0 where there is none.
     failures : list of tuple of str
         A failed point's values, its message, its folder.
     """
@@ -32,7 +32,7 @@ class Status(Tabular):
     running: int = 0
     rendered: int = 0
     reused: int = 0
-    seconds: Counter = field(default_factory=Counter)
+    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
     failures: list[tuple[str, str, str]] = field(default_factory=list)
 
     def add(self, outcome: Outcome) -> None:
@@ -41,14 +41,15 @@ class Status(Tabular):
         self.failed += outcome.status == "failed"
         self.rendered += outcome.rendered
         self.reused += outcome.reused
-        self.seconds.update(outcome.seconds)
+        for step, value in outcome.seconds.items():
+            self.seconds[step] += value
 
     @property
     def finished(self) -> int:
         """Points that are done or failed."""
         return self.done + self.failed
 
-    def left(self) -> float:
+    def remaining(self) -> float:
         """Processor time of the points that are not finished, at the mean of those that are, s."""
         mean = self.seconds["total"] / self.finished if self.finished else float("nan")
         return mean * (self.total - self.finished)
@@ -72,7 +73,9 @@ class Status(Tabular):
             mean = self.seconds["total"] / self.finished
             rows.append(("time of a point", f"{mean:.3g} s, most of it: {self.slowest()}"))
         if self.finished and self.finished < self.total:
-            rows.append(("time left", f"{self.left():.3g} s, divided by the number of workers"))
+            rows.append(
+                ("time left", f"{self.remaining():.3g} s, divided by the number of workers")
+            )
         found = [Table(f"campaign {self.name}", rows)]
         if self.failures:
             heads = ("failed point", "message", "folder")
@@ -96,11 +99,12 @@ def campaign_status(folder: str | Path) -> Status:
 
 
 def count(folder: CampaignFolder, number: int, status: Status) -> None:
-    """Add what became of a point to a status."""
+    """Add the outcome of a point to a status."""
     place = folder.place(number)
     outcome = folder.outcome(number)
     if folder.is_done(number):
         status.add(outcome or Outcome("done", "", {}, 0, 0))
+    # before the outcome: a failed point that is tried again has both files
     elif (place / ATTEMPTS).is_file():
         status.running += 1
     elif outcome is not None:

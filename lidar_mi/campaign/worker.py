@@ -1,6 +1,6 @@
-"""What a worker does: one point, or images that several points share.
+"""The tasks of a worker: one point, or images that several points share.
 
-The scheduler sees paths and numbers only. Everything else is read from the campaign's folder and
+The scheduler handles paths and numbers only. Everything else is read from the campaign's folder and
 written there.
 """
 
@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import xarray as xr
 from distributed import Worker, WorkerPlugin
@@ -45,7 +45,7 @@ from lidar_mi.io.yaml import to_yaml
 from lidar_mi.system.threads import use_threads
 
 MOST_ATTEMPTS = 3
-"""A point that has killed so many workers is given up."""
+"""A point that has killed so many workers fails."""
 
 
 class Prepare(WorkerPlugin):
@@ -62,11 +62,11 @@ class Prepare(WorkerPlugin):
 
     name = "lidar-mi"
 
-    def __init__(self, threads: int = 1, own_cache: bool = False):
+    def __init__(self, threads: int = 1, own_cache: bool = False) -> None:
         self.threads, self.own_cache, self.version = threads, own_cache, __version__
 
     def setup(self, worker: Worker) -> None:
-        """Called by the worker when it starts, or when it is given this plugin.
+        """Called by the worker when it starts, or when it receives this plugin.
 
         Raises
         ------
@@ -98,9 +98,9 @@ def carry_out(
     session : str
         A name for this start of the campaign: workers killed by a point are counted within it.
     ready : sequence of int
-        Images that each `render_shared` has rendered, which this point had to wait for.
+        Number of images rendered by each `render_shared` that precedes this point.
     first : sequence of int
-        Which of these are counted as rendered by this point; others re-use them.
+        Indices of those that count as rendered by this point; other points re-use them.
 
     Returns
     -------
@@ -111,36 +111,37 @@ def carry_out(
     place = campaign.place(number)
     if campaign.is_done(number):
         found = campaign.outcome(number)
-        assert found is not None
+        assert found is not None  # written before the metrics, by which the point is done
         return found
     make_folder(place)
     log = Log(path=place / resumable_folder.LOG)
     start = time.perf_counter()
-    keeper: PointKeeper | None = None
+    store: PointStore | None = None
     try:
-        _begin(place, session)
+        _count_attempt(place, session)
         experiment = campaign.points.experiment(number)
-        keeper = PointKeeper(campaign, number, experiment)
+        store = PointStore(campaign, number, experiment)
         if experiment.encounter is not None:
-            kept = place / RUN if campaign.campaign.keep == "everything" else None
-            flight = fly(experiment, kept, overwrite=True, notice=silent)
-            seconds, metrics = {}, flight.metrics
+            folder_of_flights = place / RUN if campaign.campaign.keep == "everything" else None
+            flights = fly(experiment, folder_of_flights, overwrite=True, notice=silent)
+            seconds, metrics = {}, flights.metrics
         else:
-            run = _prepared(experiment, campaign.points.beside)
+            run = _prepared(experiment, campaign.points.search_path)
             run.log.path = log.path
-            _compute(campaign, run, keeper)
+            _compute(campaign, run, store)
             seconds, metrics = run.seconds, run.metrics
         seconds = {"total": time.perf_counter() - start, **seconds}
-        before = sum(ready[k] for k in first)
+        # rendered for this point by a task of its own, so that the store found them there
+        shared = sum(ready[k] for k in first)
         outcome = Outcome(
-            "done", "", _rounded(seconds), keeper.rendered + before, keeper.reused - before
+            "done", "", _rounded(seconds), store.rendered + shared, store.reused - shared
         )
         # metrics last: they say that the point is done
         write_outcome(place, outcome)
         write_text(place / resumable_folder.METRICS, to_json(metrics))
     except Exception as error:
         log.fail(error)
-        counts = (keeper.rendered, keeper.reused) if keeper else (0, 0)
+        counts = (store.rendered, store.reused) if store else (0, 0)
         message = one_line(error) or type(error).__name__
         outcome = Outcome("failed", message, {"total": time.perf_counter() - start}, *counts)
         write_outcome(place, outcome)
@@ -149,7 +150,7 @@ def carry_out(
 
 
 def render_shared(folder: str, number: int, name: str, session: str) -> int:
-    """Render the images of one stage, which several points share; those that are there stay.
+    """Render the images of one stage, which several points share; present ones stay.
 
     Parameters
     ----------
@@ -163,27 +164,24 @@ def render_shared(folder: str, number: int, name: str, session: str) -> int:
     Returns
     -------
     int
-        Number of images rendered. A fault that prevents it is found again, and reported, by each of
-        the points.
+        Number of images rendered. A fault that prevents it occurs in each of the points again,
+        which report it.
     """
     campaign = _opened(folder, (Path(folder) / RECORD).stat().st_mtime_ns)
     experiment = campaign.points.experiment(number)
-    keeper = PointKeeper(campaign, number, experiment)
-    graph = stages_of(experiment)
-    stages, signatures_ = storing_stages(graph), campaign.index[number].images
-    stage, signature = next(
-        (stage, one) for stage, one in zip(stages, signatures_, strict=True) if stage.name == name
-    )
+    store, graph = PointStore(campaign, number, experiment), stages_of(experiment)
+    pairs = zip(storing_stages(graph), campaign.index[number].images, strict=True)
+    stage, signature = next((stage, one) for stage, one in pairs if stage.name == name)
     images = campaign.images(signature)
     make_folder(images)
     try:
-        _begin(images, session)
-        run = _prepared(experiment, campaign.points.beside)
-        graph.compute(stage, dict(run.results), run.log, run.search_path, keeper)
+        _count_attempt(images, session)
+        run = _prepared(experiment, campaign.points.search_path)
+        graph.compute(stage, dict(run.results), run.log, run.search_path, store)
     except Exception:
-        return keeper.rendered
+        return store.rendered
     (images / ATTEMPTS).unlink(missing_ok=True)
-    return keeper.rendered
+    return store.rendered
 
 
 def run_point(folder: CampaignFolder, number: int) -> Outcome:
@@ -200,8 +198,8 @@ def run_point(folder: CampaignFolder, number: int) -> Outcome:
     return outcome
 
 
-class PointKeeper:
-    """Storage of a point's results: images shared by content, estimates as the campaign asks.
+class PointStore:
+    """Storage of a point's results: images shared by content, estimates with ``keep: estimates``.
 
     Attributes
     ----------
@@ -210,7 +208,7 @@ class PointKeeper:
         Images.
     """
 
-    def __init__(self, campaign: CampaignFolder, number: int, experiment: Experiment):
+    def __init__(self, campaign: CampaignFolder, number: int, experiment: Experiment) -> None:
         self._keep, self.place = campaign.campaign.keep, campaign.place(number)
         self._experiment, self.signature = experiment.name, campaign.index[number].point
         graph = stages_of(experiment)
@@ -220,7 +218,7 @@ class PointKeeper:
         self.rendered = self.reused = 0
 
     def stored(self, part: str) -> xr.Dataset | None:
-        """An image of this content, from whichever point rendered it."""
+        """An image of this content, rendered by any point."""
         found = self.images.stored(part)
         self.reused += found is not None
         return found
@@ -241,39 +239,44 @@ class PointKeeper:
         return self.images.store_part(part, value)
 
     def store_result(self, name: str, value: Any) -> None:
-        """Write an estimate, if estimates are kept."""
+        """Write an estimate, if the campaign asks for it."""
         if self._keep == "estimates":
             resumable_folder.write_result(self.place, name, value, self._experiment, self.signature)
 
 
-def _compute(campaign: CampaignFolder, run: Run, keeper: PointKeeper) -> None:
-    """Run the rest of a point."""
+def _compute(campaign: CampaignFolder, run: Run, store: PointStore) -> None:
+    """Run the stages of a point that are not prepared."""
     if campaign.campaign.keep == "everything":
-        complete(run, keeper.place / RUN, overwrite=True, shared=keeper)
+        complete(run, store.place / RUN, overwrite=True, shared=store)
         return
-    record = resumable_folder.new_record(run.experiment, campaign.points.beside)
-    write_text(keeper.place / resumable_folder.RECORD, to_yaml(record))
-    finish(run, keeper, with_figures=False)
+    record = resumable_folder.new_record(run.experiment, campaign.points.search_path)
+    write_text(store.place / resumable_folder.RECORD, to_yaml(record))
+    finish(run, store, with_figures=False)
 
 
+# of the last point of this process: signatures and results of the stages that runs can share
 _last: tuple[dict[str, str], dict[str, Any]] = ({}, {})
 
 
-def _prepared(experiment: Experiment, beside: Path) -> Run:
-    """A prepared run, with what the last point of this process has in common with it."""
+def _prepared(experiment: Experiment, search_path: Path) -> Run:
+    """A prepared run, with the results that it shares with the last point of this process."""
     global _last
-    signatures = _signatures(experiment, beside)
-    before, results = _last
-    known = {name: results[name] for name in results if before[name] == signatures.get(name)}
-    run = prepare(experiment, beside, known=known)
-    shared = {name: run.results[name] for name in signatures if name in run.results}
+    signatures = _signatures(experiment, search_path)
+    last_signatures, results = _last
+    known = {
+        name: results[name] for name in results if last_signatures[name] == signatures.get(name)
+    }
+    run = prepare(experiment, search_path, known=known)
+    results = cast(dict[str, Any], run.results)
+    shared = {name: results[name] for name in signatures if name in results}
     _last = ({name: signatures[name] for name in shared}, shared)
     return run
 
 
-def _signatures(experiment: Experiment, beside: Path) -> dict[str, str]:
+def _signatures(experiment: Experiment, search_path: Path) -> dict[str, str]:
     """Signatures of the results of the preflight, which runs can share."""
-    record, graph = resumable_folder.new_record(experiment, beside), stages_of(experiment)
+    record = resumable_folder.new_record(experiment, search_path)
+    graph = stages_of(experiment)
     return {
         stage.name: resumable_folder.made_by(record, graph.keys(stage))
         for stage in graph
@@ -281,14 +284,15 @@ def _signatures(experiment: Experiment, beside: Path) -> dict[str, str]:
     }
 
 
-def _begin(place: Path, session: str) -> None:
+def _count_attempt(place: Path, session: str) -> None:
     """Count an attempt.
 
     Raises
     ------
     InputError
-        Earlier ones of this session have ended with their worker.
+        `MOST_ATTEMPTS` earlier ones of this session killed their worker.
     """
+    # a file: a worker that is killed can count nothing after it
     path = place / ATTEMPTS
     lines = read_text(path, "attempts").splitlines() if path.is_file() else []
     ended = lines.count(session)
@@ -307,7 +311,7 @@ def _rounded(seconds: dict[str, float]) -> dict[str, float]:
 
 @lru_cache(1)
 def _opened(folder: str, changed: int) -> CampaignFolder:
-    """A campaign's folder as it was then: read once by every worker."""
+    """A campaign's folder, read once by every worker and again once it has changed."""
     campaign = open_folder(folder)
     check_version(campaign)
     return campaign

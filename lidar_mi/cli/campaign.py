@@ -217,7 +217,7 @@ def _watched() -> "Iterator[Callable[[State], None]]":
             last = time.monotonic()
             errors.print(
                 f"{state.finished} of {state.total} points, {state.failed} failed, "
-                f"{state.rate():.2g} a second, {_clock(state.left())} left",
+                f"{state.rate():.2g} a second, {_clock(state.remaining())} left",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -231,7 +231,7 @@ def _table(state: "State") -> RichTable:
         ("points", f"{state.finished} of {state.total}, {state.running} running"),
         ("failed", str(state.failed)),
         ("rate", f"{state.rate():.3g} a second on {state.workers} workers"),
-        ("time left", _clock(state.left())),
+        ("time left", _clock(state.remaining())),
         ("images", f"{state.rendered} rendered, {state.reused} re-used"),
         ("slowest step", state.slowest() or "-"),
     ]

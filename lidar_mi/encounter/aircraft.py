@@ -1,4 +1,4 @@
-"""The aircraft: its state, what steers it, and what any model of it offers."""
+"""The aircraft: its state, its controls, and the protocol of its models."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from lidar_mi.encounter.strips import Loads, Strips, wake_loads
 from lidar_mi.instrument.motion import attitude
 
 LARGEST_ROLL = np.pi / 2
-"""Bank angle (rad) beyond which an aircraft counts as departed."""
+"""Bank angle (rad) beyond which an aircraft counts as upset."""
 
 Wind = Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
 """u, v, w (m/s) from x, y, z (m) and time (s), in the path frame."""
@@ -19,7 +19,7 @@ Wind = Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class AircraftState:
-    """Where the aircraft is and how it moves, in the path frame (x forward, y left, z up).
+    """Place, attitude and motion of the aircraft in the path frame (x forward, y left, z up).
 
     Attributes
     ----------
@@ -34,8 +34,8 @@ class AircraftState:
     airspeed : float
         m/s.
     departed : bool
-        The aircraft rolled beyond `LARGEST_ROLL`, or its equations have no finite solution any
-        more: the flight is over, and this is its result.
+        The flight is lost: the aircraft is upset (rolled beyond `LARGEST_ROLL`), or its equations
+        have no finite solution any more.
     """
 
     time: float = 0.0
@@ -54,7 +54,7 @@ class AircraftState:
 
 @dataclass(frozen=True)
 class Commands:
-    """Deflections asked for, rad.
+    """Commanded deflections, rad.
 
     Positive ones roll the port wing up (aileron), move the nose down (elevator) and to port
     (rudder): each gives a positive moment of `Loads`.
@@ -85,7 +85,7 @@ class Limits:
 
 
 class AircraftModel(Protocol):
-    """What a flight needs of an aircraft.
+    """A model of an aircraft.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class AircraftModel(Protocol):
 def loads_in_wind(
     strips: Strips, state: AircraftState, wind: Wind, density: float, time: ArrayLike | None = None
 ) -> Loads:
-    """The wake's force and moment on an aircraft in a given state, or as it flies on from there.
+    """The wake's force and moment on an aircraft in a state, or on its straight course from there.
 
     Parameters
     ----------
@@ -147,11 +147,12 @@ def loads_in_wind(
     Loads
         Force and moment of shape (..., 3).
     """
-    then = np.asarray(state.time if time is None else time, dtype=float)[..., None]
-    turned = attitude(state.roll, state.pitch, state.yaw).as_matrix()
-    x, y, z = (strips.places @ turned.T + np.array([state.x, state.y, state.z])).T
-    there = wind(x + state.airspeed * (then - state.time), y, z, then)
-    body = np.stack(np.broadcast_arrays(*there), -1) @ turned
+    at = np.asarray(state.time if time is None else time, dtype=float)[..., None]
+    to_path = attitude(state.roll, state.pitch, state.yaw).as_matrix()
+    # only x advances: a preview does not predict the aircraft's own motion across the path
+    x, y, z = (strips.places @ to_path.T + np.array([state.x, state.y, state.z])).T
+    found = wind(x + state.airspeed * (at - state.time), y, z, at)
+    body = np.stack(np.broadcast_arrays(*found), -1) @ to_path
     return wake_loads(strips, body, state.airspeed, density)
 
 
@@ -177,8 +178,9 @@ def deflected(
         Time of dt in which each moves, s; it rests in the remainder.
     """
     target = np.clip(commands.array, -limits.deflection, limits.deflection)
-    way = target - deflection
-    after = deflection + np.clip(way, -limits.rate * dt, limits.rate * dt)
+    change = target - deflection
+    after = deflection + np.clip(change, -limits.rate * dt, limits.rate * dt)
     moved = np.abs(after - deflection)
+    # the rate of a control that the model does not have is 0
     time = np.divide(moved, limits.rate, out=np.zeros(3), where=limits.rate > 0)
     return after, np.minimum(time, dt)

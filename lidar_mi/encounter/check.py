@@ -1,4 +1,4 @@
-"""What is known of a flight before it: its geometry, and whether it can succeed."""
+"""Checks of an encounter before it is simulated: its geometry, and what may go wrong."""
 
 import math
 from collections.abc import Iterator
@@ -12,23 +12,24 @@ from lidar_mi.encounter.slabs import Gates, gates_of
 from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import Section
-from lidar_mi.experiment.log import Notice, silent
-from lidar_mi.experiment.preflight import check as of_a_run
+from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.preflight import check as preflight
 from lidar_mi.experiment.preflight.cost import flight_seconds
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.progress import Notice
 from lidar_mi.units import shown
 
 # A path misses the wake where no rolling moment reaches this fraction of the ailerons'.
 _MISSED = 0.01
-# Slabs with both vortices in the image that a track needs.
+# Slabs with both vortices in the image that a track needs: two for its slopes, one for its test.
 _LEAST_SLABS = 3
 _INSTANTS = 400
 _UNITS = {"speed": "m/s", "dt": "s", "range": "m"}
 
 
 def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> list[str]:
-    """Check a flight before anything is rendered; warnings, a line each.
+    """Check the geometry of a flight before anything is rendered; warnings, a line each.
 
     Parameters
     ----------
@@ -46,9 +47,8 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     encounter, gates = encounter_of(experiment), gates_of(experiment)
     if encounter.control.mode == "feedforward":
         _check_latency(experiment, gates)
-    one = aircraft or aircraft_of(encounter)
     found = _without_effect(experiment, gates)
-    strength = _strongest(experiment, one)
+    strength = _strongest(experiment, aircraft or aircraft_of(encounter))
     if strength < _MISSED:
         found.append(
             "encounter.path: the flight misses the wake: its largest rolling moment is "
@@ -85,16 +85,16 @@ def sections(
     encounter, gates = encounter_of(experiment), gates_of(experiment)
     path = encounter.path
     first = _first_slab(experiment)
-    yield from of_a_run.sections(first, experiment.folder, notice, sampled=timed)
-    ahead = (gates.look_ahead - gates.stride) / path.speed - encounter.control.latency
-    rows = [
+    yield from preflight.sections(first, experiment.folder, notice, sampled=timed)
+    margin = (gates.look_ahead - gates.stride) / path.speed - encounter.control.latency
+    rows: list[tuple[str, ...]] = [
         ("aircraft", encounter.aircraft.model),
         ("flight", f"{duration(encounter):.3g} s at {shown(path.speed, 'm/s')}"),
         ("crossing and climb angle", _degrees(path.crossing_angle, path.climb_angle)),
         ("control", encounter.control.mode),
         ("slabs", f"{encounter.rate:g} a second, {gates.depth:.3g} m deep"),
         ("both vortices in the image", f"in {_slabs_in_view(experiment, gates)} slabs"),
-        ("from an estimate to its slab", f"{ahead:.3g} s"),
+        ("from an estimate to its slab", f"{margin:.3g} s"),
         (
             "largest rolling moment",
             f"{_strongest(experiment, aircraft_of(encounter)):.0%} of the ailerons'",
@@ -106,14 +106,14 @@ def sections(
         steers = encounter.control.mode == "feedforward"
         scans = duration(encounter) * encounter.rate if steers else 0.0
         seconds = flight_seconds(first, prepare(first).results, scans)
-        text = f"about {of_a_run.duration(seconds)}"
+        text = f"about {preflight.duration(seconds)}"
         yield "cost to a factor of 2", [("the flight, on one core", text)]
     if warnings:
         yield f"{experiment.name}: warnings of the flight", [(text,) for text in warnings]
 
 
 def _without_effect(experiment: Experiment, gates: Gates) -> list[str]:
-    """Keys of the file whose values a flight does not take, and what says it instead."""
+    """Keys of the file without effect on a flight, and those in their place."""
     encounter, found = encounter_of(experiment), []
     thickness = experiment.scan.thickness
     if "thickness" in experiment.scan.model_fields_set and not _same(thickness, gates.depth):
@@ -126,17 +126,17 @@ def _without_effect(experiment: Experiment, gates: Gates) -> list[str]:
             "another encounter.path.speed or encounter.rate)"
         )
     path = encounter.path
-    for section, key, instead, flown in (
+    for section, key, instead, effective in (
         ("platform", "speed", "path.speed", path.speed),
         ("platform", "dt", "rate", 1 / encounter.rate),
         ("scan", "range", "look_ahead", encounter.look_ahead),
     ):
         part = getattr(experiment, section)
         value = getattr(part, key)
-        if key in part.model_fields_set and not _same(value, flown):
+        if key in part.model_fields_set and not _same(value, effective):
             found.append(
                 f"{section}.{key}: {value:g} {_UNITS[key]} has no effect on a flight; "
-                f"encounter.{instead} makes it {flown:g} {_UNITS[key]}"
+                f"encounter.{instead} makes it {effective:g} {_UNITS[key]}"
             )
     return found
 
@@ -154,9 +154,10 @@ def _first_slab(experiment: Experiment) -> Experiment:
     scan = experiment.scan.model_copy(
         update={"range": encounter.look_ahead, "thickness": gates.depth}
     )
+    # the preflight of a run then covers the instrument of the flight, too
     changes = {"encounter": None, "platform": platform, "scan": scan}
-    seen = at_the_slabs(experiment, gates)
-    return seen.model_copy(update=changes).read_from(experiment.folder)
+    ranged = at_the_slabs(experiment, gates)
+    return ranged.model_copy(update=changes).read_from(experiment.folder)
 
 
 def _check_latency(experiment: Experiment, gates: Gates) -> None:
@@ -178,11 +179,12 @@ def _strongest(experiment: Experiment, aircraft: AircraftModel) -> float:
     times = np.linspace(0, duration(encounter), _INSTANTS)
     loads = loads_in_wind(aircraft.strips, aircraft.state, wake.wind, aircraft.density, times)
     largest = float(np.abs(loads.moment[:, 0]).max())
+    # without ailerons any wake is too strong
     return largest / most if most else float("inf")
 
 
 def _slabs_in_view(experiment: Experiment, gates: Gates) -> int:
-    """Slabs before the end of the path whose images hold both vortices, from the nominal path."""
+    """Slabs of the nominal path whose images hold both vortices."""
     encounter, wake = encounter_of(experiment), wake_along_path(experiment)
     y, z = gates.y, gates.z
     count = 0

@@ -13,7 +13,7 @@ from lidar_mi.retrieval.lines.combine import combine
 
 @dataclass(frozen=True, eq=False)
 class Completion:
-    """From the wind of a slab's images to the wind that is delivered; call it.
+    """From the wind of a slab's images to the delivered wind.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Completion:
     def __call__(
         self, wind: xr.Dataset, lines: xr.Dataset | None
     ) -> tuple[xr.Dataset, tuple[str, ...]]:
-        """The wind with the errors of pointing, combined with lines; and why it is not."""
+        """The wind with the errors of pointing, combined with lines; flags say why it is not."""
         if self.by_pointing:
             wind = with_common_error(wind, self.common, self.offset, self.rotation, self.roll_axis)
         if lines is None:
@@ -81,16 +81,21 @@ def combined_in_flight(
     Returns
     -------
     Dataset, dims (z, y)
-        From `combine`, path frame. Air that moves along x within its slab, whose gates are fixed in
-        the air, moves in the images since beams are oblique: this is taken off.
+        From `combine`, path frame. Gates are fixed in the air, but air that moves along x within
+        its slab moves in the images, since beams are oblique: `combine` subtracts this motion.
 
     Raises
     ------
     InputError
         No valid vector or no line of sight on the grid.
     """
-    told = {axis: wind.variables[axis] for axis in ("z", "y")}
-    seen = {axis: told[axis].values - at for axis, at in (("y", place[1]), ("z", place[2]))}
-    local = wind.assign_coords({axis: (axis, c, told[axis].attrs) for axis, c in seen.items()})
+    axes = {axis: wind.variables[axis] for axis in ("z", "y")}
+    # the lines start at their telescope: so does the frame in which both are combined
+    local = wind.assign_coords(
+        {
+            axis: (axis, axes[axis].values - start, axes[axis].attrs)
+            for axis, start in (("y", place[1]), ("z", place[2]))
+        }
+    )
     found = combine(local, lines, crossflow_std=crossflow_std, distance=x - place[0])
-    return found.assign_coords(told)
+    return found.assign_coords(axes)

@@ -1,7 +1,7 @@
-"""What steers against the wake: commands from the loads that it will bring.
+"""Controllers: commands from the preview of the wake's loads and the state.
 
-Three modes fly with the same wake: off has a pilot who levels the wings, feedforward steers by the
-loads predicted from the lidar's track, perfect by the true loads.
+Without control a pilot levels the wings. Feedforward steers by the loads predicted from the lidar's
+track, perfect preview by the true loads, the autopilot by a preview of no loads.
 """
 
 from collections.abc import Callable
@@ -57,14 +57,14 @@ def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
 
 
 def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Controller:
-    """The aileron planned ahead against the roll that the wake will make; the others cancel.
+    """The aileron planned against the roll by the wake ahead; the other controls cancel moments.
 
-    Where the wake has more moment than the ailerons, cancelling it leaves what they lack. An
-    aircraft that knows the wake ahead banks a little against it before. The deflections of the
-    next `HORIZON` minimise the sum of roll^2 + (`RATE_TIME` roll rate)^2 of the linear roll mode,
-    from the state flown and the moments expected, within the limits of deflection and rate; the
-    first is commanded, and all are planned again at the next call. Elevator and rudder cancel, as
-    in `cancelling`; the rudder's rolling moment is part of the plan.
+    Where the wake has more moment than the ailerons, cancelling leaves the difference. An aircraft
+    with a preview banks a little to the other side before. The deflections of the next `HORIZON`
+    minimise the sum of roll^2 + (`RATE_TIME` roll rate)^2 of the linear roll mode, from the state
+    flown and the moments expected, within the limits of deflection and rate; the first is
+    commanded, and all are planned again at the next call. Elevator and rudder cancel, as in
+    `cancelling`; the rudder's rolling moment is part of the plan.
 
     Without a preview the wings are levelled as in `wings_level`. A preview without loads makes it
     an autopilot that holds the wings level as well as the ailerons can.
@@ -77,6 +77,7 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
     """
     level, cancel = wings_level(aircraft, levelling_time), cancelling(aircraft, None)
     limits, moments = aircraft.limits, aircraft.control_moments
+    # without an aileron that moves there is no roll to plan
     if not (moments[0, 0] and limits.deflection[0] and limits.rate[0]):
         return cancel
     has_others = bool(moments[:, 1:].any())
@@ -92,7 +93,7 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
 
     def controller(preview: Preview | None, state: AircraftState) -> Commands:
         nonlocal last, before, deflection
-        # where the controls are now: nobody but this controller has moved them
+        # the controls follow this controller's commands alone: where they are is known
         if state.time > before:
             deflection, _ = deflected(deflection, last, state.time - before, limits)
         before = state.time
@@ -119,7 +120,7 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
 def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Controller:
     """Deflections whose moments cancel the predicted ones at every moment, and levelling.
 
-    The moments -M(t) are shared out to the controls by the least squares of `control_moments`,
+    The moments -M(t) are distributed over the controls by least squares of `control_moments`,
     within the limits of deflection. A control that cannot follow fast enough starts early: of all
     deflections, the one nearest to today's need is taken from which the needs of the next seconds
     can be reached at the control's rate; where there is none, the middle between the two that
@@ -132,7 +133,8 @@ def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Control
         As in `wings_level`.
     """
     level = wings_level(aircraft, levelling_time)
-    shares = np.linalg.pinv(aircraft.control_moments, rcond=1e-9)
+    # an aircraft that only rolls has one control: the pseudo-inverse leaves the others at zero
+    per_moment = np.linalg.pinv(aircraft.control_moments, rcond=1e-9)
     limits = aircraft.limits
     times = np.divide(2 * limits.deflection, limits.rate, out=np.zeros(3), where=limits.rate > 0)
     instants = np.linspace(0.0, times.max(), _INSTANTS)
@@ -142,7 +144,7 @@ def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Control
         if preview is None:
             return commands
         moments = preview(state.time + instants).moment
-        needs = np.clip(-moments @ shares.T, -limits.deflection, limits.deflection)
+        needs = np.clip(-moments @ per_moment.T, -limits.deflection, limits.deflection)
         ways = instants[:, None] * limits.rate
         least, most = (needs - ways).max(0), (needs + ways).min(0)
         chosen = np.where(least > most, (least + most) / 2, np.clip(needs[0], least, most))
@@ -152,7 +154,7 @@ def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Control
     return controller
 
 
-def _roll_mode(aircraft, dt):
+def _roll_mode(aircraft: AircraftModel, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Roll and roll rate after each interval of `HORIZON`.
 
     From the first roll rate, shape (2, `KNOTS`), and from constant moments in the intervals, two of
@@ -174,7 +176,9 @@ def _roll_mode(aircraft, dt):
     return np.stack([rolls[:, -1], rates[:, -1]]), rolls[:, :-1], rates[:, :-1]
 
 
-def _least_squares(matrix, target, allowed, least):
+def _least_squares(
+    matrix: np.ndarray, target: np.ndarray, allowed: np.ndarray, least: np.ndarray
+) -> np.ndarray:
     """The x that minimises |matrix x - target| where allowed x >= least.
 
     As a least distance problem, solved by non-negative least squares (Lawson and Hanson 1995,

@@ -1,7 +1,7 @@
-"""The Doppler lidar of a flight: frames of its lines of sight through the slab that is seen twice.
+"""The Doppler lidar of a flight: frames of its lines of sight through the slab of two scans.
 
-All lines look at the middle of the time between both scans, from half way between their places.
-Their range bins are where the slab is.
+All lines are recorded half way between both scans, in time and in place. Their range bins lie in
+the slab.
 """
 
 from dataclasses import dataclass
@@ -17,20 +17,22 @@ from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.slabs import Gates
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.line_frames import PULSES, LineImages, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings, ring_instrument
 from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind
 
-# m/s by which the wind in a wake changes the speed along a line, at most: beyond, the images
-# without noise are not exact.
+# m/s by which the wind in a wake changes the speed along a line, at most: noise-free images are
+# tabulated over these speeds.
 _FASTEST_WIND = 60.0
 
 
 class Midway(NamedTuple):
-    """Where an aircraft is between two scans, and how fast it flies; path frame, m and m/s."""
+    """Place and velocity of an aircraft between two scans; path frame, m and m/s."""
 
     place: np.ndarray
     velocity: np.ndarray
@@ -43,7 +45,7 @@ class Midway(NamedTuple):
 
 
 class LineFrames(NamedTuple):
-    """What the Doppler lidar records of a slab.
+    """The frames that the Doppler lidar records of a slab.
 
     Attributes
     ----------
@@ -67,18 +69,23 @@ class LineFrames(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DopplerScans:
-    """The Doppler lidar as nature has it.
+    """The true Doppler lidar, which records frames.
 
     Attributes
     ----------
     experiment : Experiment
         Its `doppler.lidar.range` is that of the slabs.
+    sensor : Sensor
+    doppler : Doppler
+        Those of the experiment.
     rings : Rings
         The true instrument.
     images : LineImages
     """
 
     experiment: Experiment
+    sensor: Sensor
+    doppler: Doppler
     rings: Rings
     images: LineImages
 
@@ -89,7 +96,7 @@ class DopplerScans:
         x: float,
         time: float,
         midway: Midway,
-        turned: Rotation | None = None,
+        misalignment: Rotation | None = None,
     ) -> LineFrames:
         """Frames of all lines of sight of a slab.
 
@@ -103,44 +110,46 @@ class DopplerScans:
         time : float
             Half way between both scans, s.
         midway : Midway
-        turned : Rotation, optional
-            True attitude of the lidar from the one that its beams are aimed by.
+        misalignment : Rotation, optional
+            True attitude of the lidar relative to the one by which its beams are aimed.
         """
-        experiment, sensor = self.experiment, self.experiment.sensor
-        lidar = experiment.doppler.lidar.model_copy(update={"range": x - midway.place[0]})
-        told = sensor.directions.directions()
-        going = told if turned is None else turned.apply(told)
-        here = np.zeros_like(told)
-        drift = np.broadcast_to(midway.velocity * [0, 1, 1], told.shape)
-        beams = Beams(np.zeros(len(told)), here, going, here, told, drift, drift)
+        sensor, seed = self.sensor, self.experiment.seed
+        lidar = self.doppler.lidar.model_copy(update={"range": x - midway.place[0]})
+        aimed = sensor.directions.directions()
+        true = aimed if misalignment is None else misalignment.apply(aimed)
+        origin = np.zeros_like(aimed)
+        # the speed along the path is an argument of its own of `scan_wind`
+        drift = np.broadcast_to(midway.velocity * [0, 1, 1], aimed.shape)
+        beams = Beams(np.zeros(len(aimed)), origin, true, origin, aimed, drift, drift)
 
         def wind(points: np.ndarray) -> np.ndarray:
-            places = np.moveaxis(points + midway.place, -1, 0)
-            return np.stack(wake.wind(*places, time), -1)
+            place_x, y, z = np.moveaxis(points + midway.place, -1, 0)
+            return np.stack(wake.wind(place_x, y, z, time), -1)
 
-        seed = int(np.random.SeedSequence([experiment.seed, number]).generate_state(1)[0])
+        # each slab has noise of its own, the same whenever its scan is repeated
+        own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
         lines = scan_wind(
             wind,
             sensor.directions,
             lidar,
             0.0,
-            seed,
+            own_seed,
             float(midway.velocity[0]),
             sensor.errors,
             beams,
         )
-        recorded = line_frames(
-            experiment.doppler,
+        air, laser, own = line_frames(
+            self.doppler,
             self.rings,
             self.images,
-            range(len(told)),
+            range(len(aimed)),
             lines["v_los_true"].values,
             lines["range"].values,
             sensor.pulses,
-            experiment.seed,
+            seed,
             number,
         )
-        return LineFrames(lines, *recorded, number)
+        return LineFrames(lines, air, laser, own, number)
 
 
 def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
@@ -151,13 +160,16 @@ def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
     InputError
         Times of lines, a range that is not that of the slabs, an aircraft too fast for the etalon.
     """
-    if experiment.sensor is None:
+    sensor = experiment.sensor
+    if sensor is None:
         return None
-    if experiment.sensor.timing is not None:
+    if sensor.timing is not None:
         raise InputError("sensor.timing: not allowed in an encounter; expected none")
-    reference_frames(experiment.sensor.pulses, experiment.doppler.reference.every, PULSES)
     experiment = at_the_slabs(experiment, gates)
     doppler = experiment.doppler
+    assert doppler is not None  # as there is a sensor
+    # refuses numbers of pulses that have no frame of the laser
+    reference_frames(sensor.pulses, doppler.reference.every, PULSES)
     rings = ring_instrument(doppler)
     speed = encounter_of(experiment).path.speed
     limit = rings.model.velocity_range / 2
@@ -166,9 +178,10 @@ def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
             f"encounter.path.speed: {speed:g} m/s is not allowed with sensor; expected less than "
             f"{limit - _FASTEST_WIND:.0f} m/s, half an order of doppler.etalon less the wind"
         )
-    slowest = speed * float(experiment.sensor.directions.directions()[:, 0].min())
+    # oblique lines see less of the aircraft's speed
+    slowest = speed * float(sensor.directions.directions()[:, 0].min())
     images = line_images(doppler, rings, slowest - _FASTEST_WIND, speed + _FASTEST_WIND)
-    return DopplerScans(experiment, rings, images)
+    return DopplerScans(experiment, sensor, doppler, rings, images)
 
 
 def at_the_slabs(experiment: Experiment, gates: Gates) -> Experiment:
@@ -179,10 +192,11 @@ def at_the_slabs(experiment: Experiment, gates: Gates) -> Experiment:
     InputError
         Its own range is another one.
     """
-    if experiment.sensor is None:
+    doppler = experiment.doppler
+    if experiment.sensor is None or doppler is None:
         return experiment
+    lidar = doppler.lidar
     middle = gates.look_ahead + (gates.depth - gates.stride) / 2
-    doppler, lidar = experiment.doppler, experiment.doppler.lidar
     if "range" in lidar.model_fields_set and abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
             f"doppler.lidar.range: {lidar.range:g} m is not allowed in an encounter; expected that "

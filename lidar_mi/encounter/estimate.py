@@ -1,4 +1,4 @@
-"""What the lidar delivers at a step."""
+"""The estimate that the lidar delivers at a step."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Wind and vortices of one slab of air, from the two scans that saw it.
+    """Wind and vortices of one slab of air, from the two scans that hold it.
 
     Attributes
     ----------
     time : float
         When the wind and the vortices are valid: half way between both scans, s.
     delivered : float
-        When they are there: the second scan's reference time and the latency, s.
+        Time of delivery: the second scan's reference time plus the latency, s.
     x : float
         Plane of the slab along the flight path, m.
     wind : xarray.Dataset or None, dims (z, y)
@@ -27,11 +27,10 @@ class Estimate:
     pair : VortexPairFit or None
         The vortices in the slab's plane, at `time`; look at its `success` and `reasons` first.
     flags : tuple of str
-        What limits the use of the estimate; empty if nothing does.
+        Limitations of the estimate; empty if there are none.
     seconds : mapping
-        Time that each part of the estimate took, s, without the rendering. `total` is what it took
-        from the second scan on: lines of sight and the first image come before. Left out, it is
-        their sum.
+        Duration of each part of the estimate, s, without the rendering. `total` is the duration
+        from the second scan on: lines of sight and the first image come before. Default: their sum.
     lines : xarray.Dataset or None, dim line
         Speeds along the lines of sight, in the frame of the aircraft half way between both scans.
         None without a Doppler lidar.

@@ -1,7 +1,7 @@
-"""From two images of a slab of air to its wind and its vortices, fast enough to be flown with."""
+"""From two images of a slab of air to its wind and its vortices, in real time."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import NamedTuple
@@ -12,7 +12,7 @@ import xarray as xr
 from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import LineFrames
 from lidar_mi.encounter.line_speeds import LineSpeeds
-from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds
+from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProcess
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
@@ -32,11 +32,11 @@ class SlabEstimate(NamedTuple):
         Its `from_start` says whether it was found from the expected one.
     seconds : dict
         Of the parts `vortices`, `wind` and `combination` after the second image; `lines`,
-        `vortices_before` and `wind_before`, as far as lines, the first image and the expected pair
-        are concerned, before it; and `total`, from the second image to the end, with two processes
-        less than the sum. What is not finished when the second image comes is in `total`: lines
-        come half a period before it, the first image with the second one of the last slab, and
-        each process finishes that slab before.
+        `vortices_before` and `wind_before` of the lines, the first image and the expected pair,
+        before it; and `total`, from the second image to the end, with two processes less than the
+        sum. Work that is not finished at the second image counts in `total`: lines are recorded
+        half a period before it, the first image with the second one of the last slab, and each
+        process finishes that slab first.
     lines : Dataset or None
         As `with_speeds` gives them; None without frames.
     flags : tuple of str
@@ -51,7 +51,7 @@ class SlabEstimate(NamedTuple):
 
 
 class Estimator:
-    """What an aircraft's computer does with every pair of images.
+    """Estimates wind and vortices from pair to pair of images, as an aircraft's computer does.
 
     Without an expected pair the methods start from nothing. With one they start from it, and the
     wind from the last one as well: errors are the same in a fraction of the time.
@@ -62,7 +62,7 @@ class Estimator:
         Its `retrieval` has the windows and the method of the wind: the most accurate one listed.
         Only "variational" has a fast form.
     vectors : bool
-        Whether the wind is retrieved besides the vortices.
+        Whether the wind is retrieved in addition to the vortices.
     processes : int
         2: the wind is retrieved and completed in a process of its own, while this one fits the
         vortices. The numbers are the same but for rounding. It pays where a second core is idle.
@@ -77,17 +77,17 @@ class Estimator:
         vectors: bool = True,
         processes: int = 1,
         speeds: LineSpeeds | None = None,
-    ):
+    ) -> None:
         settings = experiment.retrieval
         methods = [method for method in MOST_ACCURATE_FIRST if method in settings.methods]
-        self._winds: SlabWinds | InOwnProcess | None = None
+        self._winds: InThisProcess | InOwnProcess | None = None
         if vectors and methods:
-            form = SlabWinds if processes == 1 else InOwnProcess
+            form = InThisProcess if processes == 1 else InOwnProcess
             self._winds = form(methods[0], window_settings(settings))
         self._speeds, self._processes = speeds, processes
         # the last slab's vortices, near which the next wind starts
         self._last: VortexPairFit | None = None
-        # how long after its second image each process worked on it, s
+        # time that each process worked on the last slab after its second image, s
         self._busy: Sequence[float] = (0.0, 0.0)
 
     # no derivatives are recorded: 7 % of the time
@@ -116,7 +116,7 @@ class Estimator:
             As `fit_vortices` takes it.
         expected : VortexPairFit, optional
             The pair expected at mid-time, with its covariance. With slopes and a telescope the fit
-            is corrected for what wind along x moves in oblique beams.
+            is corrected for the motion in oblique beams by wind along x.
         times : sequence of two DataArray, optional
             Of the pixels, as `fit_vortices` takes them.
         frames : LineFrames, optional
@@ -128,27 +128,32 @@ class Estimator:
         """
         seconds: dict[str, float] = {}
         first = FirstImage(image1, dt, noise, times, expected)
-        wind, lines, flags = None, None, ()
+        wind: xr.Dataset | None = None
+        lines: xr.Dataset | None = None
+        flags: tuple[str, ...] = ()
         if self._speeds and frames:
             with _timed(seconds, "lines"):
                 lines = self._speeds.read(frames)
-        ready = self._winds and self._winds.awaits(first, self._last)
-        given = {"times": times, "telescope": telescope}
-        fit = partial(fit_vortices, image1, dt=dt, noise=noise, **given)
+        # submitted before this process fits: the other one works at the same time
+        prepared = self._winds.prepare(first, self._last) if self._winds else None
+        fit: Callable[[xr.DataArray], VortexPairFit] = partial(
+            fit_vortices, image1, dt=dt, noise=noise, times=times, telescope=telescope
+        )
         if expected:
             with _timed(seconds, "vortices_before"):
-                fit = begun_fit(image1, dt, noise, start=expected, **given)
-        if ready:
-            seconds["wind_before"] = ready()
+                fit = begun_fit(image1, dt, noise, start=expected, times=times, telescope=telescope)
+        if prepared:
+            seconds["wind_before"] = prepared.result()
         with _timed(seconds, "total"):
-            then = complete and partial(complete, lines=lines)
-            coming = self._winds and self._winds.begun(image2, then)
+            completion = partial(complete, lines=lines) if complete else None
+            retrieved = self._winds.retrieve(image2, completion) if self._winds else None
             with _timed(seconds, "vortices"):
                 pair = fit(image2)
                 if expected and expected.slopes is not None and pair.inclined is not None:
+                    assert expected.slope_covariance is not None  # as the slopes
                     pair = pair.with_slopes(expected.slopes, expected.slope_covariance)
-            if coming is not None:
-                wind, flags, parts = coming()
+            if retrieved:
+                wind, flags, parts = retrieved.result()
                 seconds |= parts
         since = self._busy if expected else (0.0, 0.0)
         self._busy = _with_delay(seconds, since, dt, self._processes)
@@ -159,12 +164,17 @@ class Estimator:
 def _with_delay(
     seconds: dict[str, float], since: Sequence[float], period: float, processes: int
 ) -> list[float]:
-    """Add to the total what a process is late at the second image; how long each is busy after it.
+    """Add the delay of the processes at the second image to the total.
 
     A process goes on with the last slab for so many seconds `since` the first image, which came
-    with that slab's second one. Then it does what can be done before the second image; the lines
-    come half a period before it. No more than a period is carried to the next slab: after one that
-    takes longer, as from nothing, others are left out.
+    with that slab's second one. Then it does the work before the second image; the lines are
+    recorded half a period before it. A slab delays the next one by a period at most: after a longer
+    one, as from nothing, slabs are skipped.
+
+    Returns
+    -------
+    list of float
+        Time that each process works on the slab after its second image, s.
     """
 
     def of(*parts: str) -> float:
@@ -183,8 +193,8 @@ def _with_delay(
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], part: str):
-    """Put the time that the block takes under its name."""
+def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    """Store the duration of the block under its name."""
     began = time.perf_counter()
     yield
     seconds[part] = time.perf_counter() - began

@@ -1,10 +1,10 @@
-"""An encounter: its flights, their numbers, figures and report."""
+"""Fly into a wake: the flights of an encounter, their metrics, figures and report."""
 
 import webbrowser
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import xarray as xr
 
@@ -13,8 +13,9 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, encounter_metrics
 from lidar_mi.assessment.report.encounter import encounter_summary
 from lidar_mi.encounter.check import geometry
-from lidar_mi.encounter.flight import Flown, fly_all
-from lidar_mi.encounter.folder import FlightFolder
+from lidar_mi.encounter.flight import FlightData, OwnAircraft, OwnController, simulate_flights
+from lidar_mi.encounter.folder import EncounterFolder
+from lidar_mi.encounter.preview import Lidar
 from lidar_mi.encounter.report import answer, write_report
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError, is_interrupt
@@ -22,29 +23,29 @@ from lidar_mi.experiment.folder.run_folder import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import load_experiment
-from lidar_mi.progress import progress
+from lidar_mi.progress import Notice, progress
 from lidar_mi.tables import Table, Tabular
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Flight(Tabular):
-    """An encounter that was flown.
+class Flights(Tabular):
+    """The flights of an encounter, one for each controller.
 
     Attributes
     ----------
     experiment : Experiment
-    flown : Flown
-        ``series`` (time series of all flights), ``track`` and ``seen`` (slab by slab).
+    data : FlightData
+        ``series`` (time series of all flights), ``track`` and ``slabs`` (slab by slab).
     metrics : dict of str to float
         Flat, SI units.
     warnings : tuple of str
-        What matters for the results.
+        Limitations of the results.
     folder : Path or None
         Folder of the files.
     """
 
     experiment: Experiment
-    flown: Flown
+    data: FlightData
     metrics: dict[str, float]
     warnings: tuple[str, ...] = ()
     folder: Path | None = None
@@ -52,17 +53,17 @@ class Flight(Tabular):
     @property
     def series(self) -> xr.Dataset:
         """States, loads and commands, dims (flight, time)."""
-        return self.flown.series
+        return self.data.series
 
     @property
     def track(self) -> xr.Dataset | None:
         """Estimates, track and truth of every slab; None without a lidar."""
-        return self.flown.track
+        return self.data.track
 
     @property
     def answer(self) -> list[str]:
-        """What a reader wants to know first, in sentences."""
-        return answer(self.experiment, self.flown, self.metrics)
+        """The main results, in sentences."""
+        return answer(self.experiment, self.data, self.metrics)
 
     def tables(self) -> list[Table]:
         """The flights and the lidar, in numbers."""
@@ -87,16 +88,16 @@ def fly(
     experiment: Experiment | str | Path,
     folder: str | Path | None = None,
     *,
-    lidar: Any = None,
-    aircraft: Callable | None = None,
-    controller: Callable | None = None,
+    lidar: Lidar | None = None,
+    aircraft: OwnAircraft | None = None,
+    controller: OwnController | None = None,
     overwrite: bool = False,
     processes: int = 1,
-    notice: Callable | None = None,
-) -> Flight:
+    notice: Notice | None = None,
+) -> Flights:
     """Fly into the wake: without control, with an autopilot, steered by the lidar, by the truth.
 
-    All flights meet the same wake. The lidar renders its scans in the flight that it steers.
+    All flights meet the same wake. Only the flight that the lidar steers renders its scans.
 
     Parameters
     ----------
@@ -104,8 +105,8 @@ def fly(
         With a section ``encounter``. Its ``control.mode`` says which flights: off alone; off,
         autopilot and perfect; all four with feedforward.
     folder : path, optional
-        Created if missing. If it holds this flight, only what is missing is computed. Figures and a
-        report are only made with a folder.
+        Created if missing. If it holds flights of this experiment, only missing results are
+        computed. Figures and a report are only made with a folder.
     lidar : object, optional
         With ``step(t, pose, expected) -> Estimate``; default: `VirtualLidar`.
     aircraft : callable, optional
@@ -113,34 +114,34 @@ def fly(
         experiment.
     controller : callable, optional
         Gives, for an aircraft, a function of the preview and the state that returns `Commands`;
-        default: `lidar_mi.encounter.control.feedforward`. It steers wherever there is a preview.
+        default: `lidar_mi.encounter.control.feedforward`. It steers all flights with a preview.
     overwrite : bool
-        Replace the flight of another experiment.
+        Replace the flights of another experiment.
     processes : int
         2: the lidar's wind is estimated in a process of its own, which is faster where a second
         core is idle. The flights are the same but for rounding.
     notice : callable, optional
-        Called with what is running and how far it is (0 to 1, or None).
+        Called with the running step and its progress (0 to 1, or None).
 
     Returns
     -------
-    Flight
-        ``series``, ``track``, ``metrics``; displayed as tables. An aircraft that departs is a
-        result: its flight says so.
+    Flights
+        ``series``, ``track``, ``metrics``; displayed as tables. A flight that is lost (upset) is a
+        result, no error: ``departed`` in its series.
 
     Raises
     ------
     InputError
-        Bad input, or a folder that holds something else.
+        Bad input, or a folder of anything else.
 
     Examples
     --------
     >>> import lidar_mi as lm
     >>> path = {"start": "80 m", "beyond": "20 m"}
-    >>> flight = lm.fly(
+    >>> flights = lm.fly(
     ...     lm.load_experiment("encounter", encounter={"path": path, "control": {"mode": "off"}})
     ... )
-    >>> flight.series["roll"].dims
+    >>> flights.series["roll"].dims
     ('flight', 'time')
     """
     if notice is None:
@@ -161,15 +162,28 @@ def fly(
     log = Log(notice)
     for text in geometry(experiment, aircraft() if aircraft else None):
         log.remark(text)
-    own = {"lidar": lidar, "aircraft": aircraft, "controller": controller}
+    simulate = partial(
+        simulate_flights,
+        experiment,
+        log.bar,
+        lidar=lidar,
+        aircraft=aircraft,
+        controller=controller,
+        processes=processes,
+    )
     if folder is None:
-        return _in_memory(experiment, own, processes, log)
-    kept = FlightFolder(folder, experiment)
-    with kept.claimed(overwrite):
-        log.path = kept.log
+        data = simulate()
+        metrics = encounter_metrics(data.series, data.track)
+        return Flights(experiment, data, metrics, tuple(log.warnings))
+    results = EncounterFolder(folder, experiment)
+    with results.claimed(overwrite):
+        log.path = results.log
         log(f"lidar-mi {__version__}, flight {experiment.name}, seed {experiment.seed}")
+        # the record names no lidar, aircraft or controller of one's own: their flights are not
+        # recognised in a folder
+        reusable = not (lidar or aircraft or controller)
         try:
-            return _into(kept, experiment, own, processes, log)
+            return _into(results, experiment, simulate, reusable, log)
         except BaseException as error:
             if is_interrupt(error):
                 error.add_note("start it again to fly again with the scans that are there")
@@ -180,26 +194,24 @@ def fly(
             raise
 
 
-def _in_memory(experiment: Experiment, own: dict, processes: int, log: Log) -> Flight:
-    flown = fly_all(experiment, log.bar, **own, processes=processes)
-    metrics = encounter_metrics(flown.series, flown.track)
-    return Flight(experiment, flown, metrics, tuple(log.warnings))
-
-
 def _into(
-    kept: FlightFolder, experiment: Experiment, own: dict, processes: int, log: Log
-) -> Flight:
-    """Fly what the folder does not have yet; parts of one's own have no record and fly again."""
-    flown = None if any(own.values()) else kept.flown()
-    metrics = kept.metrics() if flown else None
-    if flown is None:
-        if kept.scans.number:
-            log(f"{kept.scans.number} scans of the flight that was stopped are used again")
-        flown = fly_all(experiment, log.bar, **own, processes=processes, scans=kept.scans)
-        kept.keep(flown)
-        log(f"flown: {', '.join(map(str, flown.series['flight'].values))}")
+    folder: EncounterFolder,
+    experiment: Experiment,
+    simulate: Callable[..., FlightData],
+    reusable: bool,
+    log: Log,
+) -> Flights:
+    """The results that the folder holds; those that it lacks are computed and written."""
+    data = folder.read() if reusable else None
+    metrics = folder.metrics() if data else None
+    if data is None:
+        if folder.scans.number:
+            log(f"{folder.scans.number} scans of the flight that was stopped are used again")
+        data = simulate(scans=folder.scans)
+        folder.write(data)
+        log(f"flown: {', '.join(map(str, data.series['flight'].values))}")
     if metrics is None:
-        metrics = encounter_metrics(flown.series, flown.track)
-        write_report(kept, experiment, flown, metrics, log)
+        metrics = encounter_metrics(data.series, data.track)
+        write_report(folder, experiment, data, metrics, log)
     log("done")
-    return Flight(experiment, flown, metrics, tuple(log.warnings), kept.path)
+    return Flights(experiment, data, metrics, tuple(log.warnings), folder.path)

@@ -1,4 +1,4 @@
-"""The folder of a flight: its experiment, its data sets, its report."""
+"""The folder of an encounter: its experiment, the data sets of its flights, its report."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from lidar_mi.encounter.flight import Flown
+from lidar_mi.encounter.flight import FlightData
 from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
@@ -36,8 +36,8 @@ from lidar_mi.io.yaml import to_yaml
 ANIMATION, SCANS = "approach.gif", "scans"
 
 
-class FlightFolder:
-    """The files of a flight, each written under a temporary name.
+class EncounterFolder:
+    """The files of an encounter, each written under a temporary name.
 
     Parameters
     ----------
@@ -45,42 +45,43 @@ class FlightFolder:
     experiment : Experiment
     """
 
-    def __init__(self, path: str | Path, experiment: Experiment):
+    def __init__(self, path: str | Path, experiment: Experiment) -> None:
         self.path = Path(path)
         self.figures, self.log = self.path / FIGURES, self.path / LOG
         self.record = new_record(experiment, experiment.folder)
+        # trajectories depend on the version of JSBSim, where it is used
         if encounter_of(experiment).aircraft.model != "roll":
             self.record["versions"]["jsbsim"] = version("jsbsim")
         self.made_by = made_by(self.record)
         self.scans = ScanStore(self.path / SCANS, self.made_by)
-        self._beside = experiment.folder.resolve()
+        self._input_folder = experiment.folder.resolve()
 
     @contextmanager
     def claimed(self, overwrite: bool) -> Iterator[None]:
-        """Lock the folder for this flight.
+        """Lock the folder for this experiment.
 
         Raises
         ------
         InputError
-            Another process uses the folder; it is no folder of a flight, or holds that of another
+            Another process uses the folder; it is no folder of flights, or holds those of another
             experiment or version and ``overwrite`` is not set.
         """
         with held(self.path, "flight's folder"):
-            self._begin(overwrite)
+            self._start(overwrite)
             yield
 
-    def _begin(self, overwrite: bool) -> None:
+    def _start(self, overwrite: bool) -> None:
         marker = self.path / RECORD
         if marker.is_file():
-            before = read_record(self.path)
-            if made_by(before) == self.made_by:
+            if made_by(read_record(self.path)) == self.made_by:
                 return
             if not overwrite:
                 raise InputError(
                     f"{self.path}: holds another experiment or was made by another version; "
                     "expected an empty folder (-o DIR), or --overwrite to replace it"
                 )
-            if self._beside == self.path.resolve():
+            # its inputs would be removed with the old results
+            if self._input_folder == self.path.resolve():
                 raise InputError(
                     f"{self.path}: holds the experiment that this one was made from; expected "
                     "another folder (-o DIR)"
@@ -93,26 +94,26 @@ class FlightFolder:
                 path.unlink(missing_ok=True)
             self.scans.remove()
 
-        # if the disk is full, the earlier flight remains unchanged
+        # if the disk is full, the earlier results remain unchanged
         write_atomically(marker, encoded(to_yaml(self.record)), first=remove_old)
 
-    def flown(self) -> Flown | None:
-        """The data sets of this experiment's flights; None: not flown yet."""
-        found = {name: self._read(self.path / file) for name, file in FILES.items()}
-        return Flown(**found) if found["series"] is not None else None
+    def read(self) -> FlightData | None:
+        """The data sets of this experiment's flights; None: not simulated yet."""
+        series, track, slabs = (self._read(FILES[name]) for name in ("series", "track", "slabs"))
+        return None if series is None else FlightData(series, track, slabs)
 
     def metrics(self) -> dict[str, float] | None:
-        """Of a flight that is complete."""
+        """Of complete results; None: there are none."""
         return read_metrics(self.path)
 
-    def keep(self, flown: Flown) -> None:
-        """Write the data sets, the time series last: with it, the flight is there.
+    def write(self, data: FlightData) -> None:
+        """Write the data sets, and remove the stored scans, which only an unfinished flight needs.
 
-        What is kept of its scans is in them.
+        The time series comes last: its file says that all are there.
         """
         (self.path / FILES["series"]).unlink(missing_ok=True)
-        for name in ("seen", "track", "series"):
-            value = getattr(flown, name)
+        for name in ("slabs", "track", "series"):
+            value = getattr(data, name)
             if value is None:
                 (self.path / FILES[name]).unlink(missing_ok=True)
             else:
@@ -120,16 +121,17 @@ class FlightFolder:
         self.scans.remove()
 
     def data_files(self) -> list[str]:
-        """Names of the files beside the report, for links to them."""
+        """Names of the files that the report links to."""
         names = (*FILES.values(), ANIMATION)
         there = [name for name in names if (self.path / name).is_file()]
         return [*there, METRICS, SUMMARY, RECORD, LOG]
 
-    def keep_verdict(self, metrics: Mapping[str, float], page: str, answer: Sequence[str]) -> None:
-        """Write report, answer and metrics: the flight is complete."""
+    def write_verdict(self, metrics: Mapping[str, float], page: str, answer: Sequence[str]) -> None:
+        """Write report, answer and metrics: the results are complete."""
         write_verdict(self.path, self.record, metrics, page, answer)
 
-    def _read(self, path: Path) -> xr.Dataset | None:
+    def _read(self, file: str) -> xr.Dataset | None:
+        path = self.path / file
         if not path.is_file():
             return None
         found = read_netcdf(path)

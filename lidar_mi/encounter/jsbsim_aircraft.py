@@ -7,11 +7,13 @@ aircraft's own aerodynamics see air at rest. Its axes are x forward, y to starbo
 
 import math
 import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache, partial
 from pathlib import Path as FilePath
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.constants import foot, inch, lbf, slug
@@ -22,6 +24,9 @@ from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.schema.encounter import Aircraft, Path
 from lidar_mi.instrument.motion import attitude
 from lidar_mi.io.jsbsim_files import AXES, shipped_aircraft, write_aircraft_in_wake
+
+if TYPE_CHECKING:
+    from jsbsim import FGFDMExec, FGLogger
 
 STEP = 1 / 120
 """Largest step of JSBSim, s."""
@@ -47,8 +52,8 @@ class JSBSimAircraft:
     """An aircraft of JSBSim, trimmed on the path; a model of `aircraft.AircraftModel`.
 
     Its wing has JSBSim's span and area and lies at JSBSim's aerodynamic reference point; the tail
-    has JSBSim's areas and arms. The controls move at the rate of `Aircraft.aileron_rate`, beside
-    what JSBSim's own actuators do.
+    has JSBSim's areas and arms. The controls move at the rate of `Aircraft.aileron_rate`, in
+    addition to the dynamics of JSBSim's own actuators.
 
     Parameters
     ----------
@@ -64,9 +69,9 @@ class JSBSimAircraft:
         trim on this path.
     """
 
-    def __init__(self, aircraft: Aircraft, path: Path):
+    def __init__(self, aircraft: Aircraft, path: Path) -> None:
         try:
-            self._begin(aircraft, path)
+            self._start(aircraft, path)
         except (RuntimeError, ArithmeticError) as error:  # as all of JSBSim's own
             reason = one_line(error, 100).rstrip(".") or type(error).__name__
             raise InputError(
@@ -74,11 +79,12 @@ class JSBSimAircraft:
                 f"expected another aircraft, {_such_as(aircraft.model)}"
             ) from None
 
-    def _begin(self, aircraft, path):
+    def _start(self, aircraft: Aircraft, path: Path) -> None:
         self._climb = path.climb_angle
         self._fdm = _trimmed(aircraft.model, path, FLAPS)
         self.density = self._fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
         self.strips = _strips(self._fdm, aircraft.lift_slope)
+        # derivatives take aircraft of their own, with the flaps of this one
         again = partial(_trimmed, aircraft.model, path, [self._fdm["fcs/flap-cmd-norm"]])
         self.control_moments, self._per_command = _control_moments(again)
         self._at_trim = _commands(self._fdm)
@@ -89,7 +95,7 @@ class JSBSimAircraft:
         )
         self.roll_damping = _roll_damping(again)
         self.deflection = np.zeros(3)
-        self._start = _place(self._fdm)
+        self._origin = _place(self._fdm)
         self.state = self._read(0.0)
 
     @property
@@ -108,8 +114,8 @@ class JSBSimAircraft:
         JSBSim moves the aircraft before it sums up forces: loads and controls act one step later.
         """
         time = self.state.time + dt
-        given = np.concatenate([loads.force, loads.moment, commands.array])
-        if self.state.departed or not np.isfinite(given).all():
+        inputs = np.concatenate([loads.force, loads.moment, commands.array])
+        if self.state.departed or not np.isfinite(inputs).all():
             self.state = replace(self.state, time=time, departed=True)
             return self.state
         count = max(1, math.ceil(dt / STEP - 1e-6))
@@ -126,15 +132,16 @@ class JSBSimAircraft:
         self.state = self._read(time)
         return self.state
 
-    def _normalised(self, deflection):
+    def _normalised(self, deflection: np.ndarray) -> np.ndarray:
+        """Commands of JSBSim, -1 to 1, for deflections in rad; 0 for a control without effect."""
         return np.divide(
             deflection, self._per_command, out=np.zeros(3), where=self._per_command != 0
         )
 
-    def _read(self, time):
+    def _read(self, time: float) -> AircraftState:
         """State in the path frame."""
         fdm = self._fdm
-        north, east, up = _place(fdm) - self._start
+        north, east, up = _place(fdm) - self._origin
         along, upward = math.cos(self._climb), math.sin(self._climb)
         level = attitude(
             fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], -fdm["attitude/psi-rad"]
@@ -142,8 +149,8 @@ class JSBSimAircraft:
         numbers = [north, east, up, *level.as_quat(), fdm["velocities/vt-fps"]]
         if not np.isfinite(numbers).all():
             return replace(self.state, time=time, departed=True)
-        turned = attitude(0.0, self._climb, 0.0).inv() * level
-        yaw, nose_down, roll = turned.as_euler("ZYX")
+        in_path = attitude(0.0, self._climb, 0.0).inv() * level
+        yaw, nose_down, roll = in_path.as_euler("ZYX")
         p, q, r = (fdm[f"velocities/{axis}-rad_sec"] for axis in "pqr")
         return AircraftState(
             time=time,
@@ -161,7 +168,7 @@ class JSBSimAircraft:
         )
 
 
-def _loaded(name) -> Any:
+def _loaded(name: str) -> "FGFDMExec":
     try:
         import jsbsim
     except ImportError:
@@ -172,10 +179,10 @@ def _loaded(name) -> Any:
     root = FilePath(jsbsim.__file__).parent
     names = shipped_aircraft(root)
     if name not in names:
-        alike = get_close_matches(name, names, n=4, cutoff=0.5)
+        similar = get_close_matches(name, names, n=4, cutoff=0.5)
         raise InputError(
             f"encounter.aircraft.model: {name!r} is not known; expected roll or one of the "
-            f"{len(names)} aircraft of JSBSim, such as {', '.join(alike or _LARGE)}"
+            f"{len(names)} aircraft of JSBSim, such as {', '.join(similar or _LARGE)}"
         )
     jsbsim.set_logger(_silent_logger(jsbsim))
     fdm = jsbsim.FGFDMExec(str(root))
@@ -192,33 +199,21 @@ def _loaded(name) -> Any:
 
 
 @cache
-def _silent_logger(jsbsim):
-    """In place of JSBSim's own, which writes to the terminal beside what it raises."""
+def _silent_logger(jsbsim: ModuleType) -> "FGLogger":
+    """In place of JSBSim's own, which writes to the terminal whatever it also raises."""
 
-    class Silent(jsbsim.FGLogger):
-        def set_level(self, level):
-            pass
+    def ignore(self: object, *arguments: Any) -> None:
+        pass
 
-        def file_location(self, filename, line):
-            pass
-
-        def message(self, message):
-            pass
-
-        def format(self, format):
-            pass
-
-        def flush(self):
-            pass
-
-    return Silent()
+    names = ("set_level", "file_location", "message", "format", "flush")
+    return type("Silent", (jsbsim.FGLogger,), dict.fromkeys(names, ignore))()
 
 
-def _such_as(name) -> str:
+def _such_as(name: str) -> str:
     return f"such as {next(one for one in _LARGE if one != name)}"
 
 
-def _trimmed(name, path, flap_settings) -> Any:
+def _trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec":
     """JSBSim on the path, in equilibrium."""
     best = None
     for flaps in flap_settings:
@@ -250,12 +245,13 @@ def _trimmed(name, path, flap_settings) -> Any:
     return best
 
 
-def _place(fdm):
+def _place(fdm: "FGFDMExec") -> np.ndarray:
     """North, east, up, m."""
     return foot * np.array([fdm[f"position/from-start-neu-{axis}-ft"] for axis in "neu"])
 
 
-def _set_loads(fdm, force, moment):
+def _set_loads(fdm: "FGFDMExec", force: np.ndarray, moment: np.ndarray) -> None:
+    """Let a force (N) and a moment (N m) of the body frame act from now on."""
     for k, axis in enumerate(AXES):
         # the force acts at the centre of gravity, which moves as fuel burns
         for other in AXES:
@@ -267,57 +263,64 @@ def _set_loads(fdm, force, moment):
         )
 
 
-def _commands(fdm):
+def _commands(fdm: "FGFDMExec") -> np.ndarray:
     return np.array([fdm[f"fcs/{name}-cmd-norm"] for name in _CONTROLS])
 
 
-def _set_commands(fdm, normalised):
+def _set_commands(fdm: "FGFDMExec", normalised: np.ndarray) -> None:
     for name, value in zip(_CONTROLS, normalised, strict=True):
         fdm[f"fcs/{name}-cmd-norm"] = value
 
 
-def _moments(fdm):
+def _moments(fdm: "FGFDMExec") -> np.ndarray:
     """Aerodynamic moment in our axes, N m."""
     names = [f"moments/{axis}-aero-lbsft" for axis in "lmn"]
     return _TO_OURS * [fdm[name] for name in names] * lbf * foot
 
 
-def _control_moments(again, small=0.05):
-    """Moment per deflection, and deflection per normalised command, from small commands in trim."""
+def _control_moments(
+    again: Callable[[], "FGFDMExec"], small: float = 0.05
+) -> tuple[np.ndarray, np.ndarray]:
+    """Moment per deflection, and deflection per normalised command, from small commands in trim.
+
+    Two aircraft fly side by side, one with the command: in their difference the aircraft's own
+    motion in an imperfect trim cancels.
+    """
     moments, per_command = np.zeros((3, 3)), np.zeros(3)
     for k, position in enumerate(_POSITIONS):
-        flown, trimmed = again(), again()
-        before = flown[position]
-        _set_commands(flown, _commands(flown) + small * np.eye(3)[k])
+        steered, trimmed = again(), again()
+        before = steered[position]
+        _set_commands(steered, _commands(steered) + small * np.eye(3)[k])
         last = before
         for _ in range(_SETTLED):
-            flown.run()
+            steered.run()
             trimmed.run()
-            if flown[position] == last != before:
+            if steered[position] == last != before:
                 break
-            last = flown[position]
-        change = _moments(flown) - _moments(trimmed)
-        turned = flown[position] - before
+            last = steered[position]
+        change = _moments(steered) - _moments(trimmed)
+        deflection = steered[position] - before
         if not change.any():
             continue
-        per_command[k] = (turned or small * _NOMINAL) / small
+        per_command[k] = (deflection or small * _NOMINAL) / small
         moments[:, k] = change / (per_command[k] * small)
     return moments, per_command
 
 
-def _roll_damping(again, steps=6):
+def _roll_damping(again: Callable[[], "FGFDMExec"], steps: int = 6) -> float:
     """Aerodynamic rolling moment per roll rate, from a moment that acts for 0.05 s in trim."""
-    flown, trimmed = again(), again()
-    inertia = flown["inertia/ixx-slugs_ft2"] * slug * foot**2
-    _set_loads(flown, np.zeros(3), np.array([inertia * 1.0, 0.0, 0.0]))
+    rolling, trimmed = again(), again()
+    # 1 rad/s^2: small rates, at which the moment is linear
+    inertia = rolling["inertia/ixx-slugs_ft2"] * slug * foot**2
+    _set_loads(rolling, np.zeros(3), np.array([inertia * 1.0, 0.0, 0.0]))
     for _ in range(steps):
-        flown.run()
+        rolling.run()
         trimmed.run()
-    change = _moments(flown)[0] - _moments(trimmed)[0]
-    return float(change / (flown["velocities/p-rad_sec"] - trimmed["velocities/p-rad_sec"]))
+    change = _moments(rolling)[0] - _moments(trimmed)[0]
+    return float(change / (rolling["velocities/p-rad_sec"] - trimmed["velocities/p-rad_sec"]))
 
 
-def _strips(fdm, lift_slope) -> Strips:
+def _strips(fdm: "FGFDMExec", lift_slope: float) -> Strips:
     """Wing, and the tail surfaces that JSBSim knows."""
     arm = [fdm[f"metrics/aero-rp-{axis}-in"] - fdm[f"inertia/cg-{axis}-in"] for axis in AXES]
     place = np.array([-arm[0], 0.0, arm[2]]) * inch  # JSBSim's x is to the rear here, z up

@@ -1,5 +1,7 @@
 """The speeds of the lines of sight of successive slabs, from their frames."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import xarray as xr
@@ -17,15 +19,15 @@ from lidar_mi.retrieval.rings.matched import MatchedScore, matched_score, read_m
 
 # Frames of a slab whose fits are the reference of all.
 _REFERENCE = 8
-# Of the lines that have to follow the reference for the next slab.
-_ENOUGH = 0.5
+# Fraction of the lines that the reference may miss before the next slab gets a new one.
+_MOST_MISSED = 0.5
 
 
 class LineSpeeds:
-    """Reads slab after slab by the score function of a reference.
+    """Reads the speeds of slab after slab by the score function of a reference.
 
-    The reference is the fit of some frames of the first slab, or of a later one once half of the
-    lines do not follow it any more. Frames that do not follow are fitted on their own.
+    The reference is the fit of some frames of the first slab, or of a later one once it no longer
+    describes half of the lines. Frames that it does not describe are fitted one by one.
 
     Parameters
     ----------
@@ -33,21 +35,22 @@ class LineSpeeds:
         Whose frames are read; the instrument is the one that the experiment assumes.
     """
 
-    def __init__(self, scans: DopplerScans):
+    def __init__(self, scans: DopplerScans) -> None:
         experiment, rings, log = scans.experiment, scans.rings, Log(silent)
-        given = call(calibration_file, experiment, rings=rings)
-        self._experiment = experiment
+        calibration = call(calibration_file, experiment, rings=rings)
+        self._experiment, self._doppler = experiment, scans.doppler
         self._assumed = call(
-            assumed_rings, experiment, rings=rings, calibration_file=given, log=log
+            assumed_rings, experiment, rings=rings, calibration_file=calibration, log=log
         )
-        self._noises = line_noises(experiment.doppler, experiment.sensor.pulses, rings)
+        self._pulses = scans.sensor.pulses
+        self._noises = line_noises(self._doppler, self._pulses, rings)
         self._scores: list[MatchedScore] | None = None
 
     def read(self, frames: LineFrames) -> xr.Dataset:
         """The lines with their speeds and standard errors, as `with_speeds` gives them."""
-        self._scores = self._scores or self._learnt(frames)
+        self._scores = self._scores or self._reference(frames)
         if self._scores is None:
-            return self._with(frames, self._alone(frames, range(len(frames.air))))
+            return self._with(frames, self._fitted(frames, range(len(frames.air))))
         air, laser = (
             read_matched(part, score)
             for part, score in zip((frames.air, frames.laser), self._scores, strict=True)
@@ -57,14 +60,14 @@ class LineSpeeds:
         found = torch.stack([*difference(air, emitted), emitted.v_los_std]).numpy()
         missed = np.flatnonzero(~(air.read & laser.read[own]).numpy())
         if missed.size:
-            found[:, missed] = self._alone(frames, missed)
-        if missed.size > _ENOUGH * len(frames.air):
+            found[:, missed] = self._fitted(frames, missed.tolist())
+        if missed.size > _MOST_MISSED * len(frames.air):
             self._scores = None
         return self._with(frames, found)
 
-    def _learnt(self, frames: LineFrames) -> list[MatchedScore] | None:
+    def _reference(self, frames: LineFrames) -> list[MatchedScore] | None:
         """Score functions of air and laser; None where the frames do not fit the model."""
-        assumed, settings = self._assumed, self._experiment.doppler.retrieval
+        assumed, settings = self._assumed, self._doppler.retrieval
         found = []
         for part, model, noise in zip(
             (frames.air, frames.laser), (assumed.model, assumed.laser), self._noises, strict=True
@@ -83,14 +86,13 @@ class LineSpeeds:
             found.append(matched_score(fit, model, noise, response=assumed.response))
         return found
 
-    def _alone(self, frames: LineFrames, lines) -> np.ndarray:
-        """Speeds (4, lines) of some lines by fits of their own; NaN where one is refused."""
-        lines = list(lines)
-        own = [frames.own[line] for line in lines]
+    def _fitted(self, frames: LineFrames, lines: Sequence[int]) -> np.ndarray:
+        """Speeds (4, lines) of some lines by a fit each; NaN where a fit is refused."""
+        some, own = list(lines), [frames.own[line] for line in lines]
         return speeds_to_laser(
-            frames.air[lines],
+            frames.air[some],
             frames.laser[own],
-            self._experiment.doppler,
+            self._doppler,
             self._assumed,
             self._noises,
             RingMethod.ANNULAR,
@@ -98,12 +100,15 @@ class LineSpeeds:
         )
 
     def _with(self, frames: LineFrames, found: np.ndarray) -> xr.Dataset:
-        experiment = self._experiment
+        v_los, std, systematic, laser_std = found
         return with_speeds(
             frames.lines,
-            *found,
-            experiment.doppler,
-            experiment.sensor.pulses,
-            experiment.seed,
+            v_los,
+            std,
+            systematic,
+            laser_std,
+            self._doppler,
+            self._pulses,
+            self._experiment.seed,
             frames.scan,
         )

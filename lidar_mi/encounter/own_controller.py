@@ -1,4 +1,4 @@
-"""A controller of one's own: its faults become one line that names it, and what it has to be."""
+"""A controller of the user: its faults become one line with its name and what is expected."""
 
 import functools
 import inspect
@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable
 from numbers import Real
 from pathlib import Path
+from typing import Any
 
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Commands
 from lidar_mi.encounter.control import Controller, Preview
@@ -16,7 +17,7 @@ _MAKER = "expected a function of the aircraft that returns a controller"
 _CONTROLLER = "expected a function of the preview and the state that returns Commands"
 
 
-def name_of(maker: Callable) -> str:
+def name_of(maker: Callable[..., Any]) -> str:
     """What a controller is called in tables, figures and messages."""
     while isinstance(maker, functools.partial):
         maker = maker.func
@@ -24,7 +25,7 @@ def name_of(maker: Callable) -> str:
     return "own controller" if name == "<lambda>" else name
 
 
-def own_controller(maker: Callable, aircraft: AircraftModel) -> Controller:
+def own_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Controller:
     """The controller that a function makes for an aircraft, checked at every call.
 
     Parameters
@@ -72,13 +73,13 @@ def own_controller(maker: Callable, aircraft: AircraftModel) -> Controller:
     return controller
 
 
-def _takes(function: Callable, count: int) -> bool:
+def _takes(function: Callable[..., Any], count: int) -> bool:
     """Whether a function can be called with so many arguments; unknown ones are tried."""
     try:
         inspect.signature(function).bind(*range(count))
     except TypeError:
         return False
-    except ValueError:  # written in C
+    except ValueError:  # functions in C have no signature
         return True
     return True
 

@@ -1,4 +1,4 @@
-"""Where the lidar of a flight looks, if its scanner is told a wrong attitude."""
+"""Pointing of the lidar of a flight whose reported attitude has errors."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,7 +10,7 @@ from lidar_mi.instrument.reported import Reported, reported_pose
 
 
 def pointing_error(experiment: Experiment, number: int, time: float) -> Rotation | None:
-    """True attitude of the lidar in a scan, from the one that its beams are aimed by.
+    """True attitude of the lidar in a scan, relative to the one by which its beams are aimed.
 
     The scanner compensates the attitude that is reported. Its error is that of
     `lidar_mi.instrument.reported.reported_pose`, one draw a scan.
@@ -24,14 +24,15 @@ def pointing_error(experiment: Experiment, number: int, time: float) -> Rotation
     if reported is None:
         return None
     level = Pose(np.zeros((1, 3)), np.zeros((1, 3)), Rotation.identity(1))
-    told = reported_pose(reported, lambda _: level, np.array([time]), 0.0, experiment.seed, number)
-    return told.attitude[0].inv()
+    found = reported_pose(reported, lambda _: level, np.array([time]), 0.0, experiment.seed, number)
+    # the scanner turns the beams against the reported attitude
+    return found.attitude[0].inv()
 
 
 def check_reported(reported: Reported | None) -> None:
-    """Refuse what has no meaning in flight, where only the reported attitude may err.
+    """Refuse errors without effect in flight, where only the reported attitude has errors.
 
-    Wake and aircraft are seen from one place: its error cancels.
+    The places of wake and aircraft have the same error, which cancels.
 
     Raises
     ------

@@ -35,7 +35,7 @@ class AircraftPose:
     pitch: float = 0.0
     yaw: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
             if not np.isfinite(value):

@@ -1,12 +1,13 @@
-"""From the lidar's estimates to the loads that the wake will bring.
+"""From the lidar's estimates to the loads of the wake ahead.
 
-The wind expected in a plane is that of the track there, carried on to the time of arrival. A track
-that was lost remains good for the slabs that it has seen and the aircraft has not reached yet.
+The wind expected in a plane is that of the track there, predicted to the time of arrival. A lost
+track remains valid for its slabs that are still ahead of the aircraft.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from functools import partial
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -20,10 +21,11 @@ from lidar_mi.retrieval.vortices.model import wind as pair_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.track import Track, first_track, updated
 
-# Slabs ahead of the newest one in which the track is still steered by: as many as it may miss.
+# Slabs beyond the newest one that a track still predicts: as many as it may miss before it is lost.
 _SLABS_BEYOND = 5
 
 
+@runtime_checkable
 class Lidar(Protocol):
     """What a flight needs of a lidar: it is stepped from scan to scan."""
 
@@ -43,8 +45,8 @@ class Slab:
 
 
 @dataclass(eq=False)
-class Lookout:
-    """Steps a lidar in flight and keeps the track of the vortices.
+class WakeTracker:
+    """Scans in flight and tracks the vortices from slab to slab.
 
     Attributes
     ----------
@@ -55,46 +57,48 @@ class Lookout:
         From slab to slab, m.
     latest : float
         Time of the last scan, s.
+    on_estimate : callable, optional
+        Called with the lidar's estimate after every scan.
     slabs : list of Slab
         Those that were delivered, in their order.
-    seen : callable, optional
-        Called after every scan with the lidar's estimate.
     """
 
     lidar: Lidar
     period: float
     stride: float
     latest: float = np.inf
-    seen: Callable[[Estimate], None] | None = None
+    on_estimate: Callable[[Estimate], None] | None = None
     slabs: list[Slab] = field(default_factory=list)
-    _waiting: list[Estimate] = field(default_factory=list)
+    _undelivered: list[Estimate] = field(default_factory=list)
     _usable: list[Track] = field(default_factory=list)
     _scans: int = 0
-    _seen_at: tuple[float, float] = (np.nan, np.nan)
+    _last_slab: tuple[float, float] = (np.nan, np.nan)
 
-    def look(self, state: AircraftState) -> None:
-        """Scan if it is time, and take what was delivered meanwhile."""
+    def update(self, state: AircraftState) -> None:
+        """Scan if a scan is due, and track the slabs delivered since the last call."""
+        # an upset aircraft points its lidar nowhere: its poses may not even be finite
         if state.departed:
             return
         due = self._scans * self.period
+        # times are sums of steps: they may fall short of a scan's by rounding
         if due <= state.time + 1e-9 and due <= self.latest + 1e-9:
             pose = AircraftPose(state.x, state.y, state.z, state.roll, state.pitch, state.yaw)
             estimate = self.lidar.step(due, pose, self._expected())
             self._scans += 1
-            self._waiting.append(estimate)
-            self._seen_at = (estimate.x, estimate.time)
-            if self.seen:
-                self.seen(estimate)
-        while self._waiting and self._waiting[0].delivered <= state.time + 1e-9:
-            self._take(self._waiting.pop(0))
+            self._undelivered.append(estimate)
+            self._last_slab = (estimate.x, estimate.time)
+            if self.on_estimate:
+                self.on_estimate(estimate)
+        while self._undelivered and self._undelivered[0].delivered <= state.time + 1e-9:
+            self._track(self._undelivered.pop(0))
 
     @property
     def track(self) -> Track | None:
         """The newest one."""
         return self.slabs[-1].track if self.slabs else None
 
-    def is_known(self, x: float) -> bool:
-        """Whether a usable track reaches a plane, m: there is no wind ahead of all slabs."""
+    def covers(self, x: float) -> bool:
+        """Whether a usable track reaches the plane x (m)."""
         reach = _SLABS_BEYOND * self.stride
         return any(x <= track.x + reach for track in self._usable)
 
@@ -103,57 +107,60 @@ class Lookout:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Expected u, v, w (m/s) at places (m, path frame) and times (s); u is not tracked.
 
-        Places and times broadcast. Each place is told by the usable track with the slab nearest to
-        it.
+        Places and times broadcast. The wind of each place is that of the usable track with the slab
+        nearest to it.
         """
         x, y, z, time = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
         away = [np.abs(x[..., None] - [one.x for one in t.slabs]).min(-1) for t in self._usable]
         nearest = np.argmin(away, axis=0)
-        found = np.zeros((3, *x.shape))
+        # u stays 0: the pair of two images has no wind along the path
+        u, v, w = found = np.zeros((3, *x.shape))
         for k, track in enumerate(self._usable):
             here = nearest == k
             theta = torch.as_tensor(track.parameters_at(x[here], time[here]))
-            places = (torch.as_tensor(a[here]) for a in (y, z))
-            found[1:, here] = pair_wind(theta, *places, track.profile).numpy()
-        return tuple(found)
+            at_y, at_z = (torch.as_tensor(a[here]) for a in (y, z))
+            found[1:, here] = pair_wind(theta, at_y, at_z, track.profile).numpy()
+        return u, v, w
 
-    def preview(self, aircraft: AircraftModel) -> Callable[[AircraftState], Preview | None]:
-        """Looks, then gives the loads expected by the track; None while there is none."""
-        expected = preview_of(aircraft, self.wind)
+    def preview(self, aircraft: AircraftModel, state: AircraftState) -> Preview | None:
+        """The loads expected by the track from a state on; None while there is none.
 
-        def ahead(state: AircraftState) -> Preview | None:
-            self.look(state)
-            return expected(state) if self.is_known(state.x) else None
-
-        return ahead
+        Calls `update` first.
+        """
+        self.update(state)
+        return preview_in(self.wind, aircraft, state) if self.covers(state.x) else None
 
     def _expected(self) -> VortexPairFit | None:
         """The pair that the track expects in the slab that the next scan completes."""
         track = self.track
         if track is None or track.lost:
             return None
-        x, time = self._seen_at
+        x, time = self._last_slab
         return track.pair_at(x + self.stride, time + self.period)
 
-    def _take(self, estimate: Estimate) -> None:
-        before, pair = self.track, estimate.pair
-        if before is None:
-            valid = pair is not None and pair.success
-            found = first_track(pair, estimate.x, estimate.time) if valid else None
-        else:
+    def _track(self, estimate: Estimate) -> None:
+        before, pair, found = self.track, estimate.pair, None
+        if before is not None:
             found = updated(before, pair, estimate.x, estimate.time)
+        elif pair is not None and pair.success:
+            found = first_track(pair, estimate.x, estimate.time)
         self.slabs.append(Slab(estimate, found))
         if found is not None and found.usable:
-            # the same track with one more slab replaces what it was before
+            # a track with one more slab replaces itself; a new track follows the lost one, whose
+            # slabs the aircraft has yet to reach
             last = self._usable[-1].x if self._usable else None
             continued = any(slab.x == last for slab in found.slabs)
             self._usable[len(self._usable) - continued :] = [found]
 
 
-def preview_of(aircraft: AircraftModel, wind: Wind) -> Callable[[AircraftState], Preview]:
-    """The wake's loads on any state flown on, in a wind that is known anywhere at any time."""
+def preview_in(wind: Wind, aircraft: AircraftModel, state: AircraftState) -> Preview:
+    """The loads of a wind on an aircraft that goes on from a state.
 
-    def ahead(state: AircraftState) -> Preview:
-        return lambda time: loads_in_wind(aircraft.strips, state, wind, aircraft.density, time)
-
-    return ahead
+    Parameters
+    ----------
+    wind : callable
+        Known anywhere at any time.
+    aircraft : AircraftModel
+    state : AircraftState
+    """
+    return partial(loads_in_wind, aircraft.strips, state, wind, aircraft.density)

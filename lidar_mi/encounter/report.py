@@ -1,4 +1,4 @@
-"""Figures, animation and report of a flight, into its folder."""
+"""Figures, animation and report of an encounter, into its folder."""
 
 from collections.abc import Mapping
 
@@ -12,8 +12,8 @@ from lidar_mi.assessment.report.answer import verdict
 from lidar_mi.assessment.report.encounter import encounter_answer, encounter_chapter
 from lidar_mi.assessment.report.page import Film, page
 from lidar_mi.encounter.doppler import at_the_slabs
-from lidar_mi.encounter.flight import Flown, aircraft_of
-from lidar_mi.encounter.folder import ANIMATION, FlightFolder
+from lidar_mi.encounter.flight import FlightData, aircraft_of
+from lidar_mi.encounter.folder import ANIMATION, EncounterFolder
 from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.log import Log
@@ -23,63 +23,71 @@ from lidar_mi.io.film import frame_as_webp, write_gif
 
 
 def write_report(
-    kept: FlightFolder, experiment: Experiment, flown: Flown, metrics: Mapping[str, float], log: Log
+    folder: EncounterFolder,
+    experiment: Experiment,
+    data: FlightData,
+    metrics: Mapping[str, float],
+    log: Log,
 ) -> None:
     """Draw, and write figures, animation, report and metrics, these last."""
     log("drawing figures")
     span = float(np.ptp(aircraft_of(encounter_of(experiment)).strips.places[:, 1]))
-    drawn = draw_all(kept.figures, flown.series, flown.track, flown.seen, span, log)
+    drawn = draw_all(folder.figures, data.series, data.track, data.slabs, span, log)
     chapter = encounter_chapter(
         metrics,
-        judged(experiment, flown),
+        judged(experiment, data),
         drawn,
-        _film(kept, flown, span, log),
-        flown.series.attrs.get(CONTROLLER, ""),
+        _film(folder, data, span, log),
+        data.series.attrs.get(CONTROLLER, ""),
     )
-    found = answer(experiment, flown, metrics)
+    found = answer(experiment, data, metrics)
     html = page(
         at_the_slabs(experiment, gates_of(experiment)),
         dump(experiment),
-        kept.record["versions"],
+        folder.record["versions"],
         metrics,
         [chapter],
         log.warnings,
         found,
-        kept.data_files(),
+        folder.data_files(),
     )
-    kept.keep_verdict(metrics, html, found)
+    folder.write_verdict(metrics, html, found)
 
 
-def answer(experiment: Experiment, flown: Flown, metrics: Mapping[str, float]) -> list[str]:
-    """What a reader wants to know first, and the verdict on the lidar's wind, in sentences."""
-    verdicts = [verdict(table, rows) for table, rows in judged(experiment, flown)]
-    return [*encounter_answer(metrics, flown.series.attrs.get(CONTROLLER, "")), *verdicts]
+def answer(experiment: Experiment, data: FlightData, metrics: Mapping[str, float]) -> list[str]:
+    """The main results, and the verdict on the lidar's wind, in sentences."""
+    verdicts = [verdict(table, rows) for table, rows in judged(experiment, data)]
+    return [*encounter_answer(metrics, data.series.attrs.get(CONTROLLER, "")), *verdicts]
 
 
-def judged(experiment: Experiment, flown: Flown) -> list[tuple[RequirementTable, list[Finding]]]:
-    """The lidar compared with the requirements as it measured in flight; empty without one."""
-    if flown.track is None:
+def judged(
+    experiment: Experiment, data: FlightData
+) -> list[tuple[RequirementTable, list[Finding]]]:
+    """The lidar's measurements in flight compared with the requirements; empty without a lidar."""
+    if data.track is None:
         return []
     encounter = encounter_of(experiment)
     stride = encounter.path.speed / encounter.rate
     depth = stride / max(1, round(stride / experiment.scan.thickness))
-    measured = measured_in_flight(flown.series, flown.track, depth)
+    measured = measured_in_flight(data.series, data.track, depth)
     return judged_in_flight(read_requirements(), measured, encounter.path.speed)
 
 
-def _film(kept: FlightFolder, flown: Flown, span: float, log: Log) -> Film | None:
+def _film(folder: EncounterFolder, data: FlightData, span: float, log: Log) -> Film | None:
     """Frames for the report; the same as an animation in the folder."""
-    pixels, frames, times = [], [], []
-    for frame in film(flown.series, flown.track, flown.seen, span):
+    pixels: list[np.ndarray] = []
+    frames: list[tuple[bytes, str]] = []
+    times: list[float] = []
+    for frame in film(data.series, data.track, data.slabs, span):
         log.bar("drawing the animation", len(frames) / MOST_FRAMES)
         pixels.append(frame.pixels)
         frames.append((frame_as_webp(frame.pixels), frame.caption))
         times.append(frame.time)
     if len(frames) < 2:
         return None
-    # twice as slow as flown
+    # half the speed of the flight: the wake is crossed in a second or two
     seconds = 2 * (times[-1] - times[0]) / (len(times) - 1)
-    write_gif(kept.path / ANIMATION, pixels, seconds)
+    write_gif(folder.path / ANIMATION, pixels, seconds)
     return Film(
         "The flight",
         "Above: backscatter of the slab that is seen now, true cores (crosses) and tracked ones, "

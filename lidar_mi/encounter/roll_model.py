@@ -24,7 +24,7 @@ class RollModel:
         Speed and altitude.
     """
 
-    def __init__(self, aircraft: Aircraft, path: Path):
+    def __init__(self, aircraft: Aircraft, path: Path) -> None:
         self.state = AircraftState(airspeed=path.speed)
         self.density = float(Atmosphere(path.altitude).density[0])
         self.strips = wing_strips(aircraft.span, aircraft.wing_area, aircraft.lift_slope)
@@ -56,11 +56,13 @@ class RollModel:
         self.deflection, moving = deflected(self.deflection, commands, dt, self.limits)
         after = self.deflection[0]
         roll, rate = state.roll, state.roll_rate
+        # the aileron moves at its rate, then rests: the moment is linear in both parts
         for duration, start, end in ((moving[0], before, after), (dt - moving[0], after, after)):
             if duration > 0:
                 moments = loads.moment[0] + self.control_moments[0, 0] * np.array([start, end])
                 roll, rate = self._rolled(roll, rate, duration, *(moments / self.roll_inertia))
         time = state.time + dt
+        # not "beyond": a roll angle that is no number is an upset, too
         self.state = replace(
             state,
             time=time,
@@ -71,8 +73,13 @@ class RollModel:
         )
         return self.state
 
-    def _rolled(self, roll, rate, dt, start, end):
-        """p' = -p / tau + m, where m goes from start to end in dt: the solution of the line."""
+    def _rolled(
+        self, roll: float, rate: float, dt: float, start: float, end: float
+    ) -> tuple[float, float]:
+        """Roll (rad) and roll rate (rad/s) after dt of p' = -p / tau + m.
+
+        m changes linearly from start to end (rad/s^2).
+        """
         tau = self.time_constant
         slope = (end - start) / dt
         # a particular solution is p = tau (m - slope tau)

@@ -1,4 +1,4 @@
-"""The scans of a flight that is not over: a flight that was stopped does not render them again."""
+"""The scans of an unfinished flight: one that was stopped does not render them again."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,9 +13,9 @@ from lidar_mi.experiment.folder.image_store import MADE_BY
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 
-# m and rad: poses of a flight that is flown again differ by rounding, which moves no image.
+# m and rad: poses of a flight that is simulated again differ by rounding, which moves no image.
 _ROUNDING = 1e-6
-# Images of a scan, and the gate that each is of: both gates have axes of their own.
+# Images of a scan and their gates: both gates have axes of their own.
 _PARTS = (("near", "near"), ("far", "far"), ("far_noise", "far"))
 
 
@@ -50,8 +50,8 @@ class ScanStore:
     folder: Path
     made_by: str
 
-    def kept(self, number: int, pose: AircraftPose) -> Scan | None:
-        """The scan of this number, if it is there and was made from this pose."""
+    def read(self, number: int, pose: AircraftPose) -> Scan | None:
+        """The scan of this number, if it is stored and was made from this pose."""
         path = self._path(number)
         if not path.is_file():
             return None
@@ -71,7 +71,7 @@ class ScanStore:
             )
         )
 
-    def keep(self, number: int, pose: AircraftPose, scan: Scan) -> None:
+    def write(self, number: int, pose: AircraftPose, scan: Scan) -> None:
         """Write a scan."""
         make_folder(self.folder)
         images = {
@@ -83,7 +83,7 @@ class ScanStore:
 
     @property
     def number(self) -> int:
-        """Of scans that are there."""
+        """Of stored scans."""
         return len(list(self.folder.glob("scan_*.nc")))
 
     def remove(self) -> None:

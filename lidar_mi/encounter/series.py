@@ -1,4 +1,4 @@
-"""A flight as data sets: its time series, the track slab by slab, what the lidar saw."""
+"""Flights as data sets: the time series, and the track slab by slab."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -50,8 +50,8 @@ _DEFLECTION = ("rad", "aileron as deflected")
 _CONTROL = ("N m", "rolling moment of the controls")
 
 
-class Recorder:
-    """Collects a flight instant by instant."""
+class FlightRecorder:
+    """Records a flight, instant by instant."""
 
     def __init__(self) -> None:
         self._rows: list[dict[str, float]] = []
@@ -65,9 +65,10 @@ class Recorder:
         deflection: np.ndarray,
         control_moments: np.ndarray,
     ) -> None:
-        """One instant."""
+        """Record one instant: deflections in rad, moments per deflection in N m per rad."""
         row = {field.name: float(getattr(state, field.name)) for field in fields(state)}
         row |= _named(loads, "")
+        # every instant has all columns
         nothing = Loads(np.full(3, np.nan), np.full(3, np.nan))
         row |= _named(predicted or nothing, "predicted_")
         row |= {name: float(getattr(commands, name)) for name in _COMMANDS}
@@ -106,6 +107,7 @@ def _named(loads: Loads, prefix: str) -> dict[str, float]:
 
 def flights_dataset(flights: dict[str, xr.Dataset]) -> xr.Dataset:
     """Flights of the same duration as one data set, dims (flight, time)."""
+    # times of the flights of an encounter are equal to the last bit: a difference is a fault
     names = xr.DataArray(list(flights), dims="flight", attrs={"long_name": "what steers"})
     return xr.concat(list(flights.values()), names.rename("flight"), join="exact")
 
@@ -197,6 +199,7 @@ def _numbers(pair: VortexPairFit | None) -> dict[str, float]:
         k = PARAMETERS.index(name.replace("core_radius", "log_radius"))
         value = float(np.exp(pair.parameters[k]) if logarithm else pair.parameters[k])
         found[name] = value
+        # to first order the standard error of exp(q) is exp(q) times that of q
         found[f"{name}_stderr"] = float(stderr[k]) * (value if logarithm else 1.0)
     return found
 
@@ -208,7 +211,9 @@ def _line_error(lines: xr.Dataset | None) -> float:
     return float(np.sqrt(((lines["v_los"] - lines["v_los_true"]) ** 2).mean()))
 
 
-def _wind_errors(wind: xr.Dataset | None, wake, x: float, time: float) -> dict[str, float]:
+def _wind_errors(
+    wind: xr.Dataset | None, wake: WakeAlongPath, x: float, time: float
+) -> dict[str, float]:
     """Rms errors of the vectors that are valid; NaN where a component was not estimated."""
     found = {"error_u": np.nan, "error_v": np.nan, "error_w": np.nan, "vectors": 0.0}
     if wind is None:

@@ -4,8 +4,8 @@ import gc
 import time
 import weakref
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from concurrent.futures import Future
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import loky
 import numpy as np
@@ -18,6 +18,9 @@ from lidar_mi.retrieval.vortices.model import wind as model_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.slabs import awaited_wind, wind_of_slab
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 Complete = Callable[[xr.Dataset], tuple[xr.Dataset, tuple[str, ...]]]
 """From the images' wind to the wind that is delivered, and flags."""
@@ -51,7 +54,7 @@ class FirstImage(NamedTuple):
     expected: VortexPairFit | None = None
 
 
-class Found(NamedTuple):
+class SlabWind(NamedTuple):
     """The wind of a slab.
 
     Attributes
@@ -69,7 +72,7 @@ class Found(NamedTuple):
 
 
 def limits(wind: xr.Dataset) -> tuple[str, ...]:
-    """What half of the vectors or more are flagged for, in words, such as "wind: no skill"."""
+    """Reasons for which half of the vectors or more are flagged, such as "wind: no skill"."""
     flag = wind["flag"]
     return tuple(
         f"wind: {name.replace('_', ' ')}"
@@ -83,9 +86,9 @@ def limits(wind: xr.Dataset) -> tuple[str, ...]:
 class SlabWinds:
     """The winds of successive slabs by one method.
 
-    By "variational" a wind starts from the last one, moved with the expected pair and changed as
-    the winds of both pairs differ. It does not wait for this slab's vortices. Other methods start
-    from nothing.
+    By "variational" a wind starts from the last one, moved with the expected pair and changed by
+    the difference of the winds of both pairs. It does not depend on this slab's vortices. Other
+    methods start from nothing.
 
     Parameters
     ----------
@@ -94,16 +97,18 @@ class SlabWinds:
         Options of `retrieve_wind`.
     """
 
-    def __init__(self, method: ImageMethod, windows: dict[str, Any]):
+    def __init__(self, method: ImageMethod, windows: dict[str, Any]) -> None:
         self._method, self._windows = method, windows
         self._flow: Flow | None = None
         # the pair of the slab whose wind was found from nothing: prior and noise are known there
-        self._learnt: VortexPairFit | None = None
+        self._reference: VortexPairFit | None = None
         self._slab: FirstImage
-        self._awaited: Awaited | None = None
+        self._prepared: Awaited | None = None
 
-    def awaits(self, slab: FirstImage, before: VortexPairFit | None) -> Callable[[], float]:
-        """Take the first image of the next slab, before the second one is there.
+    # no derivatives are recorded, as in `Estimator.pair_of`
+    @torch.inference_mode()
+    def prepare(self, slab: FirstImage, before: VortexPairFit | None) -> float:
+        """Do the part of the next wind that does not need the second image.
 
         Parameters
         ----------
@@ -113,14 +118,17 @@ class SlabWinds:
 
         Returns
         -------
-        callable
-            Does what can be done of the wind without the second image, and gives the time (s) that
-            it took.
+        float
+            Duration, s.
         """
-        return partial(self._awaits, slab, before)
+        began = time.perf_counter()
+        self._slab, start = slab, self._start(slab, before)
+        self._prepared = awaited_wind(slab.image, start, slab.noise) if start else None
+        return time.perf_counter() - began
 
-    def begun(self, second: xr.DataArray, complete: Complete | None = None) -> Callable[[], Found]:
-        """The wind of the slab that is awaited, retrieved when it is asked for.
+    @torch.inference_mode()
+    def retrieve(self, second: xr.DataArray, complete: Complete | None = None) -> SlabWind:
+        """The wind of the slab that was prepared.
 
         Parameters
         ----------
@@ -131,23 +139,10 @@ class SlabWinds:
 
         Returns
         -------
-        callable
-            Gives the wind as `retrieve_wind` does, completed, and the time that it took. By
-            "variational" the attribute `from_start` of the images' wind says whether it was found
-            from the last one.
+        SlabWind
+            As from `retrieve_wind`, completed. By "variational" the attribute `from_start` of the
+            images' wind says whether it was found from the last one.
         """
-        return partial(self._timed, second, complete)
-
-    # no derivatives are recorded, as in `Estimator.pair_of`
-    @torch.inference_mode()
-    def _awaits(self, slab: FirstImage, before: VortexPairFit | None) -> float:
-        began = time.perf_counter()
-        self._slab, start = slab, self._start(slab, before)
-        self._awaited = start and awaited_wind(slab.image, start, slab.noise)
-        return time.perf_counter() - began
-
-    @torch.inference_mode()
-    def _timed(self, second: xr.DataArray, complete: Complete | None) -> Found:
         began = time.perf_counter()
         wind = self._wind(second)
         flags = limits(wind)
@@ -156,7 +151,7 @@ class SlabWinds:
             wind, more = complete(wind)
             flags += more
             seconds["combination"] = time.perf_counter() - began - seconds["wind"]
-        return Found(wind, flags, seconds)
+        return SlabWind(wind, flags, seconds)
 
     def _wind(self, second: xr.DataArray) -> xr.Dataset:
         slab = self._slab
@@ -164,84 +159,116 @@ class SlabWinds:
         images = slab.image, second, slab.dt
         if self._method != ImageMethod.VARIATIONAL:
             return retrieve_wind(*images, str(self._method), **options)
-        wind, self._flow = wind_of_slab(*images, self._awaited, **options)
+        wind, self._flow = wind_of_slab(*images, self._prepared, **options)
         if not wind.attrs["from_start"]:
-            self._learnt = None
+            self._reference = None
         return wind
 
     def _start(self, slab: FirstImage, before: VortexPairFit | None) -> Flow | None:
         flow, expected = self._flow, slab.expected
         if flow is None or expected is None or before is None:
             return None
+        # the nodes that both scans cover change with the aircraft's place
         if slab.image.shape != flow.windows.shape:
             return None
-        self._learnt = self._learnt or before
-        return _moved(flow, slab, before, self._learnt)
+        self._reference = self._reference or before
+        return _shifted(flow, slab, expected, before, self._reference)
 
 
-def _moved(flow: Flow, slab: FirstImage, before: VortexPairFit, learnt: VortexPairFit) -> Flow:
-    """The flow in the last slab's pair, where the next one is expected."""
+def _shifted(
+    flow: Flow,
+    slab: FirstImage,
+    expected: VortexPairFit,
+    before: VortexPairFit,
+    reference: VortexPairFit,
+) -> Flow:
+    """The flow of the last slab at the places and with the wind of the expected pair.
+
+    The flow moves with the mean place of both vortices; then the difference of the winds of the
+    expected pair and of the moved one is added.
+    """
     axes = [slab.image.coords.variables[name].values.astype(float) for name in ("z", "y")]
     z, y = map(torch.as_tensor, axes)
     step = [float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (z, y)]
-    pair = slab.expected
-    now, then, first = (torch.as_tensor(fit.parameters) for fit in (pair, before, learnt))
+    now, then, first = (torch.as_tensor(fit.parameters) for fit in (expected, before, reference))
     shift, since = (
         [float((now - other)[places].mean()) for places in _PLACES] for other in (then, first)
     )
     moved = then.clone()
     for places, by in zip(_PLACES, shift, strict=True):
         moved[places] += by
-    # displacements to 1e-5 px
-    nodes = torch.meshgrid(z.float(), y.float(), indexing="ij")[::-1]
-    v, w = (
-        a - b
-        for a, b in zip(
-            *(model_wind(theta.float(), *nodes, pair.profile) for theta in (now, moved)),
-            strict=True,
-        )
-    )
+    # single precision: displacements to 1e-5 px
+    at_z, at_y = torch.meshgrid(z.float(), y.float(), indexing="ij")
+    new, old = (model_wind(theta.float(), at_y, at_z, expected.profile) for theta in (now, moved))
+    v, w = new - old
     change = torch.stack([w * slab.dt / step[0], v * slab.dt / step[1]])
     in_pixels = [[by / size for by, size in zip(s, step, strict=True)] for s in (shift, since)]
     return flow.moved(in_pixels[0], change, in_pixels[1])
 
 
-class InOwnProcess:
-    """`SlabWinds` in a process of its own, so that another core does the work meanwhile.
+class InThisProcess:
+    """`SlabWinds` whose futures are done as they are returned."""
 
-    Its numbers are those of `SlabWinds` but for rounding. The process ends with this object.
+    def __init__(self, method: ImageMethod, windows: dict[str, Any]) -> None:
+        self._winds = SlabWinds(method, windows)
+
+    def prepare(self, slab: FirstImage, before: VortexPairFit | None) -> Future[float]:
+        """As `SlabWinds.prepare`."""
+        return _done(self._winds.prepare, slab, before)
+
+    def retrieve(self, second: xr.DataArray, complete: Complete | None = None) -> Future[SlabWind]:
+        """As `SlabWinds.retrieve`."""
+        return _done(self._winds.retrieve, second, complete)
+
+
+def _done(function: Callable[P, R], *arguments: P.args, **named: P.kwargs) -> Future[R]:
+    """A call as a future that has its result or its exception."""
+    future: Future[R] = Future()
+    try:
+        future.set_result(function(*arguments, **named))
+    except Exception as error:  # raised by `result`, as that of another process
+        future.set_exception(error)
+    return future
+
+
+class InOwnProcess:
+    """`SlabWinds` in a process of its own, which another core runs meanwhile.
+
+    Its numbers are those of `InThisProcess` but for rounding. The process ends with this object.
     """
 
-    def __init__(self, method: ImageMethod, windows: dict[str, Any]):
-        self._pool = loky.ProcessPoolExecutor(1, initializer=_begin, initargs=(method, windows))
+    def __init__(self, method: ImageMethod, windows: dict[str, Any]) -> None:
+        self._pool = loky.ProcessPoolExecutor(1, initializer=_start, initargs=(method, windows))
         # before the interpreter takes apart what the pool still needs
         weakref.finalize(self, self._pool.shutdown)
-        # what is imported once is not a part of the first wind
+        # the imports of the new process are no part of the first wind
         self._pool.submit(_ready).result()
 
-    def awaits(self, slab: FirstImage, before: VortexPairFit | None) -> Callable[[], float]:
-        """As `SlabWinds.awaits`; done from now on."""
-        return self._pool.submit(_awaits, slab, before).result
+    def prepare(self, slab: FirstImage, before: VortexPairFit | None) -> Future[float]:
+        """As `SlabWinds.prepare`."""
+        return self._pool.submit(_prepare, slab, before)
 
-    def begun(self, second: xr.DataArray, complete: Complete | None = None) -> Callable[[], Found]:
-        """As `SlabWinds.begun`; retrieved and completed from now on."""
-        return self._pool.submit(_found, second, complete).result
+    def retrieve(self, second: xr.DataArray, complete: Complete | None = None) -> Future[SlabWind]:
+        """As `SlabWinds.retrieve`."""
+        return self._pool.submit(_retrieve, second, complete)
 
 
+# of a process of `InOwnProcess`: the winds depend on each other, so that they stay there
 _winds: SlabWinds
 
 
 def without_old_garbage() -> None:
-    """Have what exists by now never searched for garbage again.
+    """Exempt all present objects from garbage collection.
 
-    Of all objects of the libraries a search takes 0.1 to 0.4 s: several periods of slabs.
+    A collection over all objects of the libraries takes 0.1 to 0.4 s: several periods of slabs.
     """
     gc.collect()
     gc.freeze()
 
 
-def _begin(method: ImageMethod, windows: dict[str, Any]) -> None:
+def _start(method: ImageMethod, windows: dict[str, Any]) -> None:
     global _winds
+    # the other core fits the vortices
     torch.set_num_threads(1)
     _winds = SlabWinds(method, windows)
     without_old_garbage()
@@ -251,9 +278,9 @@ def _ready() -> None:
     """Nothing."""
 
 
-def _awaits(slab: FirstImage, before: VortexPairFit | None) -> float:
-    return _winds.awaits(slab, before)()
+def _prepare(slab: FirstImage, before: VortexPairFit | None) -> float:
+    return _winds.prepare(slab, before)
 
 
-def _found(second: xr.DataArray, complete: Complete | None) -> Found:
-    return _winds.begun(second, complete)()
+def _retrieve(second: xr.DataArray, complete: Complete | None) -> SlabWind:
+    return _winds.retrieve(second, complete)

@@ -17,6 +17,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.flows import analytic_axes
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import beam_reach
@@ -39,7 +40,7 @@ class Gates:
     period : float
         From scan to scan, s.
     stride : float
-        Distance of the slabs that are looked at, m: flown in a period.
+        Distance from slab to slab, m: flown in a period.
     between : int
         Gates from one slab to the next.
     look_ahead : float
@@ -60,8 +61,13 @@ class Gates:
         """Of one gate, m."""
         return self.stride / self.between
 
+    @property
+    def planes(self) -> int:
+        """Planes of air in the depth of a gate: at most two spacings of the nodes apart."""
+        return max(1, math.ceil(self.depth / (2 * (self.y[1] - self.y[0]))))
+
     def slab(self, number: int) -> float:
-        """Middle along x of the slab that scan ``number`` sees in its last gate, m."""
+        """Middle along x of the slab in the last gate of scan ``number``, m."""
         return number * self.stride + self.look_ahead + self.depth / 2
 
     def plan(self, ahead: float = 0.0) -> ScanPlan:
@@ -70,7 +76,7 @@ class Gates:
         Raises
         ------
         InputError
-            An aircraft in or behind the slab that it looks at.
+            An aircraft in or behind the nearer slab.
         """
         start = self.look_ahead - self.stride - ahead
         if not start > 0:
@@ -79,6 +85,7 @@ class Gates:
                 f"than the {self.look_ahead - self.stride:g} m to the nearer slab"
             )
         stop = start + (self.between + 1) * self.depth
+        # beams are aimed at the middle of all gates, where the last gate's image is smaller
         scale = (start + stop) / 2 / (stop - self.depth / 2)
         return ScanPlan(
             self.y * scale, self.z * scale, start, stop, "planar", self.between + 1, ahead
@@ -119,19 +126,20 @@ def gates_of(experiment: Experiment) -> Gates:
             f"encounter.look_ahead: {encounter.look_ahead:g} m is not allowed; expected more than "
             f"the {stride:g} m flown from scan to scan"
         )
-    y, z = _image_axes(experiment, wake)
+    assert experiment.wake is not None  # `wake_along_path` refuses its absence
+    y, z = _image_axes(experiment.wake, wake, call(Footprint, experiment).most_nodes())
     between = max(1, round(stride / scan.thickness))
     return Gates(period, stride, between, encounter.look_ahead, y, z)
 
 
-def _image_axes(experiment: Experiment, wake: WakeAlongPath) -> tuple[np.ndarray, np.ndarray]:
+def _image_axes(settings: Wake, wake: WakeAlongPath, most: int) -> tuple[np.ndarray, np.ndarray]:
     """y and z of the nodes of the images, m: of an analytic pair its domain, else the volume's."""
-    most = call(Footprint, experiment).most_nodes()
     if not isinstance(wake, VolumeAlongPath):
-        y, z = analytic_axes(experiment.wake, "vortex_pair", most)
+        y, z = analytic_axes(settings, "vortex_pair", most)
         return y, z
-    spacing, found = experiment.wake.spacing, {}
+    spacing, found = settings.spacing, {}
     for name in "yz":
+        # rounding must not cost a cell of an extent that is a whole number of them
         cells = math.floor(float(np.ptp(wake.flow[name].values)) / spacing + 1e-6)
         found[name] = spacing * (np.arange(cells + 1) - cells / 2)
     counts = {name: len(axis) for name, axis in found.items()}
@@ -139,12 +147,16 @@ def _image_axes(experiment: Experiment, wake: WakeAlongPath) -> tuple[np.ndarray
     return found["y"], found["z"]
 
 
+Places = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Along x, y and z: places (m) or velocities (m/s)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Air:
-    """Aerosol along the flight path, carried by the wake's wind.
+    """Aerosol along the flight path, advected by the wake's wind.
 
-    Every slab has its texture as it is when the farther gate sees it; until the nearer gate does,
-    the wind carries it, with all three components.
+    The texture of a slab is that of the scan that has it in the farther gate. Until the scan that
+    has it in the nearer gate, it is advected by all three components of the wind.
 
     Attributes
     ----------
@@ -154,7 +166,7 @@ class Air:
         Extinction coefficients, m^-1: mean of the aerosol, and of the air itself.
     gates : Gates
     margin : (float, float)
-        m beyond the nodes, along y and z, that beams reach.
+        Reach of the beams beyond the nodes, along y and z, m.
     """
 
     wake: WakeAlongPath
@@ -169,11 +181,11 @@ class Air:
         number: int,
         place: tuple[float, float],
         ahead: float = 0.0,
-        turned: Rotation | None = None,
+        misalignment: Rotation | None = None,
     ) -> xr.DataArray:
         """Extinction (m^-1) in all gates of a scan, about an aircraft at ``place`` (y, z in m).
 
-        A lidar that is turned about its place looks at air elsewhere: its nodes turn with it.
+        The nodes turn with a misaligned lidar, about its place.
 
         Parameters
         ----------
@@ -183,8 +195,8 @@ class Air:
             y and z of the aircraft, m.
         ahead : float
             Of its nominal place, m.
-        turned : Rotation, optional
-            True attitude of the lidar from the one that its beams are aimed by.
+        misalignment : Rotation, optional
+            True attitude of the lidar relative to the one by which its beams are aimed.
 
         Returns
         -------
@@ -192,46 +204,52 @@ class Air:
             x from the nominal place of the aircraft, y and z from its own; all scans on one grid.
         """
         gates = self.gates
-        cells = self.planes_a_gate
+        cells = gates.planes
         step = gates.depth / cells
+        # a plane before and one behind the gates, for values between planes
         index = np.arange(-1, (gates.between + 1) * cells + 1)
         x = gates.look_ahead - gates.stride + (index + 0.5) * step
         y, z = (
             _extended(axis, margin)
             for axis, margin in zip((gates.y, gates.z), self.margin, strict=True)
         )
-        places = np.meshgrid(x - ahead, y, z, indexing="ij")
-        if turned is not None:
-            places = np.einsum("ij,j...->i...", turned.as_matrix(), np.stack(places))
-        telescope = (number * gates.stride + ahead, *place)
-        places = [a + b for a, b in zip(places, telescope, strict=True)]
-        # the plane behind the nearer gate is carried with it, for values between both
-        carried = np.s_[: 1 + cells + (gates.between > 1)]
+        at_x, at_y, at_z = np.meshgrid(x - ahead, y, z, indexing="ij")
+        if misalignment is not None:
+            at_x, at_y, at_z = np.einsum(
+                "ij,j...->i...", misalignment.as_matrix(), np.stack([at_x, at_y, at_z])
+            )
+        at_x = at_x + (number * gates.stride + ahead)
+        at_y, at_z = at_y + place[0], at_z + place[1]
+        # the plane behind the nearer gate is advected with it, for values between both
+        advected = np.s_[: 1 + cells + (gates.between > 1)]
         now = number * gates.period
-        near = tuple(axis[carried] for axis in places)
-        for axis, found in zip(
-            places, self._origins(near, now, step, y[1] - y[0], z[1] - z[0]), strict=True
-        ):
-            axis[carried] = found
+        at_x[advected], at_y[advected], at_z[advected] = self._origins(
+            (at_x[advected], at_y[advected], at_z[advected]), now, step, y[1] - y[0], z[1] - z[0]
+        )
         mean: np.ndarray | float = self.background
         if isinstance(self.wake, VolumeAlongPath):
-            # a plane that is carried has the exhaust of where and when it comes from
+            # exhaust is advected as the texture is: that of the place and time of origin
             times = np.full(len(x), now)
-            times[carried] -= gates.period
-            mean = self.wake.extinction(*places, times[:, None, None])
-        values = mean * self.texture.at(*places) + self.molecules
+            times[advected] -= gates.period
+            mean = self.wake.extinction(at_x, at_y, at_z, times[:, None, None])
+        values = mean * self.texture.at(at_x, at_y, at_z) + self.molecules
         field = xr.DataArray(values, {"x": x, "y": y, "z": z}, ("x", "y", "z"))
         field["x"].attrs["cell_width"] = step
         return field
 
-    @property
-    def planes_a_gate(self) -> int:
-        """Planes of air in the depth of a gate: at most two spacings of the nodes apart."""
-        return max(1, math.ceil(self.gates.depth / (2 * (self.gates.y[1] - self.gates.y[0]))))
+    def _origins(self, places: Places, now: float, *spacing: float) -> Places:
+        """Places of the air one period ago: Runge-Kutta steps of fourth order back in time.
 
-    def _origins(self, places, now: float, *spacing: float):
-        """Where air was one period ago: Runge-Kutta steps of fourth order back in time."""
-        first = self.wake.wind(*places, now)
+        Parameters
+        ----------
+        places : three arrays, shape (x, y, z)
+            m.
+        now : float
+            s.
+        *spacing : float
+            Along x, y and z, m: with it the steepest gradient of the wind sets the step.
+        """
+        first = self._wind(places, now)
         steep = max(
             float(np.abs(np.gradient(component, width, axis=axis)).max())
             for component in first
@@ -241,48 +259,48 @@ class Air:
         h = -self.gates.period / max(1, count)
         place, time = places, now
         for _ in range(max(1, count)):
-            k1 = first if time == now else self.wake.wind(*place, time)
-            k2 = self.wake.wind(*_moved(place, k1, h / 2), time + h / 2)
-            k3 = self.wake.wind(*_moved(place, k2, h / 2), time + h / 2)
-            k4 = self.wake.wind(*_moved(place, k3, h), time + h)
-            slope = [a + 2 * b + 2 * c + d for a, b, c, d in zip(k1, k2, k3, k4, strict=True)]
-            place, time = _moved(place, slope, h / 6), time + h
+            k1 = first if time == now else self._wind(place, time)
+            k2 = self._wind(_moved(place, k1, h / 2), time + h / 2)
+            k3 = self._wind(_moved(place, k2, h / 2), time + h / 2)
+            k4 = self._wind(_moved(place, k3, h), time + h)
+            u, v, w = (a + 2 * b + 2 * c + d for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
+            place, time = _moved(place, (u, v, w), h / 6), time + h
         return place
+
+    def _wind(self, places: Places, time: float) -> Places:
+        x, y, z = places
+        return self.wake.wind(x, y, z, time)
 
 
 def air_of(experiment: Experiment, gates: Gates) -> Air:
-    """The air of an encounter: its texture has a period along the path that memory holds.
+    """The air of an encounter: its texture has the longest period along the path that memory holds.
 
     Raises
     ------
     InputError
         A texture finer than its nodes.
     """
-    wake = experiment.wake
+    along_path, wake = wake_along_path(experiment), experiment.wake
+    assert wake is not None  # `wake_along_path` refuses its absence
     reach = beam_reach(experiment.lidar, gates.look_ahead + 2 * gates.depth)
     spacing = float(gates.y[1] - gates.y[0])
     margin = (reach + spacing, reach + spacing)
-    air = Air(
-        wake_along_path(experiment),
-        PeriodicTexture(np.zeros((1, 1, 1)), (1.0, 1.0, 1.0)),
-        wake.extinction.background,
-        wake.extinction.molecules,
-        gates,
-        margin,
-    )
-    step = gates.depth / air.planes_a_gate
-    across = [float(np.ptp(axis)) + wake.texture.outer_scale for axis in (gates.y, gates.z)]
-    path = experiment.encounter.path
+    step = gates.depth / gates.planes
+    # images at both edges must not show the same texture: an outer scale apart
+    width, height = (float(np.ptp(axis)) + wake.texture.outer_scale for axis in (gates.y, gates.z))
+    path = encounter_of(experiment).path
     flight = path.start + path.beyond + gates.look_ahead
-    longest = _TEXTURE_NODES * step / math.prod(length / spacing + 1 for length in across)
+    longest = _TEXTURE_NODES * step / ((width / spacing + 1) * (height / spacing + 1))
     texture = periodic_texture(
-        (min(flight, longest), *across),
+        (min(flight, longest), width, height),
         (step, spacing, spacing),
         wake.texture.rms,
         wake.texture.outer_scale,
         experiment.seed,
     )
-    return Air(air.wake, texture, air.background, air.molecules, gates, margin)
+    return Air(
+        along_path, texture, wake.extinction.background, wake.extinction.molecules, gates, margin
+    )
 
 
 def _extended(axis: np.ndarray, margin: float) -> np.ndarray:
@@ -291,5 +309,6 @@ def _extended(axis: np.ndarray, margin: float) -> np.ndarray:
     return axis[0] + step * np.arange(-more, len(axis) + more)
 
 
-def _moved(place, velocity, time):
-    return tuple(a + time * b for a, b in zip(place, velocity, strict=True))
+def _moved(place: Places, velocity: Places, time: float) -> Places:
+    (x, y, z), (u, v, w) = place, velocity
+    return x + time * u, y + time * v, z + time * w

@@ -9,7 +9,7 @@ moment the second, so that strips with n = 1 for forces and n = 2 for rolling mo
 and the rolling moment of the lifting line in any wind; the aspect ratio of n = 2 is that of one
 half of the wing (Barrows 1977).
 
-Left out: unsteady lift (the chord is short against the wake), stall, sweep, the fuselage, and the
+Neglected: unsteady lift (the chord is short against the wake), stall, sweep, the fuselage, and the
 forces in a surface's plane.
 
 Body frame: x forward, y left, z up, from the centre of gravity.
@@ -146,11 +146,13 @@ def in_downwash(tail: Strips, section_slope: float, aspect_ratio: float) -> Stri
     section_slope, aspect_ratio : float
         Of the wing, as in `finite_span_slope`.
     """
-    left = [
+    fractions = [
         1 - 2 * n * finite_span_slope(section_slope, aspect_ratio, n) / (np.pi * aspect_ratio)
         for n in (1, 2)
     ]
-    return replace(tail, slopes=left[0] * tail.slopes, roll_slopes=left[1] * tail.roll_slopes)
+    return replace(
+        tail, slopes=fractions[0] * tail.slopes, roll_slopes=fractions[1] * tail.roll_slopes
+    )
 
 
 def joined(*surfaces: Strips) -> Strips:
@@ -177,6 +179,7 @@ def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float)
     arms = np.cross(strips.places, strips.normals)
     lift = pressure * strips.slopes
     moment = lift @ arms
+    # the second mode of the loading, whose slope is smaller
     moment[..., 0] = (pressure * strips.roll_slopes) @ arms[:, 0]
     return Loads(lift @ strips.normals, moment)
 
@@ -190,16 +193,27 @@ def roll_damping(strips: Strips, airspeed: float, density: float) -> float:
     return float(wake_loads(strips, wind, airspeed, density).moment[0])
 
 
-def _angles(n):
+def _angles(n: int) -> np.ndarray:
+    """Of the nodes of the quadrature, rad, shape (n,)."""
     if n < 2:
         raise InputError(f"strips.n: {n} is not allowed; expected 2 or more")
     return np.arange(1, n + 1) * np.pi / (n + 1)
 
 
-def _surface(places, normal, angle, area, lift_slope, span, whole_area):
+def _surface(
+    places: np.ndarray,
+    normal: tuple[float, float, float],
+    angle: np.ndarray,
+    area: float,
+    lift_slope: float,
+    span: float,
+    whole_area: float,
+) -> Strips:
+    """Strips of a surface of so much area (m^2), which is part of a wing of span and whole area."""
     for name, value in (("span", span), ("area", area), ("lift_slope", lift_slope)):
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"strips.{name}: {value} is not allowed; expected a number > 0")
+    # the elliptic chord at each node times the distance between the nodes
     weights = np.sin(angle) ** 2
     ones = np.ones(len(places))
     aspect_ratio = span**2 / whole_area

@@ -1,4 +1,4 @@
-"""The lidar as an object that is stepped: light, detector, and what is estimated from them."""
+"""The lidar as an object that is stepped: light, detector, and the estimate from their signals."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,7 +38,7 @@ from lidar_mi.retrieval.vortices.pair import VortexPairFit
 NO_EARLIER_SCAN = "no earlier scan of this slab"
 LITTLE_OVERLAP = "the two scans have less than half of the image in common"
 
-# Of a period, by which the time of a scan may be off its raster.
+# Fraction of a period by which the time of a scan may differ from a multiple of it.
 _OFF_RASTER = 0.01
 
 
@@ -67,7 +67,7 @@ class VirtualLidar:
     vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
     the number of the scan and the pose alone: a step that is repeated gives the same images bit for
     bit, and the same estimate but for rounding, where it starts from nothing; several lidars in one
-    process do not disturb each other. Nothing is written, unless `scans` are kept.
+    process do not disturb each other. Nothing is written but to `scans`.
 
     Parameters
     ----------
@@ -75,10 +75,9 @@ class VirtualLidar:
         With a section ``encounter`` and a wake of ``vortex_pair``.
     processes : int
         2: the wind is estimated in a process of its own, at the same time as the vortices, as by an
-        aircraft's computer with two cores. The estimates are the same but
-        for rounding.
+        aircraft's computer with two cores. The estimates are the same but for rounding.
     scans : ScanStore, optional
-        Where scans are kept, and taken from if they were made from the same pose.
+        Stores scans; a stored one from the same pose is not rendered again.
 
     Raises
     ------
@@ -111,7 +110,7 @@ class VirtualLidar:
         *,
         processes: int = 1,
         scans: ScanStore | None = None,
-    ):
+    ) -> None:
         if not isinstance(experiment, Experiment):
             experiment = load_experiment(experiment)
         self.experiment = experiment
@@ -120,7 +119,7 @@ class VirtualLidar:
         self.air: Air = air_of(experiment, self.gates)
         self.images: SlabImages | None = None
         self._doppler = doppler_scans(experiment, self.gates)
-        speeds = self._doppler and LineSpeeds(self._doppler)
+        speeds = LineSpeeds(self._doppler) if self._doppler else None
         self._estimator = Estimator(experiment, processes=processes, speeds=speeds)
         self._poses: dict[int, AircraftPose] = {}
         self._renderer: ScanRenderer | None = None
@@ -161,12 +160,13 @@ class VirtualLidar:
         """
         number = self._number(t)
         pose = pose or AircraftPose(number * self.gates.stride)
-        scan = self._store and self._store.kept(number, pose)
+        scan = self._store.read(number, pose) if self._store else None
         if scan is None:
             scan = self._scanned(number, pose)
             if self._store:
-                self._store.keep(number, pose, scan)
+                self._store.write(number, pose, scan)
         before, came_from = self._scans.get(number - 1), self._poses.get(number - 1)
+        # this scan for the next slab, the one before for a step that is repeated
         self._scans = {number: scan} | ({number - 1: before} if before else {})
         self._poses = {number: pose} | ({number - 1: came_from} if came_from else {})
         period = self.gates.period
@@ -205,12 +205,13 @@ class VirtualLidar:
         """Of the Doppler lidar, if there is one."""
         if self._doppler is None:
             return None
-        turned = pointing_error(self.experiment, number, number * self.gates.period)
-        return self._doppler.frames(self.wake, number, x, valid, midway, turned)
+        misalignment = pointing_error(self.experiment, number, number * self.gates.period)
+        return self._doppler.frames(self.wake, number, x, valid, midway, misalignment)
 
     def _completion(self, x: float, midway: Midway, pose: AircraftPose) -> Completion:
-        """What unknown pointing adds to a slab's wind, and where its lines of sight start."""
+        """The errors of a slab's wind by unknown pointing, and the origin of its lines of sight."""
         pointing, period = self.experiment.retrieval.pointing, self.gates.period
+        # an unknown rotation between the scans displaces the second image by range times angle
         return Completion(
             pointing.stderr * (self.gates.look_ahead - self.gates.stride / 2) / period,
             pointing.roll / period,
@@ -235,8 +236,9 @@ class VirtualLidar:
         experiment, gates = self.experiment, self.gates
         ahead = pose.x - number * gates.stride
         plan = gates.plan(ahead)
-        turned = pointing_error(experiment, number, number * gates.period)
-        air = self.air.at_scan(number, (pose.y, pose.z), ahead, turned)
+        misalignment = pointing_error(experiment, number, number * gates.period)
+        air = self.air.at_scan(number, (pose.y, pose.z), ahead, misalignment)
+        # a lidar of another variant may have been stepped meanwhile
         use_variant(experiment.render.variant)
         if self._renderer is None:
             self._renderer = self._renderer_of(air, plan, self._settings)
@@ -250,12 +252,13 @@ class VirtualLidar:
         self, air: xr.DataArray, plan: ScanPlan, settings: RenderSettings
     ) -> ScanRenderer:
         experiment = self.experiment
-        lidar, scattering = experiment.lidar, experiment.scattering
+        lidar, scattering, wake = experiment.lidar, experiment.scattering, experiment.wake
+        assert wake is not None  # of an encounter
         return ScanRenderer(
             air,
             plan,
             lidar,
-            environment_extinction(experiment.wake),
+            environment_extinction(wake),
             *scatterer(scattering, experiment.folder, lidar.wavelength),
             settings,
             molecules(self.air.molecules, lidar.wavelength, scattering.band),
@@ -271,7 +274,7 @@ class VirtualLidar:
 
     @cached_property
     def _settings(self) -> RenderSettings:
-        """With the number of samples of all scans: as given, or by a pilot of the first one.
+        """With the Monte Carlo samples per beam of all scans: as set, or by a pilot of the first.
 
         The pilot is of the nominal pose, so that images do not depend on the first pose.
         """
@@ -314,6 +317,7 @@ def _on_first_grid(before: Scan, scan: Scan) -> tuple[SlabImages | None, tuple[s
     inside = {}
     for name in ("z", "y"):
         nodes, other = before.far[name].values, scan.near[name].values
+        # places of the aircraft are sums of steps: their rounding must not cost an edge
         slack = 1e-6 * (other[1] - other[0])
         inside[name] = (nodes >= other[0] - slack) & (nodes <= other[-1] + slack)
     covered = inside["z"].mean() * inside["y"].mean()

@@ -1,4 +1,4 @@
-"""The wake of an encounter, as the flight meets it."""
+"""The wake of an encounter along the flight path."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -46,7 +46,7 @@ def wake_along_path(experiment: Experiment) -> WakeAlongPath:
     """
     encounter, wake = encounter_of(experiment), experiment.wake
     if wake is not None and wake.file:
-        return _from_file(experiment)
+        return _from_file(wake, wake.file, encounter, experiment.folder)
     if wake is None or wake.vortex_pair is None:
         found = "nothing" if wake is None else "turbine"
         raise InputError(
@@ -81,9 +81,8 @@ def vortices_in_plane(wake: WakeAlongPath, x: float, time: float) -> tuple[Vorte
         return None
 
 
-def _from_file(experiment: Experiment) -> VolumeAlongPath:
+def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> VolumeAlongPath:
     """A simulated wake: one plane, extruded, or a volume, repeated along its axis."""
-    encounter, wake = encounter_of(experiment), experiment.wake
     if wake.second != "advect":
         raise InputError(
             f"wake.second: {wake.second:g} s is not allowed in an encounter; expected advect"
@@ -97,7 +96,8 @@ def _from_file(experiment: Experiment) -> VolumeAlongPath:
                 f"encounter.wake.{key}: {given:g} is not allowed with wake.file; expected "
                 "wake.vortex_pair"
             )
-    path = find_file(wake.file, experiment.folder, "wake.file")
+    path = find_file(file, folder, "wake.file")
+    # its time of change: a file that is written anew is read anew
     flow, cores, drift = _volume(path, path.stat().st_mtime_ns, wake.model_dump_json())
     port, starboard = (tuple(_vortex(*one) for one in side) for side in cores)
     both = [*port, *starboard]
@@ -127,8 +127,13 @@ Section = tuple[Core, float]
 """A core in a plane of a volume, and its circulation from 5 m to 15 m or less, m^2 s^-1."""
 
 
+Sides = tuple[list[Section], list[Section]]
+"""Port and starboard."""
+
+
+# check, flight and report need it again: cores in every plane take seconds to find
 @lru_cache(maxsize=2)
-def _volume(path: Path, stamp: int, keys: str):
+def _volume(path: Path, stamp: int, keys: str) -> tuple[xr.Dataset, Sides, tuple[float, float]]:
     """One period of a file's wake with its extinction, its cores plane by plane, its drift."""
     wake = Wake.model_validate_json(keys)
     needed, names = tracers_of(wake)
@@ -142,7 +147,7 @@ def _volume(path: Path, stamp: int, keys: str):
     flow = one_period(flow)
     field = extinction_of(flow, wake.extinction, flow, None)
     flow = flow[[n for n in "uvw" if n in flow]].assign(extinction=field)
-    sides: tuple[list[Section], list[Section]] = ([], [])
+    sides: Sides = ([], [])
     drifts = []
     for index in range(flow.sizes["x"]):
         section = flow.isel(x=index)
@@ -168,7 +173,7 @@ def _volume(path: Path, stamp: int, keys: str):
 
 
 def _rings(section: xr.Dataset, core: Core, partner: Core) -> Rings | None:
-    """Averages over the widest rings that there is room for."""
+    """Averages over the widest rings within the plane and around no other core."""
     tried = (ring_averages(section, core, [partner], outer=outer) for outer in _OUTER)
     return next((rings for rings in tried if rings is not None), None)
 

@@ -8,8 +8,8 @@ import xarray as xr
 
 from lidar_mi.io.netcdf import read_netcdf
 
-FLIGHT_FILES = {"series": "flight.nc", "track": "track.nc", "seen": "slabs.nc"}
-"""Of a flight's time series, of its lidar's track, of the slabs that it saw."""
+FLIGHT_FILES = {"series": "flight.nc", "track": "track.nc", "slabs": "slabs.nc"}
+"""Of the time series of flights, of the lidar's track, of images and wind vectors of its slabs."""
 
 _SIDES = ("port", "starboard")
 
@@ -37,18 +37,18 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
             yield from ((f"vortices_{name}", _points(track, name)) for name in _sources(track))
         else:
             yield "track", track
-    if files["seen"].is_file():
-        seen = read_netcdf(files["seen"]).swap_dims(slab="x").set_coords("x")
-        yield "slab_winds", _of_slabs(seen, "y", "z")
+    if files["slabs"].is_file():
+        slabs = read_netcdf(files["slabs"]).swap_dims(slab="x").set_coords("x")
+        yield "slab_winds", _of_slabs(slabs, "y", "z")
         if placed:
-            images = _of_slabs(seen, "image_y", "image_z")
+            images = _of_slabs(slabs, "image_y", "image_z")
             yield "slab_images", images.rename(image_y="y", image_z="z")
 
 
-def _of_slabs(seen: xr.Dataset, *axes: str) -> xr.Dataset:
+def _of_slabs(slabs: xr.Dataset, *axes: str) -> xr.Dataset:
     """Variables of all nodes of the slabs."""
-    names = [name for name, value in seen.data_vars.items() if {"x", *axes} == set(value.dims)]
-    kept = seen[names]
+    names = [name for name, value in slabs.data_vars.items() if {"x", *axes} == set(value.dims)]
+    kept = slabs[names]
     return kept.drop_vars([name for name in kept.coords if name not in ("x", *axes)])
 
 

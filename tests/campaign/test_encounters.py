@@ -17,7 +17,7 @@ from lidar_mi.campaign.worker import carry_out
 from lidar_mi.encounter.fly import fly
 
 
-def flown(folder, keep, mode, count):
+def carried_out(folder, keep, mode, count):
     """A campaign of flights without a lidar, in the mode of control off or perfect."""
     base = {
         "name": "base",
@@ -56,7 +56,7 @@ def flown(folder, keep, mode, count):
 
 
 def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
-    ready = flown(tmp_path, "metrics", "perfect", 4)
+    ready = carried_out(tmp_path, "metrics", "perfect", 4)
     data = collect(ready)
     off = data["encounter.off.largest_roll"]
     alone = fly(ready.points.experiment(3), notice=lambda text, fraction: None)
@@ -75,6 +75,6 @@ def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
 
 def test_everything_of_a_flight_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr("lidar_mi.encounter.fly.write_report", lambda *args, **keys: None)
-    ready = flown(tmp_path, "everything", "off", 2)
+    ready = carried_out(tmp_path, "everything", "off", 2)
     names = {entry.name for entry in (ready.place(0) / "run").iterdir()}
     assert {"experiment.yaml", "flight.nc"} <= names

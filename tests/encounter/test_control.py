@@ -31,7 +31,7 @@ def wake(circulation):
     return wind
 
 
-def flown(controller_of, wind, aircraft=None, duration=6.5):
+def simulated(controller_of, wind, aircraft=None, duration=6.5):
     """Roll, roll rate and aileron over time."""
     model = RollModel(aircraft or Aircraft(), Path())
     controller = controller_of(model)
@@ -50,15 +50,15 @@ def flown(controller_of, wind, aircraft=None, duration=6.5):
 
 def test_cancelling_leaves_nothing_with_an_unlimited_aileron():
     aircraft = Aircraft(largest_aileron="1 rad", aileron_rate="100 rad/s", aileron_power=1.0)
-    off = flown(lambda model: wings_level(model, None), wake(350), aircraft)
-    steered = flown(lambda model: cancelling(model, None), wake(350), aircraft)
+    off = simulated(lambda model: wings_level(model, None), wake(350), aircraft)
+    steered = simulated(lambda model: cancelling(model, None), wake(350), aircraft)
     assert np.abs(off[0]).max() > np.radians(20)
     assert np.abs(steered[0]).max() < 1e-4 * np.abs(off[0]).max()
 
 
 @pytest.mark.parametrize("law", [cancelling, feedforward])
 def test_commands_stay_within_the_limits(law):
-    aileron = flown(lambda model: law(model, 3.0), wake(350))[2]
+    aileron = simulated(lambda model: law(model, 3.0), wake(350))[2]
     assert np.abs(aileron).max() <= np.radians(20) * (1 + 1e-9)
     assert np.abs(np.diff(aileron)).max() <= np.radians(50) * STEP * (1 + 1e-9)
 
@@ -102,7 +102,7 @@ def test_the_plan_is_near_the_best_possible():
     """Twice as much as the least, or below; cancelling alone leaves three times as much."""
     wind = wake(350)
     off, planned, cancelled = (
-        np.abs(flown(law, wind)[0]).max()
+        np.abs(simulated(law, wind)[0]).max()
         for law in (
             lambda model: wings_level(model, 3.0),
             lambda model: feedforward(model, 3.0),

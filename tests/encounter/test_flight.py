@@ -10,7 +10,7 @@ import pytest
 
 from lidar_mi.assessment.metrics.encounter import encounter_metrics
 from lidar_mi.encounter.aircraft import Commands
-from lidar_mi.encounter.flight import aircraft_of, fly_all
+from lidar_mi.encounter.flight import aircraft_of, simulate_flights
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.schema.reading import check
@@ -28,14 +28,14 @@ def lidar(experiment):
 
 
 @pytest.fixture(scope="module")
-def flown(experiment, lidar):
-    return fly_all(experiment, silent, lidar=lidar)
+def flights(experiment, lidar):
+    return simulate_flights(experiment, silent, lidar=lidar)
 
 
-def test_all_meet_the_same_wake(flown, experiment):
+def test_all_meet_the_same_wake(flights, experiment):
     """On the nominal path the rolling moment is that of the wings level, whatever steers."""
-    assert list(flown.series["flight"].values) == ["off", "autopilot", "feedforward", "perfect"]
-    off, perfect = (flown.series.sel(flight=mode) for mode in ("off", "perfect"))
+    assert list(flights.series["flight"].values) == ["off", "autopilot", "feedforward", "perfect"]
+    off, perfect = (flights.series.sel(flight=mode) for mode in ("off", "perfect"))
     assert np.array_equal(off["x"], perfect["x"])
     # banked wings meet the wind of other places: by the square of 30 degrees
     strongest = float(np.abs(off["roll_moment"]).max())
@@ -43,10 +43,10 @@ def test_all_meet_the_same_wake(flown, experiment):
     assert float(off["time"][-1]) == pytest.approx(225 / 75, abs=0.051)
 
 
-def test_help_lessens_the_roll(flown):
-    found = encounter_metrics(flown.series, flown.track)
+def test_help_lessens_the_roll(flights):
+    found = encounter_metrics(flights.series, flights.track)
     off, blind, ours, perfect = (
-        found[f"encounter.{mode}.largest_roll"] for mode in flown.series["flight"].values
+        found[f"encounter.{mode}.largest_roll"] for mode in flights.series["flight"].values
     )
     assert perfect < blind < off
     assert perfect < 0.7 * off
@@ -55,8 +55,8 @@ def test_help_lessens_the_roll(flown):
     assert ours < 0.7 * off
 
 
-def test_track_is_used_when_it_is_delivered(flown, lidar):
-    one, track = flown.series.sel(flight="feedforward"), flown.track
+def test_track_is_used_when_it_is_delivered(flights, lidar):
+    one, track = flights.series.sel(flight="feedforward"), flights.track
     first = track["delivered"].values[np.flatnonzero(track["usable"].values)[0]]
     known = np.isfinite(one["predicted_roll_moment"].values)
     assert one["time"].values[known][0] == pytest.approx(first, abs=0.0101)
@@ -66,24 +66,24 @@ def test_track_is_used_when_it_is_delivered(flown, lidar):
     assert lidar.steps[-1] * 75 + 75 <= 225 + 7.5
 
 
-def test_commands_keep_the_limits(flown, experiment):
+def test_commands_keep_the_limits(flights, experiment):
     limits = aircraft_of(experiment.encounter).limits
-    deflection = flown.series["aileron_deflection"]
-    step = float(flown.series["time"][1] - flown.series["time"][0])
+    deflection = flights.series["aileron_deflection"]
+    step = float(flights.series["time"][1] - flights.series["time"][0])
     assert np.abs(deflection).max() <= limits.deflection[0] * (1 + 1e-9)
     assert np.abs(deflection.diff("time")).max() <= limits.rate[0] * step * (1 + 1e-9)
     # the moment is that of the deflection
     power = aircraft_of(experiment.encounter).control_moments[0, 0]
-    assert np.allclose(flown.series["control_roll_moment"], power * deflection)
+    assert np.allclose(flights.series["control_roll_moment"], power * deflection)
 
 
 def test_what_was_seen_is_not_forgotten(experiment):
     """A lidar that goes blind after the tenth slab: those slabs are still ahead, and steered by."""
     blind = SyntheticLidar(wake_along_path(experiment), blind=lambda number: number > 10)
-    flown = fly_all(experiment, silent, lidar=blind)
-    one = flown.series.sel(flight="feedforward")
+    flights = simulate_flights(experiment, silent, lidar=blind)
+    one = flights.series.sel(flight="feedforward")
     known = np.isfinite(one["predicted_roll_moment"].values)
-    assert flown.track["usable"][-1] == 0
+    assert flights.track["usable"][-1] == 0
     # ten slabs up to 75 + 9 x 7.5 m, four that the track may miss, five beyond
     assert 75 + 9 * 7.5 < float(one["x"].values[known].max()) < 75 + 18 * 7.5 + 1
     assert not known[-1]
@@ -96,8 +96,8 @@ def test_only_what_a_mode_needs_is_flown(experiment):
 
     for mode, expected in (("off", ["off"]), ("perfect", ["off", "autopilot", "perfect"])):
         one = check(encounter_keys(control={"mode": mode}), "test")
-        flown = fly_all(one, silent, lidar=Unused())
-        assert list(flown.series["flight"].values) == expected and flown.track is None
+        flights = simulate_flights(one, silent, lidar=Unused())
+        assert list(flights.series["flight"].values) == expected and flights.track is None
 
 
 def test_an_upset_is_a_result():
@@ -109,9 +109,9 @@ def test_an_upset_is_a_result():
     quick = {"aileron_power": 1.0, "roll_inertia": 1e5}
     control = {"mode": "perfect", "levelling_time": None}
     one = check(encounter_keys(control=control, aircraft=quick), "test")
-    flown = fly_all(one, silent, controller=wrong)
-    perfect = flown.series.sel(flight="perfect")
-    found = encounter_metrics(flown.series, None)
+    flights = simulate_flights(one, silent, controller=wrong)
+    perfect = flights.series.sel(flight="perfect")
+    found = encounter_metrics(flights.series, None)
     assert found["encounter.perfect.departed"] == 1 == found["encounter.perfect.hazardous"]
     assert perfect["departed"][-1] == 1 and np.isfinite(perfect["roll"]).all()
-    assert perfect.sizes["time"] == flown.series.sizes["time"]
+    assert perfect.sizes["time"] == flights.series.sizes["time"]

@@ -17,9 +17,9 @@ from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema import Scan
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.reading import check
+from lidar_mi.instrument.scan import Scan
 from tests.support.command_line import shell
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
@@ -105,6 +105,11 @@ def test_faults_are_one_line(changes, message):
     with pytest.raises(InputError) as error:
         lm.fly(experiment(**changes), notice=silent)
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_lidar_without_a_step_is_refused():
+    with pytest.raises(InputError, match="lidar: object is not allowed; expected Lidar or None"):
+        lm.fly(experiment(), lidar=object(), notice=silent)
 
 
 def test_off_needs_no_quotes(tmp_path):

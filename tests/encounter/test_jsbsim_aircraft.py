@@ -35,14 +35,14 @@ def boeing(speed=75.0, **path):
     return JSBSimAircraft(Aircraft(model="737"), Path(speed=speed, **path))
 
 
-def flown(aircraft, duration, loads=NOTHING, commands=Commands(), step=1 / 120):  # noqa: B008
+def state_after(aircraft, duration, loads=NOTHING, commands=Commands(), step=1 / 120):  # noqa: B008
     for _ in range(round(duration / step)):
         aircraft.step(step, loads, commands)
     return aircraft.state
 
 
 def test_trimmed_on_the_path():
-    state = flown(boeing(), 5.0)
+    state = state_after(boeing(), 5.0)
     assert state.x == pytest.approx(375, abs=0.2) and state.time == pytest.approx(5)
     assert abs(state.y) < 0.01 and abs(state.z) < 0.3 and abs(state.roll) < 1e-3
     assert not state.departed
@@ -54,7 +54,7 @@ def test_a_force_accelerates_the_mass(axis):
     free, pushed = boeing(climb_angle=0.0), boeing(climb_angle=0.0)
     force = np.zeros(3)
     force[axis] = pushed.mass
-    before, after = flown(free, 0.1), flown(pushed, 0.1, Loads(force, np.zeros(3)))
+    before, after = state_after(free, 0.1), state_after(pushed, 0.1, Loads(force, np.zeros(3)))
     moved = np.array([after.x - before.x, after.y - before.y, after.z - before.z])
     angle = before.pitch  # the body's axes on the path
     turn = [
@@ -74,8 +74,8 @@ def test_initial_roll_acceleration_is_moment_over_inertia():
     """Between the third and the fourth step: the integrator has started, damping has not."""
     aircraft = boeing()
     loads = Loads(np.zeros(3), np.array([2e5, 0, 0]))
-    before = flown(aircraft, 3 / 120, loads).roll_rate
-    after = flown(aircraft, 1 / 120, loads).roll_rate
+    before = state_after(aircraft, 3 / 120, loads).roll_rate
+    after = state_after(aircraft, 1 / 120, loads).roll_rate
     damped = math.exp(-2.5 / 120 * -aircraft.roll_damping / aircraft.roll_inertia)
     assert (after - before) * 120 == pytest.approx(2e5 / aircraft.roll_inertia * damped, rel=0.01)
 
@@ -86,7 +86,7 @@ def test_roll_mode_of_the_published_damping():
     damping = -0.4 * PRESSURE * AREA * SPAN**2 / (2 * 75)
     assert aircraft.roll_damping == pytest.approx(damping, rel=0.02)
     tau = -aircraft.roll_inertia / damping
-    state = flown(aircraft, 0.5, Loads(np.zeros(3), np.array([1e5, 0, 0])))
+    state = state_after(aircraft, 0.5, Loads(np.zeros(3), np.array([1e5, 0, 0])))
     expected = 1e5 / -damping * -np.expm1(-0.5 / tau)
     assert state.roll_rate == pytest.approx(expected, rel=0.04)
 
@@ -94,8 +94,8 @@ def test_roll_mode_of_the_published_damping():
 def test_roll_model_and_jsbsim_roll_alike():
     """Default keys against JSBSim's 737: -a/8 is -0.46, JSBSim's C_lp -0.4."""
     loads = Loads(np.zeros(3), np.array([2e5, 0, 0]))
-    simple = flown(RollModel(Aircraft(), Path()), 1.0, loads)
-    full = flown(boeing(), 1.0, loads)
+    simple = state_after(RollModel(Aircraft(), Path()), 1.0, loads)
+    full = state_after(boeing(), 1.0, loads)
     assert simple.roll == pytest.approx(full.roll, rel=0.1)
 
 
@@ -118,9 +118,9 @@ def test_moments_and_controls_turn_the_same_way(axis, angle, sign):
     moment = np.zeros(3)
     moment[axis] = 3e5
     names = ("aileron", "elevator", "rudder")
-    still = flown(boeing(), 0.3)
-    turned = flown(boeing(), 0.3, Loads(np.zeros(3), moment))
-    steered = flown(boeing(), 0.3, commands=Commands(**{names[axis]: 0.1}))
+    still = state_after(boeing(), 0.3)
+    turned = state_after(boeing(), 0.3, Loads(np.zeros(3), moment))
+    steered = state_after(boeing(), 0.3, commands=Commands(**{names[axis]: 0.1}))
     for state in (turned, steered):
         assert sign * (getattr(state, angle) - getattr(still, angle)) > 1e-3
         assert sign * getattr(state, f"{angle}_rate") > 0
@@ -143,7 +143,7 @@ def test_controls_keep_their_limits():
 
 def test_an_upset_is_a_result():
     aircraft = boeing()
-    state = flown(aircraft, 4.0, Loads(np.zeros(3), np.array([5e6, 0, 0])), step=0.05)
+    state = state_after(aircraft, 4.0, Loads(np.zeros(3), np.array([5e6, 0, 0])), step=0.05)
     assert state.departed and state.time == pytest.approx(4)
     assert boeing().step(0.1, Loads(np.full(3, np.nan), np.zeros(3)), Commands()).departed
 

@@ -74,6 +74,6 @@ def test_departure_is_a_state():
     assert state.departed and np.isfinite(state.roll) and state.time == pytest.approx(10)
 
 
-def test_a_moment_that_is_no_number_departs():
+def test_a_moment_that_is_no_number_loses_the_flight():
     rolling = model()
     assert rolling.step(0.05, loads(np.nan), Commands()).departed

@@ -33,9 +33,9 @@ def scan():
 
 def test_a_scan_is_read_as_it_was(tmp_path, scan):
     store = ScanStore(tmp_path / "scans", "one")
-    assert store.kept(3, POSE) is None and store.number == 0
-    store.keep(3, POSE, scan)
-    found = store.kept(3, replace(POSE, y=POSE.y + 1e-9))
+    assert store.read(3, POSE) is None and store.number == 0
+    store.write(3, POSE, scan)
+    found = store.read(3, replace(POSE, y=POSE.y + 1e-9))
     for name in ("near", "far", "far_noise"):
         xr.testing.assert_identical(
             getattr(found, name).drop_attrs().rename(None),
@@ -43,18 +43,18 @@ def test_a_scan_is_read_as_it_was(tmp_path, scan):
         )
     assert store.number == 1
     store.remove()
-    assert store.kept(3, POSE) is None and not store.folder.exists()
+    assert store.read(3, POSE) is None and not store.folder.exists()
 
 
 def test_scans_of_others_do_not_count(tmp_path, scan):
     store = ScanStore(tmp_path, "one")
-    store.keep(3, POSE, scan)
+    store.write(3, POSE, scan)
     for axis in ("x", "y", "z", "roll", "pitch", "yaw"):
-        assert store.kept(3, replace(POSE, **{axis: getattr(POSE, axis) + 1e-4})) is None
-    assert store.kept(2, POSE) is None
-    assert ScanStore(tmp_path, "another").kept(3, POSE) is None
+        assert store.read(3, replace(POSE, **{axis: getattr(POSE, axis) + 1e-4})) is None
+    assert store.read(2, POSE) is None
+    assert ScanStore(tmp_path, "another").read(3, POSE) is None
     (tmp_path / "scan_0003.nc").write_bytes(b"\x89HDF\r\n\x1a\n damaged")
-    assert store.kept(3, POSE) is None
+    assert store.read(3, POSE) is None
 
 
 def test_a_flight_that_was_stopped_goes_on(tmp_path, monkeypatch):

@@ -10,8 +10,8 @@ import xarray as xr
 
 from lidar_mi.encounter.aircraft import AircraftState, Commands
 from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.preview import Lookout, Slab
-from lidar_mi.encounter.series import QUANTITIES, Recorder, flights_dataset, track_dataset
+from lidar_mi.encounter.preview import Slab, WakeTracker
+from lidar_mi.encounter.series import QUANTITIES, FlightRecorder, flights_dataset, track_dataset
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.experiment.schema.reading import check
@@ -25,7 +25,7 @@ def wake():
 
 def recorded(roll):
     """Two instants: the second with a prediction."""
-    record, moments = Recorder(), np.diag([2.0, 3.0, 5.0])
+    record, moments = FlightRecorder(), np.diag([2.0, 3.0, 5.0])
     loads = Loads(np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]))
     for k, predicted in enumerate((None, Loads(10 * loads.force, 10 * loads.moment))):
         state = AircraftState(time=0.1 * k, x=7.5 * k, roll=roll, pitch_rate=0.3)
@@ -67,11 +67,11 @@ def test_flights_are_told_apart():
 
 
 def test_track_has_estimates_track_and_truth_of_every_slab(wake):
-    lookout = Lookout(SyntheticLidar(wake), 0.1, 7.5)
+    tracker = WakeTracker(SyntheticLidar(wake), 0.1, 7.5)
     for time in np.arange(0, 1.2, 0.05):
-        lookout.look(AircraftState(time=float(time), x=75 * float(time)))
-    found = track_dataset(lookout.slabs, wake)
-    assert found.sizes["slab"] == len(lookout.slabs) > 8
+        tracker.update(AircraftState(time=float(time), x=75 * float(time)))
+    found = track_dataset(tracker.slabs, wake)
+    assert found.sizes["slab"] == len(tracker.slabs) > 8
     assert list(found["source"].values) == ["estimate", "track", "truth"]
     # the first scan has no pair of images
     first = found.isel(slab=0)

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.cases import DT, drifting_pair_images
 from benchmarks.realtime import UNFORESEEN
-from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds
+from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProcess
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from tests.support.vortex_pairs import uneven
@@ -35,10 +35,10 @@ def drifting():
 
 
 def wind_of(winds, images, expected=None, before=None, complete=None):
-    """A slab's wind, begun with its first image."""
+    """A slab's wind, prepared with its first image."""
     first = FirstImage(images.first, DT, NOISE, expected=expected)
-    assert winds.awaits(first, before)() > 0
-    return winds.begun(images.second, complete)()
+    assert winds.prepare(first, before).result() > 0
+    return winds.retrieve(images.second, complete).result()
 
 
 def winds_of(winds, drifting, complete=None):
@@ -53,7 +53,7 @@ def winds_of(winds, drifting, complete=None):
 
 @pytest.fixture(scope="module")
 def here(drifting):
-    return winds_of(SlabWinds(ImageMethod.VARIATIONAL, WINDOWS), drifting)
+    return winds_of(InThisProcess(ImageMethod.VARIATIONAL, WINDOWS), drifting)
 
 
 def test_each_wind_starts_from_the_last_one(here, drifting):
@@ -61,7 +61,7 @@ def test_each_wind_starts_from_the_last_one(here, drifting):
     near, far = [], []
     for (wind, flags, seconds), images in zip(here, drifting[0], strict=True):
         assert not flags and set(seconds) == {"wind"} and seconds["wind"] > 0
-        alone = SlabWinds(ImageMethod.VARIATIONAL, WINDOWS)
+        alone = InThisProcess(ImageMethod.VARIATIONAL, WINDOWS)
         nothing = wind_of(alone, images).wind
         for found, errors in ((wind, near), (nothing, far)):
             true = images.v.interp(y=found["y"], z=found["z"])
@@ -97,6 +97,21 @@ def test_a_wind_is_completed_where_it_is_found_and_the_next_starts_without(here,
         assert float(abs(off).max()) < 0.01
 
 
+def failing(wind):
+    raise ValueError("a completion that fails")
+
+
+@pytest.mark.parametrize("form", [InThisProcess, InOwnProcess])
+def test_a_fault_surfaces_with_the_result(drifting, form):
+    """Not as the wind is asked for: the vortices are fitted meanwhile."""
+    winds = form(ImageMethod.CC, WINDOWS)
+    images = drifting[0][0]
+    winds.prepare(FirstImage(images.first, DT, NOISE), None).result()
+    future = winds.retrieve(images.second, failing)
+    with pytest.raises(ValueError, match="a completion that fails"):
+        future.result()
+
+
 def test_what_limits_the_wind_of_most_vectors_is_said(drifting):
     """A pattern at rest as strong as the texture, and unrelated images."""
     images, random = drifting[0][0], np.random.default_rng(5)
@@ -108,11 +123,11 @@ def test_what_limits_the_wind_of_most_vectors_is_said(drifting):
         "wind: unrelated": (images.first, other),
     }
     for reason, pair in pairs.items():
-        winds = SlabWinds(ImageMethod.VARIATIONAL, WINDOWS)
+        winds = InThisProcess(ImageMethod.VARIATIONAL, WINDOWS)
         seen = replace(images, first=pair[0], second=pair[1])
         assert reason in wind_of(winds, seen).flags
 
 
 def test_other_methods_start_from_nothing(drifting):
     images = drifting[0][0]
-    assert wind_of(SlabWinds(ImageMethod.CC, WINDOWS), images).wind.attrs["method"] == "cc"
+    assert wind_of(InThisProcess(ImageMethod.CC, WINDOWS), images).wind.attrs["method"] == "cc"

@@ -10,7 +10,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.export_flight import FLIGHT_FILES, flight_results
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.yaml import to_yaml
-from tests.support.encounter_results import flown
+from tests.support.encounter_results import made_up_flights
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def folder(tmp_path):
 @pytest.fixture
 def flight(folder):
     for name, file in FLIGHT_FILES.items():
-        write_netcdf(getattr(flown(), name), folder / file)
+        write_netcdf(getattr(made_up_flights(), name), folder / file)
     return folder
 
 
@@ -32,19 +32,25 @@ def test_tables_have_the_values_of_the_flight(flight):
     assert names == ["flight.csv", "track.csv", "slab_winds.csv"]
     table = pd.read_csv(flight / "csv" / "flight.csv")
     with_lidar = table[table["flight"] == "feedforward"]
-    roll = flown().series["roll"].sel(flight="feedforward")
+    roll = made_up_flights().series["roll"].sel(flight="feedforward")
     np.testing.assert_allclose(with_lidar["roll [rad]"], roll, rtol=1e-6)
-    assert len(pd.read_csv(flight / "csv" / "track.csv")) == 3 * flown().track.sizes["slab"]
+    assert (
+        len(pd.read_csv(flight / "csv" / "track.csv")) == 3 * made_up_flights().track.sizes["slab"]
+    )
     winds = pd.read_csv(flight / "csv" / "slab_winds.csv")
-    assert len(winds) == flown().seen["v"].size
+    assert len(winds) == made_up_flights().slabs["v"].size
     row = winds.iloc[7]
-    there = flown().seen.swap_dims(slab="x")["v"].sel(x=row.iloc[0], y=row.iloc[1], z=row.iloc[2])
+    there = (
+        made_up_flights()
+        .slabs.swap_dims(slab="x")["v"]
+        .sel(x=row.iloc[0], y=row.iloc[1], z=row.iloc[2])
+    )
     assert row["v"] == pytest.approx(float(there))
 
 
 def test_points_are_the_vortices(flight):
     results = dict(flight_results(flight, placed=True))
-    truth, track = results["vortices_truth"], flown().track.sel(source="truth")
+    truth, track = results["vortices_truth"], made_up_flights().track.sel(source="truth")
     slabs = track.sizes["slab"]
     np.testing.assert_allclose(truth["y"][:slabs], track["port_y"])
     np.testing.assert_allclose(truth["circulation"][slabs:], track["starboard_circulation"])

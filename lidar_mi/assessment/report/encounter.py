@@ -150,7 +150,7 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
     if ours is not None:
         answer += f"; with the lidar by {_degrees(ours)}"
         if _departed(metrics, "feedforward"):
-            answer += " (it departs)"
+            answer += " (the flight is lost)"
     if perfect is not None:
         answer += f"; with perfect preview by {_degrees(perfect)}"
     answer += "."

@@ -12,14 +12,14 @@ from matplotlib.image import imread
 from lidar_mi.assessment.figures.encounter import best_slab, draw_all, draw_image, draw_vortices
 from lidar_mi.assessment.figures.encounter_film import film
 from lidar_mi.experiment.log import Log
-from tests.support.encounter_results import flown
+from tests.support.encounter_results import made_up_flights
 
 SPAN = 28.9
 
 
 def test_all_are_drawn(tmp_path):
-    found = flown()
-    drawn = draw_all(tmp_path, found.series, found.track, found.seen, SPAN, Log())
+    found = made_up_flights()
+    drawn = draw_all(tmp_path, found.series, found.track, found.slabs, SPAN, Log())
     assert [one.path.stem for one in drawn] == [
         "fig29_encounter",
         "fig30_roll",
@@ -34,17 +34,17 @@ def test_all_are_drawn(tmp_path):
 
 
 def test_without_a_lidar_there_is_the_flight(tmp_path):
-    alone = flown().series.sel(flight=["off"])
+    alone = made_up_flights().series.sel(flight=["off"])
     drawn = draw_all(tmp_path, alone, None, None, SPAN, Log())
     assert [one.path.stem for one in drawn] == ["fig30_roll", "fig35_commands"]
 
 
 def test_cockpit_is_the_pilots_view():
     """Port, positive y, is on the left; cores are where the data set has them."""
-    found = flown()
-    number = best_slab(found.track, found.seen)
+    found = made_up_flights()
+    number = best_slab(found.track, found.slabs)
     axes = Figure().subplots()
-    draw_image(axes, found.seen.isel(slab=number))
+    draw_image(axes, found.slabs.isel(slab=number))
     at = found.track.isel(slab=number)
     draw_vortices(axes, at)
     left, right = axes.get_xlim()
@@ -59,8 +59,8 @@ def test_cockpit_is_the_pilots_view():
 
 def test_film_shows_the_flight(monkeypatch):
     monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.MOST_FRAMES", 3)
-    found = flown()
-    frames = list(film(found.series, found.track, found.seen, SPAN))
+    found = made_up_flights()
+    frames = list(film(found.series, found.track, found.slabs, SPAN))
     assert len(frames) == 3 and len({frame.pixels.shape for frame in frames}) == 1
     assert all(frame.pixels.dtype == np.uint8 and frame.pixels.std() > 10 for frame in frames)
     last = found.series.isel(time=-1)

@@ -1,4 +1,4 @@
-"""What the lidar saw of every slab, for figures: the image and the wind vectors."""
+"""Records the image and the wind vectors of every slab, for figures."""
 
 from dataclasses import dataclass, field
 
@@ -13,8 +13,8 @@ _VECTORS = 24
 
 
 @dataclass(eq=False)
-class Seen:
-    """Collects images and vectors, estimate by estimate.
+class SlabRecorder:
+    """Records images and vectors, estimate by estimate.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Seen:
     _slabs: list[xr.Dataset] = field(default_factory=list)
 
     def add(self, estimate: Estimate) -> None:
-        """What was seen at the last step; nothing at a first scan."""
+        """The slab of the last scan; the first scan completes none."""
         images = getattr(self.lidar, "images", None)
         if estimate.wind is None and images is None:
             return
@@ -45,7 +45,7 @@ class Seen:
         self._slabs.append(xr.Dataset(found).assign(about))
 
     def dataset(self) -> xr.Dataset | None:
-        """All slabs, dims (slab, z, y) and (slab, image_z, image_y); None: nothing was seen.
+        """All slabs, dims (slab, z, y) and (slab, image_z, image_y); None: there are none.
 
         On the nodes of the first slab; NaN where a later one has none.
         """

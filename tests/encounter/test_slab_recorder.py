@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.seen import Seen
+from lidar_mi.encounter.slab_recorder import SlabRecorder
 
 
 def estimate(x, shift=0.0, wind=True):
@@ -31,11 +31,11 @@ def image(shift=0.0):
 
 def test_slabs_share_the_grid_of_the_first():
     lidar = SimpleNamespace(images=image())
-    seen = Seen(lidar)
-    seen.add(estimate(75.0))
+    recorder = SlabRecorder(lidar)
+    recorder.add(estimate(75.0))
     lidar.images = image(0.5)
-    seen.add(estimate(82.5, 0.5))
-    found = seen.dataset()
+    recorder.add(estimate(82.5, 0.5))
+    found = recorder.dataset()
     assert found.sizes["slab"] == 2 and list(found["x"].values) == [75.0, 82.5]
     inside = found.isel(slab=1, y=slice(1, -1), z=slice(0, -1))
     # linear functions are interpolated exactly, in single precision
@@ -46,15 +46,15 @@ def test_slabs_share_the_grid_of_the_first():
 
 
 def test_flagged_vectors_are_not_shown():
-    seen = Seen(SimpleNamespace())
-    seen.add(estimate(75.0))
+    recorder = SlabRecorder(SimpleNamespace())
+    recorder.add(estimate(75.0))
     wind = estimate(75.0).wind
-    found = seen.dataset().isel(slab=0)
+    found = recorder.dataset().isel(slab=0)
     kept = wind.sel(y=found["y"], z=found["z"])
     assert (np.isnan(found["v"]) == (kept["flag"] != 0)).all() and "image" not in found
 
 
 def test_nothing_seen_is_nothing_kept():
-    seen = Seen(SimpleNamespace(images=None))
-    seen.add(estimate(75.0, wind=False))
-    assert seen.dataset() is None
+    recorder = SlabRecorder(SimpleNamespace(images=None))
+    recorder.add(estimate(75.0, wind=False))
+    assert recorder.dataset() is None
