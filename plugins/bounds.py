@@ -6,15 +6,23 @@ matter of speed alone.
 """
 
 import functools
+import math
 import re
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .variant_types import Cell, Float, Medium, MediumPtr, Point, Tensor, UInt, Vector, Volume
+
 # Least number of cells along the edge of a block, largest number of blocks along an axis, and the
 # optical depth of an axis, at the difference of the field's bounds, for which one more block pays.
 CELLS, BLOCKS, DEPTH = 4, 64, 0.5
+
+Source: TypeAlias = tuple[int, float, int, bytes]
+"""What the blocks of a grid depend on: its array's index, scale, channel and place."""
 
 UNKNOWN, UNIFORM, BLOCKED = 0, 1, 2
 """What is known of a medium: its majorant alone, that it is the same everywhere, its blocks."""
@@ -28,17 +36,17 @@ class Bounds:
     ``wrap_mode``. Other volumes have their majorant.
     """
 
-    def __init__(self):
-        self._read: dict = {}
+    def __init__(self) -> None:
+        self._read: dict[Medium, _Blocks] = {}
 
-    def update(self, media, channel: int) -> None:
+    def update(self, media: Sequence[Medium], channel: int) -> None:
         """Read the media, as far as they have changed since the last time."""
         read = {medium: _blocks(medium, channel, self._read.get(medium)) for medium in media}
         if not self._read or read != self._read:
             self._tabulate(read)
         self._read = read
 
-    def _tabulate(self, read):
+    def _tabulate(self, read: "dict[Medium, _Blocks]") -> None:
         # medium 0 is none: one block without any extinction
         numbers = [0, *(_number(mi.MediumPtr(medium))[0] for medium in read)]
         tables = [_Blocks(BLOCKED), *read.values()]
@@ -57,11 +65,13 @@ class Bounds:
         # opaque, also where there is one entry only, so that other fields run in the same kernel
         dr.make_opaque(self.kinds, self.firsts, self.counts, self.frames, self.values)
 
-    def kind(self, medium):
+    def kind(self, medium: MediumPtr) -> UInt:
         """What is known of the medium of each lane."""
         return dr.gather(mi.UInt32, self.kinds, _number(medium))
 
-    def enter(self, medium, origin, direction):
+    def enter(
+        self, medium: MediumPtr, origin: Point, direction: Vector
+    ) -> tuple[Vector, Vector, Cell, UInt]:
         """A line in the blocks of a medium: its start, step per metre, counts and first value."""
         number = _number(medium)
         rows = [dr.gather(mi.Vector3f, self.frames, 4 * number + row) for row in range(4)]
@@ -70,24 +80,24 @@ class Bounds:
         counts = dr.gather(mi.Vector3i, self.counts, number)
         return start, step, counts, dr.gather(mi.UInt32, self.firsts, number)
 
-    def extinction(self, block, counts, first):
+    def extinction(self, block: Cell, counts: Cell, first: UInt) -> Vector:
         """Least, mean and largest extinction of a block, m^-1."""
         place = block + 1
         index = (place.z * (counts.y + 2) + place.y) * (counts.x + 2) + place.x
         return dr.gather(mi.Vector3f, self.values, first + mi.UInt32(index))
 
 
-def _number(medium):
+def _number(medium: MediumPtr) -> UInt:
     return dr.reinterpret_array(mi.UInt32, medium)
 
 
-def locate(start, step, counts, travelled):
+def locate(start: Vector, step: Vector, counts: Cell, travelled: Float) -> Cell:
     """The block of a line at a distance; -1 and ``counts`` are all that lies beyond the grid."""
     place = dr.clip(dr.floor(start + step * travelled), -1, mi.Vector3f(counts))
     return mi.Vector3i(place)
 
 
-def leave(start, step, counts, block):
+def leave(start: Vector, step: Vector, counts: Cell, block: Cell) -> tuple[Float, Cell]:
     """Distance at which a line leaves a block, and the block behind it."""
     forward = step > 0
     onward = (forward & (block < counts)) | ((step < 0) & (block >= 0))
@@ -106,13 +116,21 @@ def leave(start, step, counts, block):
 class _Blocks:
     """Bounds of one medium; ``frame`` maps world coordinates to blocks."""
 
-    def __init__(self, kind, counts=(0, 0, 0), frame=0.0, values=0.0, source=None):
+    def __init__(
+        self,
+        kind: int,
+        counts: tuple[int, ...] = (0, 0, 0),
+        frame: np.ndarray | None = None,
+        values: np.ndarray | None = None,
+        source: tuple[Source, Float] | None = None,
+    ) -> None:
         self.kind, self.counts, self.source = kind, counts, source
-        self.frame = np.broadcast_to(frame, (4, 3))
-        self.values = np.broadcast_to(values, (np.prod(np.add(counts, 2)), 3))
+        self.frame = np.zeros((4, 3)) if frame is None else frame
+        blocks = math.prod(count + 2 for count in counts)
+        self.values = np.zeros((blocks, 3)) if values is None else values
 
 
-def _blocks(medium, channel, known) -> _Blocks:
+def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
     """Those of a medium; ``known`` again if it still is what it was."""
     volume = _parts(medium).get("sigma_t")
     data = _grid(volume)
@@ -145,19 +163,19 @@ def _blocks(medium, channel, known) -> _Blocks:
     return _Blocks(BLOCKED, counts, frame, values.reshape(-1, 3), (source, array))
 
 
-def _parts(thing) -> dict:
-    """What an object of a scene consists of, by name."""
-    found = {}
+def _parts(medium: Medium) -> dict[str, Any]:
+    """What a medium consists of, by name."""
+    found: dict[str, Any] = {}
 
     class Parts(mi.TraversalCallback):
-        def put(self, name, value, *_):
+        def put(self, name: str, value: Any, *_: object) -> None:
             found[name] = value
 
-    thing.traverse(Parts())
+    medium.traverse(Parts())
     return found
 
 
-def _grid(volume):
+def _grid(volume: Volume) -> Tensor | None:
     """Values of a volume that is a regular grid of extinction coefficients; None for others."""
     if volume is None or not (volume.class_name() == "GridVolume" or hasattr(volume, "to_grid")):
         return None
@@ -166,7 +184,7 @@ def _grid(volume):
     return data if data.shape[-1] == 1 or (mi.is_rgb and data.shape[-1] == 3) else None
 
 
-def _to_local(volume) -> np.ndarray:
+def _to_local(volume: Volume) -> np.ndarray:
     """The map from the world to the unit cube that a grid fills, 4 x 4.
 
     Mitsuba tells a grid's map in words only, to six digits: the middle of the bounding box gives
@@ -174,8 +192,9 @@ def _to_local(volume) -> np.ndarray:
     """
     if hasattr(volume, "to_grid"):
         return volume.to_grid()
-    rows = re.search(r"matrix=\[\[(.*?)\]\]", str(volume), re.DOTALL)[1]
-    numbers = [float(word) for word in re.split(r"[\s,\[\]]+", rows) if word]
+    found = re.search(r"matrix=\[\[(.*?)\]\]", str(volume), re.DOTALL)
+    assert found is not None  # every version of Mitsuba that is allowed prints it
+    numbers = [float(word) for word in re.split(r"[\s,\[\]]+", found[1]) if word]
     matrix = np.array(numbers).reshape(4, 4)
     box = volume.bbox()
     middle = (np.array(box.min, float).ravel() + np.array(box.max, float).ravel()) / 2
@@ -183,7 +202,9 @@ def _to_local(volume) -> np.ndarray:
     return matrix
 
 
-def _reduced(extreme, field, axis, edge):
+def _reduced(
+    extreme: Callable[[np.ndarray, np.ndarray], np.ndarray], field: np.ndarray, axis: int, edge: int
+) -> np.ndarray:
     """Extremes of blocks along an axis, each with one cell more on either side.
 
     Interpolation looks up half of that cell; the other half is a margin for rounding. Beside the
@@ -197,7 +218,7 @@ def _reduced(extreme, field, axis, edge):
     return functools.reduce(extreme, parts)
 
 
-def _averaged(field, axis, edge):
+def _averaged(field: np.ndarray, axis: int, edge: int) -> np.ndarray:
     """Means of blocks along an axis."""
     starts = np.arange(0, field.shape[axis], edge)
     lengths = np.diff([*starts, field.shape[axis]])

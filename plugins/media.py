@@ -3,14 +3,18 @@
 import drjit as dr
 import mitsuba as mi
 
-from .bounds import UNIFORM, UNKNOWN, leave, locate
+from .bounds import UNIFORM, UNKNOWN, Bounds, leave, locate
+from .surfaces import Air
+from .variant_types import Float, Generator, Interaction, Mask, MediumPtr, Point, Vector
 
 # Optical depth along a segment by which the control variate may exceed the least extinction, and
 # the majorant over the largest difference of extinction and control. Both only concern efficiency.
 RAISED, MAJORANT = 0.5, 2.0
 
 
-def interaction(medium, position, direction, wavelengths, time):
+def interaction(
+    medium: MediumPtr, position: Point, direction: Vector, wavelengths: Float, time: Float
+) -> Interaction:
     """The medium interaction of light that arrives at ``position`` along ``direction``."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p = position
@@ -22,26 +26,28 @@ def interaction(medium, position, direction, wavelengths, time):
     return mei
 
 
-def coefficients(medium, mei, channel, active):
+def coefficients(
+    medium: MediumPtr, mei: Interaction, channel: int, active: Mask
+) -> tuple[Float, Float]:
     """Scattering and extinction coefficient (m^-1) at an interaction."""
     scattering, _, extinction = medium.get_scattering_coefficients(mei, active)
     return scattering[channel], extinction[channel]
 
 
 def transmittance(
-    air,
-    bounds,
-    medium,
-    origin,
-    direction,
-    distance,
-    channel,
-    wavelengths,
-    time,
-    rng,
-    active,
-    differentiable=False,
-):
+    air: Air,
+    bounds: Bounds,
+    medium: MediumPtr,
+    origin: Point,
+    direction: Vector,
+    distance: Float,
+    channel: int,
+    wavelengths: Float,
+    time: Float,
+    rng: Generator,
+    active: Mask,
+    differentiable: bool = False,
+) -> tuple[Float, MediumPtr]:
     """Unbiased estimate of the transmittance along a straight line, and the medium at its end.
 
     Homogeneous media in closed form, others by residual ratio tracking (Novak et al. 2014, ACM TOG
@@ -80,8 +86,19 @@ def transmittance(
 
 @dr.syntax
 def _walk(
-    air, bounds, medium, origin, direction, distance, where, channel, wavelengths, time, rng, active
-):
+    air: Air,
+    bounds: Bounds,
+    medium: MediumPtr,
+    origin: Point,
+    direction: Vector,
+    distance: Float,
+    where: Float,
+    channel: int,
+    wavelengths: Float,
+    time: Float,
+    rng: Generator,
+    active: Mask,
+) -> tuple[Float, MediumPtr, MediumPtr]:
     """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
@@ -135,8 +152,18 @@ def _walk(
 
 @dr.syntax
 def collision(
-    air, bounds, medium, origin, direction, distance, channel, wavelengths, time, rng, active
-):
+    air: Air,
+    bounds: Bounds,
+    medium: MediumPtr,
+    origin: Point,
+    direction: Vector,
+    distance: Float,
+    channel: int,
+    wavelengths: Float,
+    time: Float,
+    rng: Generator,
+    active: Mask,
+) -> tuple[Float, MediumPtr, Mask]:
     """Distance to the first real collision by delta tracking, its medium, and whether it happened.
 
     Not forced: a sample without a collision within ``distance``, or at an opaque surface, is lost.

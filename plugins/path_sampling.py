@@ -4,10 +4,14 @@
 physical distribution. Both give Stokes vectors about the instrument's horizontal axis.
 """
 
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
 import drjit as dr
 import mitsuba as mi
 
 from .bodies import slabs
+from .bounds import Bounds
 from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
 from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
@@ -16,6 +20,23 @@ from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
 from .resampling import choose
 from .surfaces import Air, media_of
+from .variant_types import (
+    Float,
+    Frame,
+    Generator,
+    Interaction,
+    Mask,
+    MediumPtr,
+    Point,
+    Scene,
+    Sensor,
+    Stokes,
+    UInt,
+    Vector,
+)
+
+Products: TypeAlias = Mapping[tuple[int, int], Float]
+"""Sums of products of two Stokes components, by their indices."""
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
@@ -45,7 +66,19 @@ class Sample:
     ``mi.mueller.stokes_basis(direction)``.
     """
 
-    def __init__(self, rng, frame, start, time, axes, origin, direction, aperture, delay, stokes):
+    def __init__(
+        self,
+        rng: Generator,
+        frame: Frame,
+        start: Point,
+        time: Float,
+        axes: Frame,
+        origin: Point,
+        direction: Vector,
+        aperture: Point,
+        delay: Float,
+        stokes: Stokes,
+    ) -> None:
         self.rng, self.frame, self.start, self.time, self.axes = rng, frame, start, time, axes
         self.origin, self.direction, self.aperture = origin, direction, aperture
         self.delay, self.stokes = delay, stokes
@@ -54,7 +87,9 @@ class Sample:
 class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
-    def __init__(self, scene, sensor, bounds, differentiable=False):
+    def __init__(
+        self, scene: Scene, sensor: Sensor, bounds: Bounds, differentiable: bool = False
+    ) -> None:
         self.air, self.sensor = Air(scene, sensor), sensor
         self.bounds, self.differentiable = bounds, differentiable
         self.rounded = has_tables(media_of(scene, sensor))
@@ -64,7 +99,7 @@ class Lidar:
         self.area = sensor.aperture_area()
         self.context = mi.PhaseFunctionContext()
 
-    def emit(self, seed, beam, number) -> Sample:
+    def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
         """Samples of beams by their index, with independent random numbers."""
         rng = generator(seed, beam, number)
         sensor, laser = self.sensor, self.sensor.laser
@@ -92,7 +127,17 @@ class Lidar:
             rng, frame, start, time, axes, origin, direction, aperture, delay, list(stokes)
         )
 
-    def forced(self, sample, low, high, position, max_order, split, by_order, cell):
+    def forced(
+        self,
+        sample: Point,
+        low: Float,
+        high: Float,
+        position: Float,
+        max_order: int,
+        split: bool,
+        by_order: Float,
+        cell: UInt,
+    ) -> Stokes:
         """Stokes vector (about e_h) received from each sample's gate.
 
         ``low`` and ``high`` are twice the gate's ranges less the sample's delay, ``position`` (0
@@ -126,7 +171,18 @@ class Lidar:
         return _sum(total, further)
 
     @dr.syntax
-    def _forced_further(self, sample, medium, path, width, last, split, by_order, cell, max_order):
+    def _forced_further(
+        self,
+        sample: Sample,
+        medium: MediumPtr,
+        path: Float,
+        width: Float,
+        last: UInt,
+        split: bool,
+        by_order: Float,
+        cell: UInt,
+        max_order: int,
+    ) -> Stokes:
         """Orders from two on: the path is closed once from every vertex but the last."""
         # local names, as the loop records local variables only
         aperture, rng = sample.aperture, sample.rng
@@ -185,7 +241,9 @@ class Lidar:
             active &= weight > 0
         return total
 
-    def _first_flight(self, rng, origin, direction, aperture, path):
+    def _first_flight(
+        self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
+    ) -> tuple[Float, Float]:
         """Length of a first flight and the inverse of its density; -1 where there is no air."""
         reach = closing_distance(origin - aperture, direction, path)
         enters, leaves = slabs(self.low, self.high, origin, direction)
@@ -202,17 +260,26 @@ class Lidar:
         )
         return dr.select((path > 0) & (most > least), reach - left, -1), dr.rcp(density)
 
-    def _half_field(self, axes, away):
+    def _half_field(self, axes: Frame, away: Vector) -> Float:
         """Tangent of half the widest angle between a direction and one of the field of view."""
         local = axes.to_local(away)
         vertex = dr.norm(local.xy) / (1 + local.z)
         field = self._half_fov()
         return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
-    def _half_fov(self):
+    def _half_fov(self) -> Float:
         return self.sensor.m_fov_tan / (1 + dr.sqrt(1 + dr.square(self.sensor.m_fov_tan)))
 
-    def _last_flight(self, rng, sample, medium, mei, stokes, rest, active):
+    def _last_flight(
+        self,
+        rng: Generator,
+        sample: Sample,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        rest: OpenPath,
+        active: Mask,
+    ) -> tuple[Vector, Stokes, Float, Float]:
         """Direction, Stokes vector and length of the flight to the last vertex; its weight.
 
         One of two candidates, selected by its contribution if there is no obstacle and the medium
@@ -259,7 +326,15 @@ class Lidar:
         (wo, scattered, leg, volume), weight = choose(rng, *tried)
         return wo, scattered, leg, volume * weight
 
-    def _next_flight(self, rng, medium, mei, stokes, rest, active):
+    def _next_flight(
+        self,
+        rng: Generator,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        rest: OpenPath,
+        active: Mask,
+    ) -> tuple[Vector, Stokes, Float, Float]:
         """Direction, Stokes vector (of unchanged S0), length and weight of a further flight."""
         phase, rest = medium.phase_function(), rest.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
@@ -292,11 +367,11 @@ class Lidar:
         factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
         return wo, _scaled(scattered, factor), leg, dr.select(factor > 0, weight / factor, 0)
 
-    def _field_solid_angle(self):
+    def _field_solid_angle(self) -> Float:
         cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
         return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
 
-    def _in_field(self, axes, rng):
+    def _in_field(self, axes: Frame, rng: Generator) -> Vector:
         """A direction of the field of view, uniform in solid angle."""
         sample = pair(rng)
         # 1 - cos, without the difference of numbers next to one: fields of view are milliradians
@@ -305,7 +380,18 @@ class Lidar:
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
         return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
 
-    def _connect(self, sample, rng, position, direction, distance, medium, stokes, volume, active):
+    def _connect(
+        self,
+        sample: Sample,
+        rng: Generator,
+        position: Point,
+        direction: Vector,
+        distance: Float,
+        medium: MediumPtr,
+        stokes: Stokes,
+        volume: Float,
+        active: Mask,
+    ) -> Stokes:
         """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
 
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
@@ -331,7 +417,16 @@ class Lidar:
         scattering, _ = coefficients(medium, mei, self.channel, active)
         return self._receive(sample, rng, medium, mei, stokes, active, out * scattering * volume)
 
-    def _receive(self, sample, rng, medium, mei, stokes, active, weight):
+    def _receive(
+        self,
+        sample: Sample,
+        rng: Generator,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        active: Mask,
+        weight: Float,
+    ) -> Stokes:
         """Next-event estimation from an interaction to the telescope point."""
         back = sample.aperture - mei.p
         distance = dr.norm(back)
@@ -361,7 +456,9 @@ class Lidar:
             )
         return [dr.select(active, r * weight, 0) for r in received]
 
-    def _scatter(self, medium, mei, stokes, wo, active):
+    def _scatter(
+        self, medium: MediumPtr, mei: Interaction, stokes: Stokes, wo: Vector, active: Mask
+    ) -> tuple[Stokes, Float]:
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
         if self.rounded:
             wo = off_the_poles(mei.wi, wo)
@@ -370,8 +467,18 @@ class Lidar:
 
     @dr.syntax
     def analog(
-        self, sample, max_order, base, gates, sums, products, largest, magnified, split, by_order
-    ):
+        self,
+        sample: Sample,
+        max_order: int,
+        base: UInt,
+        gates: int,
+        sums: Sequence[Float],
+        products: Products,
+        largest: UInt,
+        magnified: float,
+        split: bool,
+        by_order: Float,
+    ) -> None:
         """Analog free flights; every collision is connected to the telescope.
 
         Adds contributions to ``sums``, and their products, each factor ``magnified``, to
@@ -432,12 +539,20 @@ class Lidar:
             _deposit(sums, products, largest, magnified, base + gate, held, began & ~active)
 
 
-def _add(total, value, cell, active=True):
+def _add(total: Float, value: Float, cell: UInt, active: Mask = True) -> None:
     # the default mode would compile the number of cells into the kernel
     dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, active, mode=dr.ReduceMode.Local)
 
 
-def _deposit(sums, products, largest, magnified, cell, held, active):
+def _deposit(
+    sums: Sequence[Float],
+    products: Products,
+    largest: UInt,
+    magnified: float,
+    cell: UInt,
+    held: Stokes,
+    active: Mask,
+) -> None:
     """Add contributions of samples to their gates, and products of their components."""
     active = active & (held[0] != 0)
     for total, value in zip(sums, held, strict=True):
@@ -449,13 +564,13 @@ def _deposit(sums, products, largest, magnified, cell, held, active):
     dr.scatter_reduce(dr.ReduceOp.Max, largest, square, cell, active, mode=dr.ReduceMode.Local)
 
 
-def _copied(stokes):
+def _copied(stokes: Sequence[Float]) -> Stokes:
     return [mi.Float(s) for s in stokes]
 
 
-def _sum(first, second):
+def _sum(first: Stokes, second: Stokes) -> Stokes:
     return [a + b for a, b in zip(first, second, strict=True)]
 
 
-def _scaled(stokes, factor):
+def _scaled(stokes: Stokes, factor: Float) -> Stokes:
     return [s * factor for s in stokes]

@@ -206,6 +206,6 @@ def test_samples_of_another_number_are_not_resumed():
     keeper = Keeper()
     store = batches_of(IMAGES, keeper, Log(), 100)(0)
     store._next = 0.0
-    store.keep(3, lambda: {"image": np.ones(2)})
-    assert batches_of(IMAGES, keeper, Log(), 100)(0).kept()[0] == 3
-    assert batches_of(IMAGES, keeper, Log(), 110)(0).kept() == (0, {})
+    store.store(3, lambda: {"image": np.ones(2)})
+    assert batches_of(IMAGES, keeper, Log(), 100)(0).stored()[0] == 3
+    assert batches_of(IMAGES, keeper, Log(), 110)(0).stored() == (0, {})
