@@ -238,7 +238,7 @@ def _next(
 
 
 def scene_of(shapes: Sequence[Shape]) -> Scene:
-    """A scene of some shapes alone. Mitsuba names them anew; they keep their names."""
+    """A scene of some shapes alone. Mitsuba renames them; their names are restored."""
     names = [shape.id() for shape in shapes]
     parts = {f"shape{number}": shape for number, shape in enumerate(shapes)}
     scene = mi.load_dict({"type": "scene", **parts}, optimize=False)
@@ -294,8 +294,8 @@ def _affine(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     # x = A c + b for each corner c
     reference = np.column_stack([reference, np.ones(len(reference))])
     affine, *_ = np.linalg.lstsq(reference, corners, rcond=None)
-    bent = np.abs(reference @ affine - corners).max() > 1e-5 * np.abs(corners).max()
-    return None if bent else (affine[:3].T, affine[3])
+    sheared = np.abs(reference @ affine - corners).max() > 1e-5 * np.abs(corners).max()
+    return None if sheared else (affine[:3].T, affine[3])
 
 
 def _pieces(corners: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, bool]]:

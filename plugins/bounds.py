@@ -8,7 +8,7 @@ matter of speed alone.
 import functools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -39,7 +39,7 @@ class Bounds:
     def __init__(self) -> None:
         self._read: dict[Medium, _Blocks] = {}
 
-    def update(self, media: Sequence[Medium], channel: int) -> None:
+    def update(self, media: Iterable[Medium], channel: int) -> None:
         """Read the media, as far as they have changed since the last time."""
         read = {medium: _blocks(medium, channel, self._read.get(medium)) for medium in media}
         if not self._read or read != self._read:
@@ -47,7 +47,8 @@ class Bounds:
         self._read = read
 
     def _tabulate(self, read: "dict[Medium, _Blocks]") -> None:
-        # medium 0 is none: one block without any extinction
+        # medium 0 is none: one block without any extinction, so that lanes in a vacuum need no
+        # branch of their own
         numbers = [0, *(_number(mi.MediumPtr(medium))[0] for medium in read)]
         tables = [_Blocks(BLOCKED), *read.values()]
         size, first, values = max(numbers) + 1, 0, []
@@ -82,6 +83,7 @@ class Bounds:
 
     def extinction(self, block: Cell, counts: Cell, first: UInt) -> Vector:
         """Least, mean and largest extinction of a block, m^-1."""
+        # a layer of blocks around the grid holds the bounds of all that lies beyond
         place = block + 1
         index = (place.z * (counts.y + 2) + place.y) * (counts.x + 2) + place.x
         return dr.gather(mi.Vector3f, self.values, first + mi.UInt32(index))
@@ -102,15 +104,16 @@ def leave(start: Vector, step: Vector, counts: Cell, block: Cell) -> tuple[Float
     forward = step > 0
     onward = (forward & (block < counts)) | ((step < 0) & (block >= 0))
     face = mi.Vector3f(dr.select(forward, block + 1, block))
+    # along an axis in which it leaves the grid or does not move, it stays in its block
     ends = dr.select(onward, (face - start) / step, dr.inf)
     end = dr.min(ends)
     # one axis only, so that every block on the way is visited
     along_x = ends.x == end
     along_y = ~along_x & (ends.y == end)
-    turn = mi.Vector3i(
+    unit = mi.Vector3i(
         dr.select(along_x, 1, 0), dr.select(along_y, 1, 0), dr.select(along_x | along_y, 0, 1)
     )
-    return end, block + dr.select(forward, turn, -turn)
+    return end, block + dr.select(forward, unit, -unit)
 
 
 class _Blocks:
@@ -137,18 +140,22 @@ def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
     if data is None:
         constant = volume is not None and volume.class_name() == "ConstVolume"
         kind = UNIFORM if constant or medium.is_homogeneous() else UNKNOWN
+        # the same object for the same bounds: the tables are not written again
         return known if known and known.kind == kind else _Blocks(kind)
     scale, to_local = float(mi.traverse(medium)["scale"]), _to_local(volume)
-    # an array that stays in use keeps its index
+    # an array has its index for as long as it is in use, and `known` uses it: an equal index is
+    # the same values, without reading them
     array = mi.Float(dr.detach(data.array))
     source = array.index, scale, channel, to_local.tobytes()
     if known and known.source and known.source[0] == source:
         return known
+    # states, z, y, x, channels; a grid that does not change has one state
     field = np.array(array, float).reshape(-1, *data.shape[-4:])
     field = scale * field[..., channel if data.shape[-1] == 3 else 0]
     least, most = field.min(0), field.max(0)
     mean, outside = field.mean(0), (least.min(), field.mean(), most.max())
     extents = np.linalg.norm(np.linalg.inv(to_local[:3, :3]), axis=0)[::-1]
+    # an even field gains nothing from blocks, whose borders each cost a step
     wanted = np.clip((outside[2] - outside[0]) * extents / DEPTH, 1, BLOCKS)
     edges = np.maximum(CELLS, np.ceil(mean.shape / wanted)).astype(int)
     for axis, edge in enumerate(edges):
@@ -187,7 +194,7 @@ def _grid(volume: Volume) -> Tensor | None:
 def _to_local(volume: Volume) -> np.ndarray:
     """The map from the world to the unit cube that a grid fills, 4 x 4.
 
-    Mitsuba tells a grid's map in words only, to six digits: the middle of the bounding box gives
+    Mitsuba states a grid's map in words only, to six digits: the middle of the bounding box gives
     its place to the rounding of single precision, and its axes are right to a millionth of it.
     """
     if hasattr(volume, "to_grid"):

@@ -45,6 +45,7 @@ class OpenPath:
 
     def one_plus_cosine(self, direction: Vector) -> Float:
         """1 + cos(theta), exact where it is small."""
+        # as 1 + cos(theta) of a scalar product it would be rounding alone, near the telescope
         return 0.5 * dr.squared_norm(self.away + direction)
 
     def leg(self, used: Float, one_plus_cosine: Float) -> Float:
@@ -58,6 +59,7 @@ class OpenPath:
     def sample(self, used: Float, sample: Point) -> Vector:
         """Direction of a flight that consumes ``used``; two numbers in [0, 1)."""
         least, most, offset = self._limits(used)
+        # of the density 1 / (1 + cos(theta) + offset) per solid angle, by its inverse
         one_plus_cosine = dr.clip(least * dr.exp(dr.log(most / least) * sample.x) - offset, 0, 2)
         sine = dr.sqrt(one_plus_cosine * (2 - one_plus_cosine))
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
@@ -101,6 +103,7 @@ def closing_distance(offset: Vector, direction: Vector, path: Float) -> Float:
     -1 where the path is shorter than the straight line.
     """
     length = dr.norm(offset)
+    # not path^2 - length^2: a path little longer than the straight line would have no digits
     end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
     return dr.select(path > length, end, -1)
 
@@ -109,21 +112,23 @@ def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: F
     """Distance of a vertex in front of the point where the beam would close the path.
 
     Of isotropic scattering there, weighted by the length at which directions close the path, the
-    fraction that returns into view is proportional to ln(1 + (scale / left)^2). Uniform, if that
+    fraction that returns into view is proportional to ln(1 + (scale / gap)^2). Uniform, if that
     is out of the range.
     """
-    left = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
-    return dr.select((left > least) & (left < most), left, dr.lerp(least, most, again))
+    # a Cauchy number times a uniform one has this density: the logarithm has no closed inverse
+    gap = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
+    return dr.select((gap > least) & (gap < most), gap, dr.lerp(least, most, again))
 
 
-def near_density(left: Float, least: Float, most: Float, scale: Float) -> Float:
+def near_density(gap: Float, least: Float, most: Float, scale: Float) -> Float:
     """Of `sample_near`, per metre."""
+    # of the draws that fall out of the range and are replaced by uniform ones
     outside = 1 - _near_chance(most, scale) + _near_chance(least, scale)
-    density = dr.log(1 + dr.square(scale / left)) / (dr.pi * scale)
+    density = dr.log(1 + dr.square(scale / gap)) / (dr.pi * scale)
     return density + outside / (most - least)
 
 
-def _near_chance(left: Float, scale: Float) -> Float:
-    """Integral of ln(1 + (scale / left)^2) / (pi scale) from 0 to ``left``."""
-    value = left * dr.log(1 + dr.square(scale / left)) + 2 * scale * dr.atan(left / scale)
-    return dr.select(left > 0, value / (dr.pi * scale), 0)
+def _near_chance(gap: Float, scale: Float) -> Float:
+    """Integral of ln(1 + (scale / gap)^2) / (pi scale) from 0 to ``gap``."""
+    value = gap * dr.log(1 + dr.square(scale / gap)) + 2 * scale * dr.atan(gap / scale)
+    return dr.select(gap > 0, value / (dr.pi * scale), 0)

@@ -206,9 +206,9 @@ def define() -> type:
             mean = self.line.characteristic(number / self.free_spectral_range)
             rms, bow = (v * self.m_defect_order for v in (self.surface_rms, self.bow))
             mean = mean * np.exp(-2 * (np.pi * number * rms) ** 2) * np.sinc(number * bow)
-            kept = np.flatnonzero(np.abs(mean) * strongest**number > NEGLECTED)[-1]
+            last = np.flatnonzero(np.abs(mean) * strongest**number > NEGLECTED)[-1]
             self.m_harmonics = [mi.Float(mean.real), mi.Float(mean.imag)]
-            self.m_last = dr.opaque(mi.Int32, int(kept))
+            self.m_last = dr.opaque(mi.Int32, int(last))
 
         # --- mirrors
 

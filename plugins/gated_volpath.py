@@ -219,6 +219,7 @@ def define() -> type:
                 passes = enumerate(self._passes(sensor, samples), 1)
                 for number, (first, count, start, now, complete) in passes:
                     done += count * now * self._unit(sensor)
+                    # random numbers depend on beam and number alone: stored passes are skipped
                     if number <= before:
                         continue
                     part = trace(scene, sensor, seed, first, count, start, now)
@@ -232,6 +233,7 @@ def define() -> type:
                         lit, fraction = results[0].numpy() > 0, results[-1].numpy()
                         counts += lit.sum(), (lit & (fraction >= HALF)).sum()
                         total = None
+                    # kernels run asynchronously: what is reported or stored must have been computed
                     if self.progress or self.batches:
                         dr.eval(image, total)
                         dr.sync_thread()
@@ -244,7 +246,7 @@ def define() -> type:
                         self.progress(done, beams * samples)
             self.lit, self.untrusted = (int(count) for count in counts)
             if not self.shares:
-                _warn_of_untrusted(self.lit, self.untrusted)
+                _warn_of_unreliable(self.lit, self.untrusted)
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
 
@@ -295,10 +297,12 @@ def define() -> type:
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
             for first, count, start, now, _ in self._passes(sensor, samples):
+                # Mitsuba's derivatives call this with gradients suspended
                 with dr.resume_grad():
                     _, means, *_ = self._gated(
                         scene, sensor, seed, first, count, start, now, differentiable=True
                     )
+                    # passes of one image are added up: each has its part of the samples
                     fraction = now * gates / samples
                     means = [m * fraction for m in means[: len(STOKES)]]
                     yield means, self._places(first * gates, count * gates)[: len(STOKES)]
@@ -347,6 +351,7 @@ def define() -> type:
             """
             beams, unit = sensor.beam_count, self._unit(sensor)
             rounds = samples // unit
+            # at least two, for a variance within the pass
             rounds_at_once = min(rounds, max(2, self.samples_per_pass // unit))
             beams_at_once = max(1, self.samples_per_pass // (rounds_at_once * unit))
             for first in range(0, beams, beams_at_once):
@@ -389,6 +394,7 @@ def define() -> type:
             sample = lidar.emit(seed, beam, number)
 
             low, high = sensor.ranges(sample.frame.n, sample.start)
+            # whole paths, twice the ranges; light emitted later has less of it before the gate
             width = 2 * (high - low) / gates
             near = 2 * (low - sample.delay) + width * gate
             where = sample.rng.next_float32()
@@ -398,6 +404,8 @@ def define() -> type:
             )
             dr.eval(stokes, by_order)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
+            # deviations from the pass's own mean: a sum of squares less a square would cancel in
+            # single precision
             off = [
                 MAGNIFIED * (s - dr.gather(mi.Float, m, cell))
                 for s, m in zip(stokes[:2], means[:2], strict=True)
@@ -445,6 +453,8 @@ def define() -> type:
             number = _opaque(rounds)
             means = [s / number for s in sums]
             large = [MAGNIFIED * mean for mean in means[:2]]
+            # here contributions are scattered to their gates before a mean is known; most are 0,
+            # so that squares exceed the mean's by far and hardly cancel
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
             return rounds, means + self._per_order(by_order, rounds), deviations, largest
@@ -561,11 +571,11 @@ def _errors(number: Float, deviations: list[Float]) -> list[Float]:
     return [*errors, dr.select(both > 0, dr.clip(deviations[2] / both, -1, 1), 0)]
 
 
-def _warn_of_untrusted(lit: int, untrusted: int) -> None:
-    if untrusted > 0.01 * lit:
+def _warn_of_unreliable(lit: int, unreliable: int) -> None:
+    if unreliable > 0.01 * lit:
         warnings.warn(
-            f"{NAME}: in {untrusted} of {lit} pixels that receive light one sample carries "
-            "half of the variance or more; their standard errors cannot be trusted; expected more "
+            f"{NAME}: in {unreliable} of {lit} pixels that receive light one sample carries "
+            "half of the variance or more; their standard errors are unreliable; expected more "
             "samples",
             stacklevel=3,
         )

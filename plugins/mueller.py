@@ -77,7 +77,7 @@ def define() -> type:
             self.m_flags = +mi.PhaseFunctionFlags.Isotropic
 
         def _tabulate(self, table: np.ndarray) -> None:
-            """Elements, and the probabilities of cells, of a table as it was given."""
+            """Elements, and the probabilities of cells, of a table as it was stated."""
             table = check_table(table)
             table = _refined(table)
             self.m_angle = mi.Float(np.radians(table[:, 0]))
@@ -201,7 +201,7 @@ def _refined(table: np.ndarray) -> np.ndarray:
         fraction = (levels[1:-1] - ends[0]) / (ends[1] - ends[0])
         parts.append(angle[cell] + fraction * (angle[cell + 1] - angle[cell]))
     nodes = np.concatenate(parts)
-    # as single precision tells them apart
+    # as single precision distinguishes them
     nodes = nodes[np.unique(np.radians(nodes).astype(np.float32), return_index=True)[1]]
     return np.column_stack([nodes, *(np.interp(nodes, angle, c) for c in table[:, 1:].T)])
 

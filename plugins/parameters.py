@@ -77,8 +77,8 @@ def pose(props: Properties, plugin: str, field: str = "to_world") -> Transform:
 def check_pose(placed: Transform, plugin: str, field: str = "to_world") -> None:
     """Refuse a pose that is not a rotation and translation: it must not scale an instrument."""
     matrix = np.array(placed.matrix, float).reshape(4, 4)
-    turn = matrix[:3, :3]
-    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0
+    rotation = matrix[:3, :3]
+    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
     # NaN compares as false
     if not (rigid and np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()):
         fail(plugin, field, matrix.round(4).tolist(), "a rotation and a translation")

@@ -112,6 +112,7 @@ class Lidar:
         aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
+        # half the path, so that ranges of a gate shift by as much
         if laser.pulse_duration > 0:
             sigma = FWHM_TO_SIGMA * laser.pulse_duration * SPEED_OF_LIGHT / 2
             delay = sigma * mi.warp.square_to_std_normal(pair(rng)).x
@@ -123,13 +124,11 @@ class Lidar:
                 transverse(axes.s, direction),
                 mi.mueller.stokes_basis(direction),
             )
-        return Sample(
-            rng, frame, start, time, axes, origin, direction, aperture, delay, list(stokes)
-        )
+        return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
 
     def forced(
         self,
-        sample: Point,
+        sample: Sample,
         low: Float,
         high: Float,
         position: Float,
@@ -149,6 +148,8 @@ class Lidar:
         path = dr.lerp(low, high, position)
         closure = closing_distance(offset, sample.direction, path)
         back = dr.normalize(sample.aperture - (sample.origin + sample.direction * closure))
+        # times d(distance)/d(path): a vertex farther by ds lengthens the path by ds less its
+        # component along the way back
         volume = (high - low) / (1 - dr.dot(sample.direction, back))
         total = self._connect(
             sample,
@@ -211,7 +212,8 @@ class Lidar:
             mei = interaction(medium, position, direction, self.wavelengths, sample.time)
             scattering, _ = coefficients(medium, mei, self.channel, active)
             weight *= out * scattering
-            # no roulette at the first vertex: in thin air it is the signal
+            # no roulette at the first vertex: all light of two scatterings passes it, and in thin
+            # air its weight is always small
             survival = dr.select(order == 2, 1, dr.minimum(ROULETTE_FACTOR * weight, 1))
             active &= (weight > 0) & (rng.next_float32(active) < survival)
             stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
@@ -222,6 +224,7 @@ class Lidar:
             away, excess = away / distance, path - distance
             active &= excess > 0
             _, reach = slabs(self.low, self.high, position, -away)
+            # as long as the path is open, its remainder exceeds the straight way back
             rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
             closing, scattered, leg, volume = self._last_flight(
                 rng, sample, medium, mei, stokes, rest, active
@@ -248,17 +251,18 @@ class Lidar:
         reach = closing_distance(origin - aperture, direction, path)
         enters, leaves = slabs(self.low, self.high, origin, direction)
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
-        # half the field of view's radius at half the path
+        # half the field of view's radius at half the path: nearer vertices send most of what they
+        # scatter through the field, farther ones past it
         scale = 0.25 * path * self.sensor.m_fov_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
         # for phase functions with a stronger forward peak than the isotropic one
         steps = dr.log((most + scale) / (least + scale))
         far = (least + scale) * dr.exp(steps * choice.y) - scale
-        left = dr.select(choice.x < NEAR_FRACTION, near, far)
+        gap = dr.select(choice.x < NEAR_FRACTION, near, far)
         density = dr.lerp(
-            dr.rcp((left + scale) * steps), near_density(left, least, most, scale), NEAR_FRACTION
+            dr.rcp((gap + scale) * steps), near_density(gap, least, most, scale), NEAR_FRACTION
         )
-        return dr.select((path > 0) & (most > least), reach - left, -1), dr.rcp(density)
+        return dr.select((path > 0) & (most > least), reach - gap, -1), dr.rcp(density)
 
     def _half_field(self, axes: Frame, away: Vector) -> Float:
         """Tangent of half the widest angle between a direction and one of the field of view."""
@@ -287,9 +291,9 @@ class Lidar:
         """
         phase, axes, path = medium.phase_function(), sample.axes, rest.distance + rest.excess
         # sampling from the telescope is best for last vertices far off, in radii of its field
-        beside = rest.field / self._half_fov() - 1
-        ahead = 0.5 * rest.excess / (rest.distance * self.sensor.m_fov_tan)
-        far = dr.square(beside) + dr.square(ahead)
+        across = rest.field / self._half_fov() - 1
+        along = 0.5 * rest.excess / (rest.distance * self.sensor.m_fov_tan)
+        far = dr.square(across) + dr.square(along)
         backward = BACK_FRACTION * (1 - dr.rcp(1 + far))
         strategy = rng.next_float32(active)
         by_phase, by_back = strategy < PHASE_FRACTION, strategy > 1 - backward
@@ -299,8 +303,10 @@ class Lidar:
         inward = self._in_field(axes, rng)
         first = dr.select(by_phase, drawn, dr.select(by_back, inward, aimed))
         axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, rest.away))
+        # a quarter turn about the axis has the angle to it for which the first one was drawn
         tried = []
         for wo in (first, quarter_turn(axis, first)):
+            # towards the vertex that a direction from the telescope stands for, where drawn so
             end = sample.aperture + wo * closing_distance(sample.aperture - mei.p, wo, path)
             wo = dr.select(by_back, dr.normalize(end - mei.p), wo)
             one_plus_cosine = rest.one_plus_cosine(wo)
@@ -316,6 +322,8 @@ class Lidar:
             there = interaction(medium, end, wo, self.wavelengths, sample.time)
             back = dr.normalize(sample.aperture - end)
             received, back_pdf = self._scatter(medium, there, scattered, back, in_view)
+            # of all three strategies together (Veach & Guibas 1995, balance heuristic): none has a
+            # large weight where another one would have drawn the direction
             density = PHASE_FRACTION * pdf + backward * from_telescope
             aimed_density = rest.density(rest.excess, one_plus_cosine)
             density += (1 - PHASE_FRACTION - backward) * aimed_density
@@ -342,10 +350,10 @@ class Lidar:
         # transmittances to the gate differ little: any part of the excess length is about as likely
         most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.sensor.m_fov_tan
         choice, near = pair(rng), sample_near(0, most, scale, pair(rng), rng.next_float32(active))
-        left = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
-        left_density = near_density(left, 0, most, scale)
-        left_density = 0.5 * dr.lerp(dr.rcp(most), left_density, NEAR_FLIGHT_FRACTION)
-        used = rest.excess - 2 * left
+        gap = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
+        gap_density = near_density(gap, 0, most, scale)
+        gap_density = 0.5 * dr.lerp(dr.rcp(most), gap_density, NEAR_FLIGHT_FRACTION)
+        used = rest.excess - 2 * gap
         sample = pair(rng)
         mirrored = mi.Point2f(1 - sample.x, sample.y + 0.25)
         # two candidates again, with opposite azimuth and complementary polar sample
@@ -358,12 +366,13 @@ class Lidar:
             leg = rest.leg(used, one_plus_cosine)
             scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
             density = dr.lerp(rest.density(used, one_plus_cosine), pdf, PHASE_FLIGHT_FRACTION)
-            density *= rest.slope(used, one_plus_cosine, leg) * left_density
+            density *= rest.slope(used, one_plus_cosine, leg) * gap_density
             end = mei.p + wo * leg
             inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
             target = dr.select(inside & (density > 0), scattered[0], 0)
             tried.append((target, density, (wo, scattered, leg)))
         (wo, scattered, leg), weight = choose(rng, *tried)
+        # the change of S0 goes into the weight, on which roulette is played
         factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
         return wo, _scaled(scattered, factor), leg, dr.select(factor > 0, weight / factor, 0)
 
@@ -446,6 +455,8 @@ class Lidar:
             active,
             self.differentiable,
         )
+        # the telescope's point is uniform on its disc: area, cosine and distance make it a solid
+        # angle
         weight = weight * out * self.area * -dr.dot(wo, sample.axes.n) / (distance * distance)
         received, _ = self._scatter(medium, mei, stokes, wo, active)
         if not mi.is_polarized:
@@ -461,6 +472,7 @@ class Lidar:
     ) -> tuple[Stokes, Float]:
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
         if self.rounded:
+            # Mitsuba's tables are 0 where rounding puts a cosine beyond 1
             wo = off_the_poles(mei.wi, wo)
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return apply_phase_function(value, stokes, self.channel), pdf
@@ -515,11 +527,13 @@ class Lidar:
             travelled += flight
             mei = interaction(medium, position, direction, self.wavelengths, sample.time)
             scattering, extinction = coefficients(medium, mei, self.channel, active)
+            # absorption weighs, and ends no sample
             albedo = dr.select(active, scattering / extinction, 0)
             stokes = _scaled(stokes, albedo)
             range_ = 0.5 * (travelled + dr.norm(aperture - position))
             fraction = (range_ - low) / (high - low)
             counts = active & (fraction >= 0) & (fraction < 1)
+            # the distance to the last vertex is drawn, not forced: it has no weight of its own
             gain = self._receive(sample, rng, medium, mei, stokes, counts, mi.Float(1))
             now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
             done = now != gate
@@ -529,6 +543,7 @@ class Lidar:
             if dr.hint(split, mode="scalar"):
                 _add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
             order += 1
+            # later orders arrive from farther away still
             active &= (order <= max_order) & (range_ < high)
             onward, value, density = medium.phase_function().sample(
                 self.context, mei, rng.next_float32(active), pair(rng), active

@@ -16,6 +16,7 @@ import numpy as np
 
 from .bodies import extent, name_of
 from .parameters import fail
+from .surfaces import media_of
 from .variant_types import Float, Medium, Scene, Sensor
 
 # rounding to single precision may leave an albedo of 1 this much above it
@@ -59,17 +60,10 @@ class Physical:
             A coefficient, albedo, weight or asymmetry out of its range or NaN; a shape or volume
             whose position is not finite.
         """
-        media = {}
-        if sensor.get_medium() is not None:
-            media[sensor.get_medium()] = sensor.get_medium().id()
         for shape in scene.shapes():
             self._place(name_of(shape), *extent(shape))
-            for side in ("interior_medium", "exterior_medium"):
-                medium = getattr(shape, side)()
-                if medium is not None:
-                    media.setdefault(medium, f"{name_of(shape)}.{side}")
         passed = {}
-        for medium, where in media.items():
+        for medium, where in media_of(scene, sensor).items():
             parameters = mi.traverse(medium)
             for name, (_, _, node, _) in parameters.properties.items():
                 if isinstance(node, mi.Volume):
@@ -78,10 +72,11 @@ class Physical:
                 rule = next((rule for rule in RULES if rule[0].fullmatch(name)), None)
                 if rule is None or not _is_coefficient(node, value):
                     continue
-                held = _flat(value)
-                if not _same(self.passed.get((medium, name), ()), held):
-                    self.check_values(f"{where}.{name}", held, *rule[1:])
-                passed[medium, name] = held
+                arrays = _flat(value)
+                if not _same(self.passed.get((medium, name), ()), arrays):
+                    self.check_values(f"{where}.{name}", arrays, *rule[1:])
+                # the arrays themselves, so that no other one gets their index
+                passed[medium, name] = arrays
         self.passed = passed
 
     def _place(self, field: str, low: Any, high: Any) -> None:

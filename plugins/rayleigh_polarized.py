@@ -62,13 +62,13 @@ def define() -> type:
             callback.put("depolarization", self.m_depolarization, kind)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-            given = self.m_depolarization[0]
-            if not 0 <= given < 0.5:
-                fail(NAME, "depolarization", given, "0 <= value < 0.5")
-            self.depolarization = given
+            depolarization = self.m_depolarization[0]
+            if not 0 <= depolarization < 0.5:
+                fail(NAME, "depolarization", depolarization, "0 <= value < 0.5")
+            self.depolarization = depolarization
             # Delta and Delta' of Hansen & Travis
-            self.m_dipole = dr.opaque(mi.Float, (1 - given) / (1 + given / 2))
-            self.m_circular = dr.opaque(mi.Float, (1 - 2 * given) / (1 - given))
+            self.m_dipole = dr.opaque(mi.Float, (1 - depolarization) / (1 + depolarization / 2))
+            self.m_circular = dr.opaque(mi.Float, (1 - 2 * depolarization) / (1 - depolarization))
 
         def phase(self, cosine: Float) -> Float:
             """Phase function of natural light, per steradian."""

@@ -1,6 +1,6 @@
 """What a scene asks for and the integrators cannot do: refused, each in a line.
 
-Mitsuba accepts any film, sampler, emitter and surface beside a sensor. What is refused here would
+Mitsuba accepts any film, sampler, emitter and surface with a sensor. What is refused here would
 otherwise be ignored without a word. The table in the reference of `gated_volpath` lists all.
 """
 
@@ -15,7 +15,7 @@ from .polarization import first_unpolarized_in_blend
 from .surfaces import media_of
 from .variant_types import Scene, Sensor, Shape
 
-# shapes whose sides can be told apart along a line; besides all meshes
+# shapes other than meshes whose sides are distinguished along a line
 SIDED = ("Cube", "Sphere", "Rectangle", "Disk", "Cylinder")
 
 
@@ -89,7 +89,7 @@ def _check_shape(plugin: str, shape: Shape) -> None:
 
 
 def check_air(plugin: str, scene: Scene, sensor: Sensor) -> None:
-    """Raise an error if no gate meets air, or for a blend that cannot be told from its parts.
+    """Raise an error if no gate meets air, or for a blend whose parts cannot be recognised.
 
     Raises
     ------

@@ -163,12 +163,17 @@ def _any(at: Sequence[Mask], found: Sequence[Crossing], index: int, front: Mediu
     return result
 
 
-def media_of(scene: Scene, sensor: Sensor) -> list[Medium]:
-    """All media of a scene and of the sensor in it, each once."""
-    media = [sensor.get_medium()]
+def media_of(scene: Scene, sensor: Sensor) -> dict[Medium, str]:
+    """All media of a scene and of the sensor in it, each with what a message calls it."""
+    media = {}
+    if sensor.get_medium() is not None:
+        media[sensor.get_medium()] = name_of(sensor.get_medium())
     for shape in scene.shapes():
-        media += [shape.interior_medium(), shape.exterior_medium()]
-    return [medium for medium in dict.fromkeys(media) if medium is not None]
+        for side in ("interior_medium", "exterior_medium"):
+            medium = getattr(shape, side)()
+            if medium is not None:
+                media.setdefault(medium, f"{name_of(shape)}.{side}")
+    return media
 
 
 def _surroundings(bodies: list[Body], sheets: list[Sheet], sensor: Sensor) -> Medium | None:

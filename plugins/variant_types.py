@@ -2,7 +2,7 @@
 
 Each variant has types of its own, and a plugin is defined in whichever is in force. No type checker
 can tell which, so that every name but `Stokes` and `Table` stands for `Any`; what it is called in a
-variant stands beside it.
+variant stands in its comment.
 """
 
 from typing import Any, TypeAlias
