@@ -48,7 +48,7 @@ class Line:
     offsets: np.ndarray
     sigmas: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check("line.wavelength", self.wavelength, self.wavelength > 0, "m above 0")
         for name in ("weights", "offsets", "sigmas"):
             values = np.array(getattr(self, name), float, ndmin=1)
@@ -239,8 +239,8 @@ def backscatter_line(
     return Line(wavelength, weights[present], offsets[present], sigmas[present])
 
 
-def _check(name, value, good, allowed):
-    value, good = np.atleast_1d(value), np.atleast_1d(good)
-    good = good & np.isfinite(value)
-    if not good.all():
-        raise InputError(f"{name}: {value[~good][0]:g} is not allowed; expected {allowed}")
+def _check(name: str, value: np.ndarray | float, good: np.ndarray | bool, allowed: str) -> None:
+    values = np.atleast_1d(value)
+    fine = np.atleast_1d(good) & np.isfinite(values)
+    if not fine.all():
+        raise InputError(f"{name}: {values[~fine][0]:g} is not allowed; expected {allowed}")

@@ -6,7 +6,7 @@ Pitch is positive nose up, yaw nose to port, roll port wing up.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal, Self, cast
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_serializer, field_validator, model_validator
@@ -48,7 +48,7 @@ class Sinusoid(Description):
         return f"{value!r} {'rad' if self.axis in ANGLES else 'm'}"
 
     @model_validator(mode="after")
-    def _small_angle(self):
+    def _small_angle(self) -> Self:
         if self.axis in ANGLES and self.amplitude > 1:
             raise ValueError(
                 f"amplitude: {self.amplitude:g} rad is not allowed; expected at most 1 rad, with "
@@ -77,7 +77,7 @@ class Motion(Description):
     )
 
     @model_validator(mode="after")
-    def _one_attitude(self):
+    def _one_attitude(self) -> Self:
         if self.trajectory is not None and self.attitude is not None:
             raise ValueError("attitude: not allowed with trajectory, which has it; expected one")
         return self

@@ -49,7 +49,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     """A NetCDF-4 or NetCDF-3 file, its times as numbers, its values read when they are asked for.
 
     Values are unpacked and missing ones NaN, as CF says: ``_FillValue``, ``missing_value`` and,
-    without ``_FillValue``, what the library writes into cells that nobody wrote. The limits
+    without ``_FillValue``, what the library writes into cells that were never written. The limits
     ``valid_min``, ``valid_max`` and ``valid_range`` hold in `load_variable`.
 
     Raises
@@ -72,7 +72,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
             raise _damaged(path, error) from None
 
 
-def _open(path, **how) -> xr.Dataset:
+def _open(path: str | Path, **how: Any) -> xr.Dataset:
     """The data set of a file, by the library that reads its kind."""
     path = Path(path)
     kind = _kind(path)
@@ -132,7 +132,7 @@ def _convert(command: str, path: Path, wanted: str = "NetCDF-4 or NetCDF-3 class
     return f"expected {wanted}: {command.format(shlex.quote(str(path)))}"
 
 
-def _declared(path):
+def _declared(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
     """Bytes read on opening and the largest chunk read for a value; filters that are missing."""
     found: list[tuple[str, int]] = []
     filters: dict[int, str] = {}
@@ -172,7 +172,7 @@ def _missing_filters(variable: h5py.Dataset) -> dict[int, str]:
 def _mark_missing(variable: xr.Variable) -> None:
     """Let xarray find what CF calls missing and it does not.
 
-    What the library writes into cells that nobody wrote; the sign of ``missing_value`` where
+    What the library writes into cells that were never written; the sign of ``missing_value`` where
     ``_Unsigned`` changes that of the values.
     """
     attributes, kind = variable.attrs, variable.dtype
@@ -261,7 +261,7 @@ def valid_range(variable: xr.DataArray, path: str | Path) -> tuple[float, float]
     return limits[0], limits[1]
 
 
-def _damaged(path, error):
+def _damaged(path: str | Path, error: Exception) -> InputError:
     reason = next(iter(str(error).splitlines()), "") or type(error).__name__
     return InputError(f"{path}: is damaged ({reason}); allowed: a whole NetCDF file")
 
