@@ -396,7 +396,7 @@ def _print_series(winds: "xr.Dataset") -> None:
     print_table(Table(title, rows, heads, note))
 
 
-def _print_vortices(wind: xr.Dataset) -> None:
+def _print_vortices(wind: "xr.Dataset") -> None:
     """The numbers of a fitted vortex pair with their standard errors."""
     rows = []
     for name in (n for n in wind.data_vars if f"{n}_stderr" in wind and not wind[n].dims):

@@ -15,6 +15,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
+from lidar_mi.io.compression import compression
 from lidar_mi.io.size import check_size
 
 # What never written cells hold (NC_FILL_* of netcdf.h), but in types of one byte, which the library
@@ -31,10 +32,6 @@ _NEVER_WRITTEN = {
 }
 # How files begin, what they are, and what makes NetCDF that is read of them.
 _KINDS = (
-    (b"\x1f\x8b", "is compressed with gzip", "gunzip {0}"),
-    (b"BZh", "is compressed with bzip2", "bunzip2 {0}"),
-    (b"\xfd7zXZ", "is compressed with xz", "unxz {0}"),
-    (b"\x28\xb5\x2f\xfd", "is compressed with zstd", "unzstd {0}"),
     (b"PK\x03\x04", "is a zip archive", "unzip {0}"),
     (b"\x0e\x03\x13\x01", "is HDF4", "ncks {0} out.nc"),
     (b"GRIB", "is GRIB", "cdo -f nc4 copy {0} out.nc"),
@@ -119,6 +116,9 @@ def _kind(path: Path) -> str:
         ) from None
     if magic[:3] == b"CDF" and magic[3:4] in (b"\x01", b"\x02", b"\x05"):
         return f"CDF-{magic[3]}"
+    if packed := compression(magic):
+        name, program = packed
+        raise InputError(f"{path}: is compressed with {name}; {_convert(f'{program} {{0}}', path)}")
     for begin, what, command in _KINDS:
         if magic.startswith(begin):
             raise InputError(f"{path}: {what}; {_convert(command, path)}")
