@@ -216,7 +216,7 @@ def define() -> type:
             return ps, dr.rcp(ps.pdf)
 
         def sample_wavelengths(
-            self, si: Interaction, sample: Point, active: Mask = True
+            self, si: Interaction, sample: Float, active: Mask = True
         ) -> tuple[Float, Spectrum]:
             """The laser's own."""
             return self.wavelengths(), mi.Spectrum(1)

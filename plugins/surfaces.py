@@ -65,14 +65,17 @@ class Air:
                         self.sheets.append(part)
                     else:
                         self.bodies.append(part)
+        # the last body that a place is in is the smallest: its medium holds
         self.bodies.sort(key=lambda body: -body.volume)
         self.opaque = scene_of(opaque) if opaque else None
         around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
         self.around = mi.MediumPtr(around)
         for body in self.bodies:
+            # a cavity that states no medium is open to what surrounds all shapes
             if body.hollow and body.interior is None:
                 body.inside = self.around
         dr.make_opaque(self.around)
+        # an open surface encloses nothing: behind it there may be air at any distance
         everywhere = around is not None or self.sheets
         self.bounds = _everywhere() if everywhere else (self.low, self.high)
 
@@ -101,6 +104,7 @@ class Air:
         active = active & (start < distance)
         lines, opaque = crossings
         end = mi.Float(distance)
+        # only open surfaces change it on the way; a body's medium follows from the body alone
         around = mi.MediumPtr(medium) if self.sheets else self.around
         within = []
         for body, line in zip(self.bodies, lines, strict=True):
@@ -194,7 +198,7 @@ def _surroundings(bodies: list[Body], sheets: list[Sheet], sensor: Sensor) -> Me
                 f"the medium of {name_of(bodies[index].shape)}, in which the telescope is, "
                 "by reference",
             )
-    # -1 is the last
+    # -1, of beams that begin in no body, is the last
     around = [*(body.exterior for body in bodies), stated]
     around = list(dict.fromkeys(around[index] for index in np.unique(outer)))
     if len(around) > 1:

@@ -138,11 +138,11 @@ def carrier(
         *_, last = _departures(speed, durations)
         places.append(last)
 
-    def carry(field: xr.DataArray) -> xr.DataArray:
+    def advected(field: xr.DataArray) -> xr.DataArray:
         _check_grid(field, v, w, u)
         return _reader(field, u is not None)(places)
 
-    return carry
+    return advected
 
 
 def advect_to(
@@ -182,12 +182,12 @@ def advect_to(
         intervals = np.diff(side, prepend=0.0)
         counts = np.ceil(np.abs(intervals) / longest - 1e-6).astype(int).clip(1)
         steps = np.repeat(intervals / counts, counts)
-        carried = _carried(field, v, w, u, steps, np.cumsum(counts) - 1)
-        states.update(zip(side, carried, strict=True))
+        advected = _advected(field, v, w, u, steps, np.cumsum(counts) - 1)
+        states.update(zip(side, advected, strict=True))
     return xr.concat([states[time] for time in times], xr.Variable("time", times))
 
 
-def _carried(
+def _advected(
     field: xr.DataArray,
     v: xr.DataArray,
     w: xr.DataArray,

@@ -126,7 +126,7 @@ class Line:
         return self.offsets[which] + self.sigmas[which] * rng.standard_normal(n)
 
     def shifted(self, offset: float) -> "Line":
-        """The line moved by ``offset`` Hz."""
+        """The line shifted by ``offset`` Hz."""
         return replace(self, offsets=self.offsets + offset)
 
     def broadened(self, sigma: float) -> "Line":

@@ -67,10 +67,10 @@ class DopplerScan(Description):
         middles stay in the plane, or at the distance from where it was at the reference time.
         """
         directions = self.directions() if beams is None else beams.reported_direction
-        flown = 0.0 if beams is None else beams.reported_origin[:, 0]
+        advance = 0.0 if beams is None else beams.reported_origin[:, 0]
         if self.gates == "planar":
-            return (lidar.range - flown) / directions[:, 0]
-        return np.full(len(directions), lidar.range) - flown
+            return (lidar.range - advance) / directions[:, 0]
+        return np.full(len(directions), lidar.range) - advance
 
 
 class PlatformErrors(Description):

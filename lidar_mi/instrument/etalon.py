@@ -258,7 +258,7 @@ def transmission(
     cosine, offset : array
         Of the angle inside the gap; frequency less that of the laser, Hz.
     line : lidar_mi.atmosphere.line.Line, optional
-        Average over this line, moved by ``offset``; default: monochromatic light.
+        Average over this line, shifted by ``offset``; default: monochromatic light.
     """
     order = fractional_order(etalon, wavelength, cosine, offset)
     return series(harmonics(etalon, wavelength, line), torch.as_tensor(order)).numpy()

@@ -209,7 +209,7 @@ def random_process(
 
 
 def true_pose(
-    motion: Motion, time: np.ndarray, speed: float, seed: int, flown: Trajectory | None = None
+    motion: Motion, time: np.ndarray, speed: float, seed: int, path: Trajectory | None = None
 ) -> Pose:
     """The true pose at times since the first scan.
 
@@ -222,7 +222,7 @@ def true_pose(
         Of straight flight, m/s.
     seed : int
         Of the experiment.
-    flown : Trajectory
+    path : Trajectory
         Of ``motion.trajectory``.
 
     Raises
@@ -231,7 +231,7 @@ def true_pose(
         See `Trajectory.at`.
     """
     time = np.asarray(time, float)
-    given = flown.at(time, speed) if flown else None
+    recorded = path.at(time, speed) if path else None
     offset = {axis: np.zeros(len(time)) for axis in (*PLACES, *ANGLES)}
     rate = {axis: np.zeros(len(time)) for axis in PLACES}
     for one in motion.sinusoids:
@@ -248,8 +248,10 @@ def true_pose(
             )
     place, velocity = (np.stack([parts[axis] for axis in PLACES], -1) for parts in (offset, rate))
     turned = attitude(*(offset[axis] for axis in ANGLES))
-    if given is None:
+    if recorded is None:
         return Pose(place, velocity, turned)
     return Pose(
-        given.place + place, given.velocity + velocity, cast(Rotation, given.attitude * turned)
+        recorded.place + place,
+        recorded.velocity + velocity,
+        cast(Rotation, recorded.attitude * turned),
     )

@@ -177,7 +177,7 @@ class ScanRenderer:
         albedo: float,
         settings: RenderSettings,
         molecules: Molecules | None = None,
-    ):
+    ) -> None:
         air = (environment, phase, albedo, settings, molecules)
         self._scene = mi.load_dict(scene_dict(extinction, plan, lidar, *air))
         self._parameters = mi.traverse(self._scene)

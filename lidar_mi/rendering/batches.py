@@ -31,7 +31,7 @@ class Batches:
         Time spent by earlier runs on the stored passes.
     """
 
-    def __init__(self, load: Callable[[], Arrays | None], save: Callable[[Arrays], None]):
+    def __init__(self, load: Callable[[], Arrays | None], save: Callable[[Arrays], None]) -> None:
         self._load, self._save = load, save
         self.seconds = 0.0
         self._start = time.monotonic()
