@@ -54,7 +54,7 @@ class Stopped(BaseException):
         Of the signal.
     """
 
-    def __init__(self, number: int):
+    def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
 

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from html import escape
+from importlib import import_module
 from typing import Any
 
 from rich.console import Console
@@ -93,11 +94,10 @@ def _on_terminal(console: Console) -> Iterator[Notice]:
 
 @contextmanager
 def _in_notebook() -> Iterator[Notice]:
-    from IPython.display import HTML, display
-
+    ipython: Any = import_module("IPython.display")  # it states no types
     start = shown = time.monotonic()
     last = None
-    bar = display(HTML(""), display_id=True)
+    bar = ipython.display(ipython.HTML(""), display_id=True)
 
     def notice(text: str, fraction: float | None) -> None:
         nonlocal shown, last
@@ -107,14 +107,14 @@ def _in_notebook() -> Iterator[Notice]:
         if text != last or now - shown > _NOTEBOOK_INTERVAL:
             value = "" if fraction is None else f' value="{fraction:.3f}"'
             clock = f"{int(now - start) // 60}:{int(now - start) % 60:02d}"
-            bar.update(HTML(f"<progress{value}></progress> {clock} {escape(text)}"))
+            bar.update(ipython.HTML(f"<progress{value}></progress> {clock} {escape(text)}"))
             shown = now
         last = text
 
     try:
         yield notice
     finally:
-        bar.update(HTML(""))
+        bar.update(ipython.HTML(""))
 
 
 def without_warnings(notice: Notice) -> Notice:

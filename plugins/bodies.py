@@ -5,22 +5,32 @@ traced, to each shape alone: where surfaces coincide, a common search would find
 that leaves a closed mesh where it meets it next is inside.
 """
 
+import abc
 import itertools
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from .variant_types import Float, Mask, Medium, MediumPtr, Point, Scene, Shape, Vector
+
+Line: TypeAlias = tuple[Float, Float]
+"""Distances along a line at which it enters and leaves a body, or a box around it."""
+Crossing: TypeAlias = tuple[Float, MediumPtr, MediumPtr]
+"""Distance of an open surface along a line, the media in front of it and behind."""
 
 # A ray is traced from this far behind the last surface, relative to the position's size: several
 # roundings of a coordinate in single precision (0.5 mm at 500 m).
 STEP = 1e-6
 # of a line across the cube of half edge 1, per m
 SLOWEST = 1e-30
-# open surfaces of a mesh that are told apart
+# open surfaces of a mesh that are distinguished
 MOST_SHEETS = 64
 
 
-def parts_of_shape(shape):
+def parts_of_shape(shape: Shape) -> "list[Body | Sheet]":
     """What is on both sides of a shape whose surface lets light pass: bodies and open surfaces."""
     if shape.class_name() == "Sphere":
         return [Sphere(shape)]
@@ -42,20 +52,30 @@ def parts_of_shape(shape):
     ]
 
 
-class Body:
+class Body(abc.ABC):
     """A closed shape: its volume (m^3), the media on both sides of its surface.
 
     ``hollow``: a cavity of the shape, which has the exterior medium in it.
     """
 
-    def __init__(self, shape, volume, hollow=False):
+    def __init__(self, shape: Shape, volume: float, hollow: bool = False) -> None:
         self.volume, self.shape, self.hollow = volume, shape, hollow
         media = shape.interior_medium(), shape.exterior_medium()
         self.interior, self.exterior = media[::-1] if _is_flipped(shape) != hollow else media
         self.inside, self.outside = mi.MediumPtr(self.interior), mi.MediumPtr(self.exterior)
         dr.make_opaque(self.inside, self.outside)
 
-    def contains(self, places):
+    @abc.abstractmethod
+    def line(self, origin: Point, direction: Vector) -> Line:
+        """Where a line enters and leaves it, or is near it; infinity, if it misses."""
+
+    @abc.abstractmethod
+    def next_crossing(
+        self, line: Line, origin: Point, direction: Vector, start: Float, active: Mask
+    ) -> tuple[Float, Mask]:
+        """Distance of the next crossing behind ``start``, and whether that is inside."""
+
+    def contains(self, places: np.ndarray) -> np.ndarray:
         """Whether places (n, 3) are inside."""
         low, high = extent(self.shape)
         near = ((places >= low) & (places <= high)).all(1)
@@ -64,30 +84,34 @@ class Body:
         origin = mi.Point3f(*(mi.Float(np.ascontiguousarray(axis)) for axis in places.T))
         direction = mi.Vector3f(1, 0, 0)
         line = self.line(origin, direction)
-        _, inside = self.ahead(line, origin, direction, mi.Float(0), mi.Bool(True))
+        _, inside = self.next_crossing(line, origin, direction, mi.Float(0), mi.Bool(True))
         return np.broadcast_to(np.array(inside), len(places))
 
 
 class Convex(Body):
     """A body that lines enter and leave once, at distances in closed form."""
 
-    def ahead(self, line, origin, direction, start, active):
+    def next_crossing(
+        self, line: Line, origin: Point, direction: Vector, start: Float, active: Mask
+    ) -> tuple[Float, Mask]:
         """Distance of the next crossing behind ``start``, and whether that is inside."""
         near, far = line
-        outside, ahead = near > start, far > start
-        return dr.select(outside, near, dr.select(ahead, far, dr.inf)), ~outside & ahead
+        outside, leaves = near > start, far > start
+        return dr.select(outside, near, dr.select(leaves, far, dr.inf)), ~outside & leaves
 
 
 class Cube(Convex):
     """The image of the cube of half edge 1."""
 
-    def __init__(self, shape, matrix, centre, hollow=False):
+    def __init__(
+        self, shape: Shape, matrix: np.ndarray, centre: np.ndarray, hollow: bool = False
+    ) -> None:
         super().__init__(shape, 8 * abs(np.linalg.det(matrix)), hollow)
         inverse = np.linalg.inv(matrix)
         self.to_local, self.offset = mi.Matrix3f(inverse), mi.Vector3f(-inverse @ centre)
         dr.make_opaque(self.to_local, self.offset)
 
-    def line(self, origin, direction):
+    def line(self, origin: Point, direction: Vector) -> Line:
         """Where a line enters and leaves it; infinity, if it misses."""
         start, step = self.to_local @ origin + self.offset, self.to_local @ direction
         # along a face, the slowest of steps: products with the inverse stay finite
@@ -100,19 +124,20 @@ class Cube(Convex):
 class Sphere(Convex):
     """A sphere."""
 
-    def __init__(self, shape):
+    def __init__(self, shape: Shape) -> None:
         low, high = extent(shape)
         radius = (high - low).mean() / 2
         super().__init__(shape, 4 / 3 * np.pi * radius**3)
         self.centre, self.radius = mi.Point3f((low + high) / 2), mi.Float(radius)
         dr.make_opaque(self.centre, self.radius)
 
-    def line(self, origin, direction):
+    def line(self, origin: Point, direction: Vector) -> Line:
         """Where a line enters and leaves it; infinity, if it misses."""
         offset = self.centre - origin
         middle = dr.dot(offset, direction)
-        beside = dr.norm(offset - direction * middle)
-        half2 = (self.radius - beside) * (self.radius + beside)
+        impact = dr.norm(offset - direction * middle)
+        # not radius^2 - impact^2: of a large sphere that a line grazes it would have no digits
+        half2 = (self.radius - impact) * (self.radius + impact)
         half = dr.safe_sqrt(half2)
         return dr.select(half2 > 0, middle - half, dr.inf), middle + half
 
@@ -120,17 +145,19 @@ class Sphere(Convex):
 class Closed(Body):
     """A closed mesh. Light that leaves it at the next surface is inside."""
 
-    def __init__(self, shape, piece, volume, hollow):
+    def __init__(self, shape: Shape, piece: Shape, volume: float, hollow: bool) -> None:
         super().__init__(shape, abs(volume), hollow)
         self.scene, (self.low, self.high) = scene_of([piece]), box_around([piece])
         # whether normals point outwards: they follow the order of corners, unless flipped
         self.outwards = _sign((volume > 0) != piece.has_flipped_normals())
 
-    def line(self, origin, direction):
+    def line(self, origin: Point, direction: Vector) -> Line:
         """Where a line is near it."""
         return slabs(self.low, self.high, origin, direction)
 
-    def ahead(self, line, origin, direction, start, active):
+    def next_crossing(
+        self, line: Line, origin: Point, direction: Vector, start: Float, active: Mask
+    ) -> tuple[Float, Mask]:
         """Distance of the next crossing behind ``start``, and whether that is inside."""
         near, far = line
         place, normal = _next(
@@ -143,7 +170,7 @@ class Closed(Body):
 class Sheet:
     """An open surface: a rectangle, a disc, a cylinder, a mesh with a rim."""
 
-    def __init__(self, shape, piece):
+    def __init__(self, shape: Shape, piece: Shape) -> None:
         self.shape, self.scene = shape, scene_of([piece])
         self.interior, self.exterior = shape.interior_medium(), shape.exterior_medium()
         self.inside, self.outside = mi.MediumPtr(self.interior), mi.MediumPtr(self.exterior)
@@ -151,7 +178,9 @@ class Sheet:
         # whether the interior is behind the normal
         self.outwards = _sign(shape.has_flipped_normals() == piece.has_flipped_normals())
 
-    def ahead(self, origin, direction, start, active):
+    def next_crossing(
+        self, origin: Point, direction: Vector, start: Float, active: Mask
+    ) -> Crossing:
         """Distance of the surface behind ``start``, the media in front of it and behind."""
         place, normal = _next(self.scene, origin, direction, start, active)
         leaves = dr.dot(normal, direction) * self.outwards > 0
@@ -159,18 +188,18 @@ class Sheet:
         return place, front, dr.select(leaves, self.outside, self.inside)
 
 
-def passes_light(shape) -> bool:
+def passes_light(shape: Shape) -> bool:
     """Whether light passes a shape's surface unchanged."""
     bsdf = shape.bsdf()
     return bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
 
 
-def name_of(thing) -> str:
+def name_of(thing: Shape | Medium) -> str:
     """What a message calls a shape or medium: those that Mitsuba has merged have no name."""
     return thing.id() or thing.class_name()
 
 
-def extent(shape):
+def extent(shape: Shape) -> np.ndarray:
     """Lowest and highest corner, (2, 3); Mitsuba's own is missing where it has merged meshes."""
     if shape.is_mesh():
         corners = _corners(shape)
@@ -178,19 +207,19 @@ def extent(shape):
     return np.array([shape.bbox().min, shape.bbox().max], float)
 
 
-def scene_extent(shapes):
+def scene_extent(shapes: Sequence[Shape]) -> np.ndarray:
     """Corners of all shapes' boxes, (n, 3); the origin, if there is no shape."""
     return np.concatenate([extent(shape) for shape in shapes]) if shapes else np.zeros((1, 3))
 
 
-def slabs(low, high, origin, direction):
+def slabs(low: Point, high: Point, origin: Point, direction: Vector) -> Line:
     """Distances along a line at which it is inside a box, first and last."""
     # a component of 0 makes infinities; where it makes NaN (0 times infinity), comparisons fail
     first, last = (low - origin) / direction, (high - origin) / direction
     return dr.max(dr.minimum(first, last)), dr.min(dr.maximum(first, last))
 
 
-def first_hit(scene, origin, direction, active):
+def first_hit(scene: Scene, origin: Point, direction: Vector, active: Mask) -> tuple[Float, Vector]:
     """Distance of the first surface, infinite if there is none, and its normal."""
     # one by one: packets of rays are slower here, coherent or not
     si = scene.ray_intersect(
@@ -199,15 +228,17 @@ def first_hit(scene, origin, direction, active):
     return dr.select(active & si.is_valid(), si.t, dr.inf), si.n
 
 
-def _next(scene, origin, direction, start, active):
+def _next(
+    scene: Scene, origin: Point, direction: Vector, start: Float, active: Mask
+) -> tuple[Float, Vector]:
     """Distance of the next surface behind ``start``, infinite if there is none, and its normal."""
     start = start + STEP * (dr.max(dr.abs(origin)) + start)
     place, normal = first_hit(scene, origin + direction * start, direction, active)
     return start + place, normal
 
 
-def scene_of(shapes):
-    """A scene of some shapes alone. Mitsuba names them anew; they keep their names."""
+def scene_of(shapes: Sequence[Shape]) -> Scene:
+    """A scene of some shapes alone. Mitsuba renames them; their names are restored."""
     names = [shape.id() for shape in shapes]
     parts = {f"shape{number}": shape for number, shape in enumerate(shapes)}
     scene = mi.load_dict({"type": "scene", **parts}, optimize=False)
@@ -216,11 +247,11 @@ def scene_of(shapes):
     return scene
 
 
-def _sign(positive):
+def _sign(positive: bool) -> Float:
     return dr.opaque(mi.Float, 1 if positive else -1)
 
 
-def box_around(shapes):
+def box_around(shapes: Sequence[Shape]) -> tuple[Point, Point]:
     """Corners of a box around shapes, opaque, so that no scene's size is compiled into a kernel."""
     corners = scene_extent(shapes)
     margin = 10 * STEP * (1 + np.abs(corners).max())
@@ -229,7 +260,9 @@ def box_around(shapes):
     return low, high
 
 
-def _is_hollow(index, volumes, boxes) -> bool:
+def _is_hollow(
+    index: int, volumes: Sequence[float], boxes: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> bool:
     """Whether a piece is a cavity: within a larger one, and wound the other way round."""
     volume, (low, high) = volumes[index], boxes[index]
     return any(
@@ -241,7 +274,9 @@ def _is_hollow(index, volumes, boxes) -> bool:
     )
 
 
-def _part(shape, corners, faces, volume, hollow, whole):
+def _part(
+    shape: Shape, corners: np.ndarray, faces: np.ndarray, volume: float, hollow: bool, whole: bool
+) -> Body | Sheet:
     if volume:
         used = corners[faces.min() : faces.max() + 1]
         affine = _affine(used)
@@ -251,7 +286,7 @@ def _part(shape, corners, faces, volume, hollow, whole):
     return Closed(shape, piece, volume, hollow) if volume else Sheet(shape, piece)
 
 
-def _affine(corners):
+def _affine(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """The map from the cube of half edge 1 to a cube with these corners, or None."""
     reference = _corners(mi.load_dict({"type": "cube"}))
     if corners.shape != reference.shape:
@@ -259,11 +294,11 @@ def _affine(corners):
     # x = A c + b for each corner c
     reference = np.column_stack([reference, np.ones(len(reference))])
     affine, *_ = np.linalg.lstsq(reference, corners, rcond=None)
-    bent = np.abs(reference @ affine - corners).max() > 1e-5 * np.abs(corners).max()
-    return None if bent else (affine[:3].T, affine[3])
+    sheared = np.abs(reference @ affine - corners).max() > 1e-5 * np.abs(corners).max()
+    return None if sheared else (affine[:3].T, affine[3])
 
 
-def _pieces(corners, faces):
+def _pieces(corners: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, bool]]:
     """Parts of a mesh, each with whether it is closed: Mitsuba merges shapes of one medium.
 
     A part ends at the first face after which every edge has been passed as often one way as the
@@ -298,7 +333,7 @@ def _pieces(corners, faces):
     ]
 
 
-def _sheets(faces):
+def _sheets(faces: np.ndarray) -> list[np.ndarray]:
     """Open surfaces that share no corner, as Mitsuba has merged them."""
     before = np.maximum.accumulate(faces.max(1))
     behind = np.minimum.accumulate(faces.min(1)[::-1])[::-1]
@@ -307,7 +342,7 @@ def _sheets(faces):
     return sheets if len(sheets) <= MOST_SHEETS else [faces]
 
 
-def _mesh(corners, faces):
+def _mesh(corners: np.ndarray, faces: np.ndarray) -> Shape:
     """A mesh of some faces."""
     used, faces = np.unique(faces, return_inverse=True)
     mesh = mi.Mesh("part", len(used), faces.size // 3)
@@ -318,7 +353,7 @@ def _mesh(corners, faces):
     return mesh
 
 
-def _is_flipped(shape) -> bool:
+def _is_flipped(shape: Shape) -> bool:
     """Whether a scene asks for flipped normals; a mirrored sphere's are flipped by Mitsuba."""
     mirrored = False
     if shape.class_name() == "Sphere":
@@ -327,7 +362,7 @@ def _is_flipped(shape) -> bool:
     return shape.has_flipped_normals() != mirrored
 
 
-def _volume(corners, faces) -> float:
+def _volume(corners: np.ndarray, faces: np.ndarray) -> float:
     """Volume (m^3) of a closed mesh, negative where corners run clockwise from outside."""
     first, second, third = (corners[faces[:, k]] - corners[faces[0, 0]] for k in range(3))
     parts = (first * np.cross(second, third)).sum(1) / 6
@@ -335,5 +370,5 @@ def _volume(corners, faces) -> float:
     return float(parts.sum() if abs(parts.sum()) > 1e-12 * np.abs(parts).sum() else 0)
 
 
-def _corners(mesh):
+def _corners(mesh: Shape) -> np.ndarray:
     return np.array(mesh.vertex_positions_buffer(), float).reshape(-1, 3)

@@ -6,15 +6,23 @@ matter of speed alone.
 """
 
 import functools
+import math
 import re
+from collections.abc import Callable, Iterable
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .variant_types import Cell, Float, Medium, MediumPtr, Point, Tensor, UInt, Vector, Volume
+
 # Least number of cells along the edge of a block, largest number of blocks along an axis, and the
 # optical depth of an axis, at the difference of the field's bounds, for which one more block pays.
 CELLS, BLOCKS, DEPTH = 4, 64, 0.5
+
+Source: TypeAlias = tuple[int, float, int, bytes]
+"""What the blocks of a grid depend on: its array's index, scale, channel and place."""
 
 UNKNOWN, UNIFORM, BLOCKED = 0, 1, 2
 """What is known of a medium: its majorant alone, that it is the same everywhere, its blocks."""
@@ -28,18 +36,19 @@ class Bounds:
     ``wrap_mode``. Other volumes have their majorant.
     """
 
-    def __init__(self):
-        self._read: dict = {}
+    def __init__(self) -> None:
+        self._read: dict[Medium, _Blocks] = {}
 
-    def update(self, media, channel: int) -> None:
+    def update(self, media: Iterable[Medium], channel: int) -> None:
         """Read the media, as far as they have changed since the last time."""
         read = {medium: _blocks(medium, channel, self._read.get(medium)) for medium in media}
         if not self._read or read != self._read:
             self._tabulate(read)
         self._read = read
 
-    def _tabulate(self, read):
-        # medium 0 is none: one block without any extinction
+    def _tabulate(self, read: "dict[Medium, _Blocks]") -> None:
+        # medium 0 is none: one block without any extinction, so that lanes in a vacuum need no
+        # branch of their own
         numbers = [0, *(_number(mi.MediumPtr(medium))[0] for medium in read)]
         tables = [_Blocks(BLOCKED), *read.values()]
         size, first, values = max(numbers) + 1, 0, []
@@ -57,11 +66,13 @@ class Bounds:
         # opaque, also where there is one entry only, so that other fields run in the same kernel
         dr.make_opaque(self.kinds, self.firsts, self.counts, self.frames, self.values)
 
-    def kind(self, medium):
+    def kind(self, medium: MediumPtr) -> UInt:
         """What is known of the medium of each lane."""
         return dr.gather(mi.UInt32, self.kinds, _number(medium))
 
-    def enter(self, medium, origin, direction):
+    def enter(
+        self, medium: MediumPtr, origin: Point, direction: Vector
+    ) -> tuple[Vector, Vector, Cell, UInt]:
         """A line in the blocks of a medium: its start, step per metre, counts and first value."""
         number = _number(medium)
         rows = [dr.gather(mi.Vector3f, self.frames, 4 * number + row) for row in range(4)]
@@ -70,67 +81,81 @@ class Bounds:
         counts = dr.gather(mi.Vector3i, self.counts, number)
         return start, step, counts, dr.gather(mi.UInt32, self.firsts, number)
 
-    def extinction(self, block, counts, first):
+    def extinction(self, block: Cell, counts: Cell, first: UInt) -> Vector:
         """Least, mean and largest extinction of a block, m^-1."""
+        # a layer of blocks around the grid holds the bounds of all that lies beyond
         place = block + 1
         index = (place.z * (counts.y + 2) + place.y) * (counts.x + 2) + place.x
         return dr.gather(mi.Vector3f, self.values, first + mi.UInt32(index))
 
 
-def _number(medium):
+def _number(medium: MediumPtr) -> UInt:
     return dr.reinterpret_array(mi.UInt32, medium)
 
 
-def locate(start, step, counts, travelled):
+def locate(start: Vector, step: Vector, counts: Cell, travelled: Float) -> Cell:
     """The block of a line at a distance; -1 and ``counts`` are all that lies beyond the grid."""
     place = dr.clip(dr.floor(start + step * travelled), -1, mi.Vector3f(counts))
     return mi.Vector3i(place)
 
 
-def leave(start, step, counts, block):
+def leave(start: Vector, step: Vector, counts: Cell, block: Cell) -> tuple[Float, Cell]:
     """Distance at which a line leaves a block, and the block behind it."""
     forward = step > 0
     onward = (forward & (block < counts)) | ((step < 0) & (block >= 0))
     face = mi.Vector3f(dr.select(forward, block + 1, block))
+    # along an axis in which it leaves the grid or does not move, it stays in its block
     ends = dr.select(onward, (face - start) / step, dr.inf)
     end = dr.min(ends)
     # one axis only, so that every block on the way is visited
     along_x = ends.x == end
     along_y = ~along_x & (ends.y == end)
-    turn = mi.Vector3i(
+    unit = mi.Vector3i(
         dr.select(along_x, 1, 0), dr.select(along_y, 1, 0), dr.select(along_x | along_y, 0, 1)
     )
-    return end, block + dr.select(forward, turn, -turn)
+    return end, block + dr.select(forward, unit, -unit)
 
 
 class _Blocks:
     """Bounds of one medium; ``frame`` maps world coordinates to blocks."""
 
-    def __init__(self, kind, counts=(0, 0, 0), frame=0.0, values=0.0, source=None):
+    def __init__(
+        self,
+        kind: int,
+        counts: tuple[int, ...] = (0, 0, 0),
+        frame: np.ndarray | None = None,
+        values: np.ndarray | None = None,
+        source: tuple[Source, Float] | None = None,
+    ) -> None:
         self.kind, self.counts, self.source = kind, counts, source
-        self.frame = np.broadcast_to(frame, (4, 3))
-        self.values = np.broadcast_to(values, (np.prod(np.add(counts, 2)), 3))
+        self.frame = np.zeros((4, 3)) if frame is None else frame
+        blocks = math.prod(count + 2 for count in counts)
+        self.values = np.zeros((blocks, 3)) if values is None else values
 
 
-def _blocks(medium, channel, known) -> _Blocks:
+def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
     """Those of a medium; ``known`` again if it still is what it was."""
     volume = _parts(medium).get("sigma_t")
     data = _grid(volume)
     if data is None:
         constant = volume is not None and volume.class_name() == "ConstVolume"
         kind = UNIFORM if constant or medium.is_homogeneous() else UNKNOWN
+        # the same object for the same bounds: the tables are not written again
         return known if known and known.kind == kind else _Blocks(kind)
     scale, to_local = float(mi.traverse(medium)["scale"]), _to_local(volume)
-    # an array that stays in use keeps its index
+    # an array has its index for as long as it is in use, and `known` uses it: an equal index is
+    # the same values, without reading them
     array = mi.Float(dr.detach(data.array))
     source = array.index, scale, channel, to_local.tobytes()
     if known and known.source and known.source[0] == source:
         return known
+    # states, z, y, x, channels; a grid that does not change has one state
     field = np.array(array, float).reshape(-1, *data.shape[-4:])
     field = scale * field[..., channel if data.shape[-1] == 3 else 0]
     least, most = field.min(0), field.max(0)
     mean, outside = field.mean(0), (least.min(), field.mean(), most.max())
     extents = np.linalg.norm(np.linalg.inv(to_local[:3, :3]), axis=0)[::-1]
+    # an even field gains nothing from blocks, whose borders each cost a step
     wanted = np.clip((outside[2] - outside[0]) * extents / DEPTH, 1, BLOCKS)
     edges = np.maximum(CELLS, np.ceil(mean.shape / wanted)).astype(int)
     for axis, edge in enumerate(edges):
@@ -145,19 +170,19 @@ def _blocks(medium, channel, known) -> _Blocks:
     return _Blocks(BLOCKED, counts, frame, values.reshape(-1, 3), (source, array))
 
 
-def _parts(thing) -> dict:
-    """What an object of a scene consists of, by name."""
-    found = {}
+def _parts(medium: Medium) -> dict[str, Any]:
+    """What a medium consists of, by name."""
+    found: dict[str, Any] = {}
 
     class Parts(mi.TraversalCallback):
-        def put(self, name, value, *_):
+        def put(self, name: str, value: Any, *_: object) -> None:
             found[name] = value
 
-    thing.traverse(Parts())
+    medium.traverse(Parts())
     return found
 
 
-def _grid(volume):
+def _grid(volume: Volume) -> Tensor | None:
     """Values of a volume that is a regular grid of extinction coefficients; None for others."""
     if volume is None or not (volume.class_name() == "GridVolume" or hasattr(volume, "to_grid")):
         return None
@@ -166,16 +191,17 @@ def _grid(volume):
     return data if data.shape[-1] == 1 or (mi.is_rgb and data.shape[-1] == 3) else None
 
 
-def _to_local(volume) -> np.ndarray:
+def _to_local(volume: Volume) -> np.ndarray:
     """The map from the world to the unit cube that a grid fills, 4 x 4.
 
-    Mitsuba tells a grid's map in words only, to six digits: the middle of the bounding box gives
+    Mitsuba states a grid's map in words only, to six digits: the middle of the bounding box gives
     its place to the rounding of single precision, and its axes are right to a millionth of it.
     """
     if hasattr(volume, "to_grid"):
         return volume.to_grid()
-    rows = re.search(r"matrix=\[\[(.*?)\]\]", str(volume), re.DOTALL)[1]
-    numbers = [float(word) for word in re.split(r"[\s,\[\]]+", rows) if word]
+    found = re.search(r"matrix=\[\[(.*?)\]\]", str(volume), re.DOTALL)
+    assert found is not None  # every version of Mitsuba that is allowed prints it
+    numbers = [float(word) for word in re.split(r"[\s,\[\]]+", found[1]) if word]
     matrix = np.array(numbers).reshape(4, 4)
     box = volume.bbox()
     middle = (np.array(box.min, float).ravel() + np.array(box.max, float).ravel()) / 2
@@ -183,7 +209,9 @@ def _to_local(volume) -> np.ndarray:
     return matrix
 
 
-def _reduced(extreme, field, axis, edge):
+def _reduced(
+    extreme: Callable[[np.ndarray, np.ndarray], np.ndarray], field: np.ndarray, axis: int, edge: int
+) -> np.ndarray:
     """Extremes of blocks along an axis, each with one cell more on either side.
 
     Interpolation looks up half of that cell; the other half is a margin for rounding. Beside the
@@ -197,7 +225,7 @@ def _reduced(extreme, field, axis, edge):
     return functools.reduce(extreme, parts)
 
 
-def _averaged(field, axis, edge):
+def _averaged(field: np.ndarray, axis: int, edge: int) -> np.ndarray:
     """Means of blocks along an axis."""
     starts = np.arange(0, field.shape[axis], edge)
     lengths = np.diff([*starts, field.shape[axis]])

@@ -55,6 +55,7 @@ radiance is the power on the pixel.
 """
 
 import math
+from types import ModuleType
 
 import drjit as dr
 import mitsuba as mi
@@ -63,15 +64,28 @@ import numpy as np
 from .parameters import fail, number, pose, positive
 from .parameters import table as read_table
 from .registration import register
+from .variant_types import (
+    Box,
+    Float,
+    Mask,
+    Numbers,
+    Point,
+    Properties,
+    Ray,
+    Spectrum,
+    Table,
+    Transform,
+    Vector,
+)
 
 NAME, KIND = "ccd", "sensor"
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class Ccd(mi.Sensor):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             width, height = self.film().size()
             self.focal_length = positive(props, NAME, "focal_length", 0.3)
@@ -105,20 +119,20 @@ def define():
             self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
             if self.lens is not None:
-                self.m_exit = dr.opaque(mi.Float, self._exit_radius())
+                self.m_exit = dr.opaque(mi.Float, self._exit_radius(self.lens))
 
         # --- light towards the CCD; (right, down, onward) are the lens's own coordinates
 
-        def sample_stop(self, sample):
+        def sample_stop(self, sample: Point) -> Point:
             """Points of the stop, uniformly (world)."""
             disc = mi.warp.square_to_uniform_disk(sample) * self.m_stop
             return self.m_pose @ mi.Point3f(0, disc.x, disc.y)
 
-        def stop_area(self):
+        def stop_area(self) -> Float:
             """Area of the stop, m^2."""
             return dr.pi * self.m_stop * self.m_stop
 
-        def receive(self, point, direction):
+        def receive(self, point: Point, direction: Vector) -> tuple[Point, Mask]:
             """Position on the CCD of light through ``point`` of the stop along ``direction``.
 
             Both in world coordinates. The position is in px right and down from the centre of the
@@ -146,7 +160,7 @@ def define():
 
         # --- rays from the CCD into the scene
 
-        def sample_towards_scene(self, place, sample):
+        def sample_towards_scene(self, place: Point, sample: Point) -> tuple[Point, Vector, Float]:
             """A ray from ``place`` (px, as above) through the lens: stop point, direction, weight.
 
             The mean of the weight over ``sample`` is a pixel's étendue.
@@ -177,7 +191,7 @@ def define():
 
         # --- from the CCD to the image of an ideal lens on an upright CCD, and back
 
-        def _ideal(self, at):
+        def _ideal(self, at: Point) -> tuple[Point, Float]:
             """Place in the ideal image of a place on the CCD, and its area there over the CCD's.
 
             Light through the middle of the lens meets the tilted CCD in P = (0, 0, f) + x e_x +
@@ -200,7 +214,7 @@ def define():
                 at, stretch = at / wide, stretch / (wide * (1 + 3 * k * ideal2))
             return at, stretch
 
-        def _distorted(self, right, down):
+        def _distorted(self, right: Float, down: Float) -> Point:
             """Place on the CCD of a place in the ideal image."""
             at = mi.Point2f(right, down)
             if self.distortion:
@@ -218,8 +232,8 @@ def define():
                 )
             return at
 
-        def _exit_radius(self) -> float:
-            """Radius of the light's cross-section in the tangent plane of the last surface."""
+        def _exit_radius(self, lens: np.ndarray) -> float:
+            """Radius of the light's cross-section in the tangent plane of a lens's last surface."""
             width, height = self.film().size()
             corner = np.abs(np.array([[0, 0], [width, height]]) - 0.5 - self.centre).max(0)
             field = np.hypot(*corner) * self.pixel / self.focal_length
@@ -228,18 +242,20 @@ def define():
             length = np.sqrt(1 + slopes**2)
             rim = self.stop_radius * np.cos(angle), self.stop_radius * np.sin(angle)
             rays = slopes / length, np.zeros_like(slopes), 1 / length
-            (right, down), out, passes = _through(self.lens, rim, rays, np)
+            (right, down), out, passes = _through(lens, rim, rays, np)
             if not passes.all():
                 fail(NAME, "lens", "light misses a surface", "surfaces that all light meets")
-            back = -self.lens[-1, 2] / out[2]
+            back = -lens[-1, 2] / out[2]
             return 1.01 * float(np.hypot(right + back * out[0], down + back * out[1]).max())
 
         # --- Mitsuba
 
-        def world_transform(self):
+        def world_transform(self) -> Transform:
             return self.m_pose
 
-        def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        def sample_ray(
+            self, time: Float, sample1: Float, sample2: Point, sample3: Point, active: Mask = True
+        ) -> tuple[Ray, Spectrum]:
             """A ray of a film position in [0, 1]^2; its weight is a pixel's étendue."""
             place = mi.Point2f(sample2) * mi.Point2f(self.film().size()) - 0.5
             point, direction, weight = self.sample_towards_scene(place, sample3)
@@ -247,14 +263,16 @@ def define():
                 mi.Spectrum(weight) & active
             )
 
-        def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
+        def sample_ray_differential(
+            self, time: Float, sample1: Float, sample2: Point, sample3: Point, active: Mask = True
+        ) -> tuple[Ray, Spectrum]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
 
-        def bbox(self):
+        def bbox(self) -> Box:
             return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
 
-        def to_string(self):
+        def to_string(self) -> str:
             width, height = self.film().size()
             kind = "ideal lens" if self.lens is None else f"lens of {len(self.lens) - 1} surfaces"
             return (
@@ -265,7 +283,7 @@ def define():
     return Ccd
 
 
-def read_lens(source) -> np.ndarray:
+def read_lens(source: Table) -> np.ndarray:
     """A lens (tensor or file name), checked: rows of radius, conic, distance, index behind."""
     lens = np.asarray(read_table(NAME, "lens", source, 4), float)
     if lens.ndim == 1 and lens.size % 4 == 0:
@@ -291,7 +309,12 @@ def _reversed(lens: np.ndarray) -> np.ndarray:
     return back
 
 
-def _through(lens, place, direction, xp):
+def _through(
+    lens: np.ndarray,
+    place: tuple[Numbers, Numbers],
+    direction: tuple[Numbers, Numbers, Numbers],
+    xp: ModuleType,
+) -> tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers, Numbers], Numbers]:
     """Follow light through a lens: from the plane of its first row to that at its end.
 
     ``place`` (2 arrays) and ``direction`` (3 arrays, a unit vector) are (right, down) and
@@ -319,8 +342,9 @@ def _through(lens, place, direction, xp):
         ratio = before / index
         leaving2 = 1 - ratio * ratio * (1 - arriving * arriving)
         met = met & (leaving2 > 0)
-        turn = xp.sqrt(xp.maximum(leaving2, 0)) - ratio * arriving
-        u, v, w = ratio * u + turn * nx, ratio * v + turn * ny, ratio * w + turn * nz
+        # Snell's law: the direction changes along the normal alone
+        change = xp.sqrt(xp.maximum(leaving2, 0)) - ratio * arriving
+        u, v, w = ratio * u + change * nx, ratio * v + change * ny, ratio * w + change * nz
         distance, before = after, index
     step = (distance - z) / w
     return (x + step * u, y + step * v), (u, v, w), met

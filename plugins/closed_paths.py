@@ -14,6 +14,8 @@ about 1 / (1 + cos(theta)): flights towards the telescope contribute by far the 
 import drjit as dr
 import mitsuba as mi
 
+from .variant_types import Float, Point, Vector
+
 # of the components of the sum of two unit vectors in single precision
 ROUNDING = 1e-6
 
@@ -31,36 +33,40 @@ class OpenPath:
     reach : how far towards the telescope there may be any air, m.
     """
 
-    def __init__(self, away, distance, excess, field, reach):
+    def __init__(
+        self, away: Vector, distance: Float, excess: Float, field: Float, reach: Float
+    ) -> None:
         self.away, self.distance, self.excess = away, distance, excess
         self.field, self.reach = field, reach
 
-    def widened(self, factor):
+    def widened(self, factor: float) -> "OpenPath":
         """The same with a wider field."""
         return OpenPath(self.away, self.distance, self.excess, factor * self.field, self.reach)
 
-    def one_plus_cosine(self, direction):
+    def one_plus_cosine(self, direction: Vector) -> Float:
         """1 + cos(theta), exact where it is small."""
+        # as 1 + cos(theta) of a scalar product it would be rounding alone, near the telescope
         return 0.5 * dr.squared_norm(self.away + direction)
 
-    def leg(self, used, one_plus_cosine):
+    def leg(self, used: Float, one_plus_cosine: Float) -> Float:
         """Length of a flight that consumes ``used`` of the excess length."""
         return used * (0.5 * used + self.distance) / (used + self.distance * one_plus_cosine)
 
-    def slope(self, used, one_plus_cosine, leg):
+    def slope(self, used: Float, one_plus_cosine: Float, leg: Float) -> Float:
         """Derivative of the excess length consumed with respect to the length of the flight."""
         return (used + self.distance * one_plus_cosine) / (self.distance + used - leg)
 
-    def sample(self, used, sample):
+    def sample(self, used: Float, sample: Point) -> Vector:
         """Direction of a flight that consumes ``used``; two numbers in [0, 1)."""
         least, most, offset = self._limits(used)
+        # of the density 1 / (1 + cos(theta) + offset) per solid angle, by its inverse
         one_plus_cosine = dr.clip(least * dr.exp(dr.log(most / least) * sample.x) - offset, 0, 2)
         sine = dr.sqrt(one_plus_cosine * (2 - one_plus_cosine))
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
         local = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, one_plus_cosine - 1)
         return mi.Frame3f(self.away).to_world(local)
 
-    def density(self, used, one_plus_cosine):
+    def density(self, used: Float, one_plus_cosine: Float) -> Float:
         """Of `sample`, per steradian."""
         least, most, offset = self._limits(used)
         place = one_plus_cosine + offset
@@ -69,7 +75,7 @@ class OpenPath:
         inside = (place >= least - slack) & (place <= most + slack)
         return dr.select(inside, dr.inv_two_pi / (dr.log(most / least) * place), 0)
 
-    def _limits(self, used):
+    def _limits(self, used: Float) -> tuple[Float, Float, Float]:
         """Least and largest ``one_plus_cosine + offset`` of flights that end in view; ``offset``.
 
         On an ellipsoid of eccentricity e the angles psi and theta at its foci obey
@@ -84,12 +90,12 @@ class OpenPath:
         return least + offset, 2 + offset, offset
 
 
-def quarter_turn(axis, direction):
+def quarter_turn(axis: Vector, direction: Vector) -> Vector:
     """A direction rotated by 90 degrees about an axis."""
     return axis * dr.dot(axis, direction) + dr.cross(axis, direction)
 
 
-def closing_distance(offset, direction, path):
+def closing_distance(offset: Vector, direction: Vector, path: Float) -> Float:
     """Length of the flight whose path, from its start to the goal, is ``path`` long.
 
     From ``offset`` (start minus goal) along ``direction`` to t, and from there to the goal:
@@ -97,29 +103,32 @@ def closing_distance(offset, direction, path):
     -1 where the path is shorter than the straight line.
     """
     length = dr.norm(offset)
+    # not path^2 - length^2: a path little longer than the straight line would have no digits
     end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
     return dr.select(path > length, end, -1)
 
 
-def sample_near(least, most, scale, sample, again):
+def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: Float) -> Float:
     """Distance of a vertex in front of the point where the beam would close the path.
 
     Of isotropic scattering there, weighted by the length at which directions close the path, the
-    fraction that returns into view is proportional to ln(1 + (scale / left)^2). Uniform, if that
+    fraction that returns into view is proportional to ln(1 + (scale / gap)^2). Uniform, if that
     is out of the range.
     """
-    left = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
-    return dr.select((left > least) & (left < most), left, dr.lerp(least, most, again))
+    # a Cauchy number times a uniform one has this density: the logarithm has no closed inverse
+    gap = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
+    return dr.select((gap > least) & (gap < most), gap, dr.lerp(least, most, again))
 
 
-def near_density(left, least, most, scale):
+def near_density(gap: Float, least: Float, most: Float, scale: Float) -> Float:
     """Of `sample_near`, per metre."""
+    # of the draws that fall out of the range and are replaced by uniform ones
     outside = 1 - _near_chance(most, scale) + _near_chance(least, scale)
-    density = dr.log(1 + dr.square(scale / left)) / (dr.pi * scale)
+    density = dr.log(1 + dr.square(scale / gap)) / (dr.pi * scale)
     return density + outside / (most - least)
 
 
-def _near_chance(left, scale):
-    """Integral of ln(1 + (scale / left)^2) / (pi scale) from 0 to ``left``."""
-    value = left * dr.log(1 + dr.square(scale / left)) + 2 * scale * dr.atan(left / scale)
-    return dr.select(left > 0, value / (dr.pi * scale), 0)
+def _near_chance(gap: Float, scale: Float) -> Float:
+    """Integral of ln(1 + (scale / gap)^2) / (pi scale) from 0 to ``gap``."""
+    value = gap * dr.log(1 + dr.square(scale / gap)) + 2 * scale * dr.atan(gap / scale)
+    return dr.select(gap > 0, value / (dr.pi * scale), 0)

@@ -1,13 +1,17 @@
 """Dielectric and metal coatings of mirrors: layers, and the waves that they reflect."""
 
+from collections.abc import Sequence
+from types import ModuleType
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .parameters import fail
+from .variant_types import Numbers, Properties
 
 
-def read_coating(props, plugin: str) -> list[tuple[complex, float]]:
+def read_coating(props: Properties, plugin: str) -> list[tuple[complex, float]]:
     """Layers (index + i extinction, thickness in m) of a mirror from its plate to the gap."""
     text = str(props.get("coating", "")).strip()
     try:
@@ -21,12 +25,14 @@ def read_coating(props, plugin: str) -> list[tuple[complex, float]]:
     return [(complex(index, *rest), thickness) for index, thickness, *rest in layers]
 
 
-def admittance(index, cosine, polarisation):
+def admittance(index: Numbers, cosine: Numbers, polarisation: str) -> Numbers:
     """Ratio of the transverse magnetic to the transverse electric field, in vacuum's."""
     return index * cosine if polarisation == "s" else index / cosine
 
 
-def amplitudes_of(layers, gap, plate, xp):
+def amplitudes_of(
+    layers: Sequence[tuple[Numbers, Numbers]], gap: Numbers, plate: Numbers, xp: ModuleType
+) -> tuple[Numbers, Numbers, Numbers]:
     """Amplitudes of a mirror by the characteristic matrices of its layers (Macleod 2010, ch. 2).
 
     Parameters

@@ -62,6 +62,9 @@ kind. Neither recompiles anything.
     </bsdf>
 """
 
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -69,8 +72,32 @@ import numpy as np
 from .coating import admittance, amplitudes_of, read_coating
 from .parameters import TINY, at_least, choice, fail, number, positive
 from .registration import register
+from .variant_types import (
+    Complex,
+    Context,
+    Drawn,
+    Float,
+    Int,
+    Interaction,
+    Mask,
+    Point,
+    Properties,
+    Spectrum,
+    Texture,
+    Traversal,
+    Vector,
+)
 
 NAME, KIND = "etalon", "bsdf"
+
+Mirrors: TypeAlias = tuple[Complex, Complex, Complex]
+"""Amplitudes for one polarisation: reflection on the side of the gap, transmission through both
+mirrors, reflection on the outer side."""
+Wave: TypeAlias = tuple[Complex, Complex, Complex, Complex, Complex]
+"""The amplitudes of `Mirrors`, the factor of a round trip, and the mean of the sum of all trips."""
+Elements: TypeAlias = tuple[Float, Float, Float, Float]
+"""Elements m00, m01, m22, m23 of a Mueller matrix about the axis perpendicular to the plane of
+incidence."""
 
 SPEED_OF_LIGHT = 299_792_458.0
 # what mi.traverse shows
@@ -81,16 +108,17 @@ NEGLECTED = 1e-8
 LEAST_PASSED = 1e-6
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class Etalon(mi.BSDF):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             lines = [o for _, o in props.objects() if hasattr(o, "characteristic")]
             if len(lines) > 1:
                 fail(NAME, "line", len(lines), "one nested texture of type 'spectral_line'")
-            self.line = lines[0] if lines else None
+            # None only where frequencies are sampled
+            self.line: Texture = lines[0] if lines else None
             self.line_shape = choice(props, NAME, "line_shape", "folded", ("folded", "sampled"))
             if self.line_shape == "folded" and self.line is None:
                 fail(NAME, "line", None, "a nested texture of type 'spectral_line', or 'sampled'")
@@ -119,7 +147,7 @@ def define():
             self.m_components = [mi.BSDFFlags.DeltaReflection | sides, mi.BSDFFlags.Null | sides]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
-        def _prepare(self, tuned):
+        def _prepare(self, tuned: bool) -> None:
             """All that needs double precision. ``tuned``: to the fraction of the order."""
             for field, least in (("gap", TINY), ("absorption", 0.0), ("surface_rms", 0.0)):
                 if not least <= getattr(self, field) < np.inf:
@@ -139,8 +167,8 @@ def define():
                 shift = np.angle(axial) / np.pi
                 step = 1e-6
                 above, below = (self._mirror_on_axis(1 + h)[0] for h in (step, -step))
-                turn = np.angle(above / below)
-                delay = turn / (2 * step) * self.wavelength / (2 * np.pi * SPEED_OF_LIGHT)
+                change = np.angle(above / below)
+                delay = change / (2 * step) * self.wavelength / (2 * np.pi * SPEED_OF_LIGHT)
             self.order = 2 * self.index * self.gap / self.wavelength
             if tuned:
                 rest = self.order + shift - self.order_fraction
@@ -163,7 +191,7 @@ def define():
             self.m_orders_per_hertz = dr.opaque(mi.Float, per_hertz)
             self.m_reflectivity = dr.opaque(mi.Float, self.reflectivity)
             # factor of the transmitted amplitude by absorption, for two mirrors
-            self.m_left = dr.opaque(mi.Float, 1 - self.absorption / passed)
+            self.m_passed = dr.opaque(mi.Float, 1 - self.absorption / passed)
             self.m_defect_order = 2 * self.index / self.wavelength
             self.m_rms = dr.opaque(mi.Float, self.surface_rms * self.m_defect_order)
             self.m_bow = dr.opaque(mi.Float, self.bow * self.m_defect_order)
@@ -172,34 +200,34 @@ def define():
                 grazing = (1 + self.reflectivity) / 2
                 self._fold(grazing if self.coating else self.reflectivity)
 
-        def _fold(self, strongest):
+        def _fold(self, strongest: float) -> None:
             """Line and defects in Fourier space: the mean of exp(2 pi i n order), n = 0, 1, ..."""
             number = np.arange(1 + int(np.ceil(np.log(NEGLECTED) / np.log(strongest))))
             mean = self.line.characteristic(number / self.free_spectral_range)
             rms, bow = (v * self.m_defect_order for v in (self.surface_rms, self.bow))
             mean = mean * np.exp(-2 * (np.pi * number * rms) ** 2) * np.sinc(number * bow)
-            kept = np.flatnonzero(np.abs(mean) * strongest**number > NEGLECTED)[-1]
+            last = np.flatnonzero(np.abs(mean) * strongest**number > NEGLECTED)[-1]
             self.m_harmonics = [mi.Float(mean.real), mi.Float(mean.imag)]
-            self.m_last = dr.opaque(mi.Int32, int(kept))
+            self.m_last = dr.opaque(mi.Int32, int(last))
 
         # --- mirrors
 
-        def _mirror_on_axis(self, frequency):
+        def _mirror_on_axis(self, frequency: float) -> tuple[complex, complex, complex]:
             """`amplitudes_of` at normal incidence and a frequency over the laser's, in float64."""
             layers = [(n, n * d * 2 * np.pi / self.wavelength * frequency) for n, d in self.coating]
             with np.errstate(all="ignore"):  # NaN of a thick metal is refused as opaque
                 return amplitudes_of(layers, self.index, self.plate_index, np)
 
-        def _mirrors(self, sine2):
-            """Amplitudes of the mirrors for s and p, at an outer angle's sine squared.
+        def _mirrors(self, sine2: Float) -> list[Mirrors]:
+            """Of the transverse field for s and p, at an outer angle's sine squared.
 
-            Of the transverse field: reflection on the side of the gap, transmission through both
-            mirrors, reflection on the outer side.
+            One entry where both are the same.
             """
             if not self.coating:
                 amplitude = dr.sqrt(self.m_reflectivity)
-                passed = (1 - self.m_reflectivity) * self.m_left
-                return [tuple(mi.Complex2f(a, 0) for a in (-amplitude, passed, amplitude))]
+                passed = (1 - self.m_reflectivity) * self.m_passed
+                reflected = mi.Complex2f(amplitude, 0)
+                return [(-reflected, mi.Complex2f(passed, 0), reflected)]
             amplitudes = []
             for polarisation in "sp":
                 layers = []
@@ -208,17 +236,17 @@ def define():
                     cosine = dr.sqrt(1 - sine2 / (index * index))
                     phase = cosine * index * (2 * np.pi * thickness / self.wavelength)
                     layers.append((admittance(index, cosine, polarisation), phase))
-                ends = [
+                gap, plate = (
                     admittance(index, dr.sqrt(1 - sine2 / index**2), polarisation)
                     for index in (self.index, self.plate_index)
-                ]
-                inside, passed, outside = amplitudes_of(layers, *ends, dr)
-                amplitudes.append((inside, passed * self.m_left, outside))
+                )
+                inside, passed, outside = amplitudes_of(layers, gap, plate, dr)
+                amplitudes.append((inside, passed * self.m_passed, outside))
             return amplitudes
 
         # --- light
 
-        def order_of(self, sine2, offset):
+        def order_of(self, sine2: Float, offset: Float) -> Float:
             """Fractional phase order at an outer angle's sine squared and an offset (Hz)."""
             sine2 = sine2 / self.index**2
             cosine = dr.sqrt(1 - sine2)
@@ -229,20 +257,22 @@ def define():
                 + (offset * self.m_orders_per_hertz * cosine)
             )
 
-        def matrices(self, sine2, offset, defects, reflects=True):
-            """Mueller elements (m00, m01, m22, m23) of transmitted and of reflected light.
+        def matrices(
+            self, sine2: Float, offset: Float, defects: Float, reflects: bool = True
+        ) -> tuple[Elements, Elements | None]:
+            """Mueller elements of transmitted and of reflected light.
 
-            About the axis perpendicular to the plane of incidence. ``offset`` (Hz) is the ray's
-            frequency less the laser line's if sampled, the line's shift if folded.
+            ``offset`` (Hz) is the ray's frequency less the laser line's if sampled, the line's
+            shift if folded.
             """
             order = self.order_of(sine2, offset)
             if self.line_shape == "sampled":
                 order += defects
             sine, cosine = dr.sincos(dr.two_pi * (order - dr.round(order)))
-            turn = mi.Complex2f(cosine, sine)
+            phasor = mi.Complex2f(cosine, sine)
             waves = []
             for inside, passed, outside in self._mirrors(sine2):
-                trip = inside * inside * turn
+                trip = inside * inside * phasor
                 waves.append((inside, passed, outside, trip, self._resonance(trip)))
             through = self._products(waves, lambda wave: (0, wave[1]))
             if not reflects:
@@ -251,20 +281,25 @@ def define():
             back = self._products(waves, lambda wave: (wave[2], wave[1] / wave[0]), sign=-1)
             return through, back
 
-        def _resonance(self, trip):
+        def _resonance(self, trip: Complex) -> Complex:
             """Mean of the sum of all round trips, 1 / (1 - trip)."""
             if self.line_shape == "sampled":
                 return 1 / (1 - trip)
             return _power_series(self.m_harmonics, self.m_last, trip)
 
-        def _products(self, waves, amplitudes, sign=1):
+        def _products(
+            self,
+            waves: list[Wave],
+            amplitudes: Callable[[Wave], tuple[Complex, Complex]],
+            sign: int = 1,
+        ) -> Elements:
             """Means of products of s and p amplitudes ``a + b w / (1 - trip)`` as Mueller elements.
 
             With w = 1 for transmitted, w = trip for reflected light (``a`` not 0). The product of
             two sums of round trips is a sum again: (S1 + S2* - 1) / (1 - trip1 trip2*).
             """
 
-            def product(first, second):
+            def product(first: Wave, second: Wave) -> Complex:
                 (a1, b1), (a2, b2) = amplitudes(first), amplitudes(second)
                 trip1, trip2, sum1, sum2 = first[3], second[3], first[4], second[4]
                 both = (sum1 + dr.conj(sum2) - 1) / (1 - trip1 * dr.conj(trip2))
@@ -282,7 +317,9 @@ def define():
 
         # --- Mitsuba
 
-        def sample(self, ctx, si, sample1, sample2, active=True):
+        def sample(
+            self, ctx: Context, si: Interaction, sample1: Float, sample2: Point, active: Mask = True
+        ) -> tuple[Drawn, Spectrum]:
             reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
             transmits = ctx.is_enabled(mi.BSDFFlags.Null, 1)
             bs = mi.BSDFSample3f()
@@ -297,14 +334,14 @@ def define():
                 defects = self.m_bow * (sample2.x - 0.5) + self.m_rms * normal
             sine2 = dr.square(si.wi.x) + dr.square(si.wi.y)
             through, back = self.matrices(sine2, offset, defects, reflects)
-            if reflects and transmits:
+            if back is not None and transmits:
                 bs.pdf = back[0] / (back[0] + through[0])
                 reflected = sample1 < bs.pdf
                 bs.pdf = dr.select(reflected, bs.pdf, 1 - bs.pdf)
                 elements = [dr.select(reflected, b, t) for b, t in zip(back, through, strict=True)]
             else:
-                bs.pdf, reflected = mi.Float(1), mi.Bool(reflects)
-                elements = back if reflects else through
+                bs.pdf, reflected = mi.Float(1), mi.Bool(back is not None)
+                elements = list(through if back is None else back)
             bs.wo = dr.select(reflected, mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z), -si.wi)
             bs.eta = mi.Float(1)
             bs.sampled_component = dr.select(reflected, mi.UInt32(0), mi.UInt32(1))
@@ -314,7 +351,9 @@ def define():
             elements = [e / bs.pdf for e in elements]
             return bs, self._as_spectrum(ctx, si.wi, bs.wo, elements) & active
 
-        def _as_spectrum(self, ctx, wi, wo, elements):
+        def _as_spectrum(
+            self, ctx: Context, wi: Vector, wo: Vector, elements: Sequence[Float]
+        ) -> Spectrum:
             if not mi.is_polarized:
                 return mi.Spectrum(elements[0])
             arriving, leaving = (-wo, wi) if ctx.mode == mi.TransportMode.Radiance else (-wi, wo)
@@ -326,7 +365,7 @@ def define():
             matrix[3, 2], matrix[3, 3] = -m23, m22
             normal = mi.Vector3f(0, 0, 1)
 
-            def axis(direction):
+            def axis(direction: Vector) -> Vector:
                 across = dr.cross(normal, direction)
                 length = dr.norm(across)
                 return dr.select(length > 0, across / length, mi.Vector3f(1, 0, 0))
@@ -341,16 +380,18 @@ def define():
                 mi.mueller.stokes_basis(leaving),
             )
 
-        def eval(self, ctx, si, wo, active=True):
+        def eval(self, ctx: Context, si: Interaction, wo: Vector, active: Mask = True) -> Spectrum:
             return mi.Spectrum(0)
 
-        def pdf(self, ctx, si, wo, active=True):
+        def pdf(self, ctx: Context, si: Interaction, wo: Vector, active: Mask = True) -> Float:
             return mi.Float(0)
 
-        def eval_pdf(self, ctx, si, wo, active=True):
+        def eval_pdf(
+            self, ctx: Context, si: Interaction, wo: Vector, active: Mask = True
+        ) -> tuple[Spectrum, Float]:
             return mi.Spectrum(0), mi.Float(0)
 
-        def description(self) -> dict:
+        def description(self) -> dict[str, float | str]:
             """Entries of an image's header; the order in two parts, exact in float32."""
             return {
                 "gap": self.gap,
@@ -365,13 +406,13 @@ def define():
                 "line_shape": self.line_shape,
             }
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             if self.line is not None:
                 callback.put("line", self.line, mi.ParamFlags.NonDifferentiable)
             for name, value in self.m_changeable.items():
                 callback.put(name, value, mi.ParamFlags.NonDifferentiable)
 
-        def parameters_changed(self, keys=()):
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             now = {name: float(value[0]) for name, value in self.m_changeable.items()}
             tuned = now["order_fraction"] != self.order_fraction
             before = {name: getattr(self, name) for name in now}
@@ -381,7 +422,7 @@ def define():
                 self._set(before, tuned=False)
                 raise
 
-        def _set(self, values, tuned):
+        def _set(self, values: dict[str, float], tuned: bool) -> None:
             for name, value in values.items():
                 setattr(self, name, value)
             self._prepare(tuned)
@@ -389,7 +430,7 @@ def define():
             for name, array in self.m_changeable.items():
                 array[:] = mi.Float64(getattr(self, name))
 
-        def to_string(self):
+        def to_string(self) -> str:
             return (
                 f"Etalon[order={self.order_on_axis:.6f}, gap={self.gap:.9g} m, "
                 f"free_spectral_range={self.free_spectral_range:g} Hz, "
@@ -400,7 +441,7 @@ def define():
 
 
 @dr.syntax
-def _power_series(harmonics, last, z):
+def _power_series(harmonics: Sequence[Float], last: Int, z: Complex) -> Complex:
     """Sum of complex coefficients (real, imaginary arrays) times powers of z, by Horner's rule."""
     total, k = mi.Complex2f(0, 0), mi.Int32(last)
     while k >= 0:

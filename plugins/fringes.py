@@ -42,6 +42,8 @@ of an etalon are split in two parts, exact in single precision, when it is loade
 """
 
 import itertools
+from collections.abc import Sequence
+from typing import NoReturn
 
 import drjit as dr
 import mitsuba as mi
@@ -49,11 +51,29 @@ import numpy as np
 
 from .bodies import first_hit, name_of, scene_extent, scene_of
 from .parameters import choice, fail, whole
+from .passes import Batches, Progress, stored_passes
 from .physical import Physical
 from .polarization import horizontal_axis, rotate_stokes
 from .random_numbers import generator, pair
 from .registration import register
 from .supported import check_sensor
+from .variant_types import (
+    Context,
+    Emitter,
+    Float,
+    Generator,
+    Mask,
+    Parameters,
+    Properties,
+    Ray,
+    Scene,
+    Sensor,
+    Spectrum,
+    Stokes,
+    Tensor,
+    UInt,
+    Vector,
+)
 
 NAME, KIND = "fringes", "integrator"
 
@@ -62,30 +82,37 @@ STOKES = ("S0", "S1", "S2", "S3")
 OFFSET = 2e-4
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class Fringes(mi.CppADIntegrator):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             self.estimator = choice(
                 props, NAME, "estimator", "camera", ("camera", "forward", "analog")
             )
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 2)
             self.physical = Physical(NAME)
-            # called with (paths done, paths in all) after every pass, when set
-            self.progress = None
-            # stores finished passes, when set; see gated_volpath
-            self.batches = None
+            # set by whoever renders
+            self.progress: Progress | None = None
+            self.batches: Batches | None = None
 
-        def aov_names(self):
+        def aov_names(self) -> list[str]:
             return []
 
         def quantities(self) -> list[str]:
             """Names of the last axis of the rendered tensor."""
             return [*STOKES, "S0_stderr"]
 
-        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        def render(
+            self,
+            scene: Scene,
+            sensor: Sensor | int = 0,
+            seed: int = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Tensor:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             if not hasattr(sensor, "sample_towards_scene"):
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'ccd'")
@@ -95,7 +122,7 @@ def define():
             check_sensor(NAME, sensor)
             self.physical.check(scene, sensor)
             _check_straight(scene)
-            _check_apart(scene, source, sensor)
+            _check_separation(scene, source, sensor)
             paths = int(spp) or sensor.sampler().sample_count()
             if self.estimator == "camera" and not 2 <= paths <= self.samples_per_pass:
                 fail(NAME, "sample_count", paths, f"2 to samples_per_pass, {self.samples_per_pass}")
@@ -110,11 +137,26 @@ def define():
                 dr.scatter(image, channel, pixel + index)
             return mi.TensorXf(image, (height, width, len(channels)))
 
-        def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        def render_backward(
+            self,
+            scene: Scene,
+            params: Parameters,
+            grad_in: Tensor,
+            sensor: Sensor | int = 0,
+            seed: int = 0,
+            spp: int = 0,
+        ) -> NoReturn:
             """Refused: see `render_forward`."""
             _no_gradients()
 
-        def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        def render_forward(
+            self,
+            scene: Scene,
+            params: Parameters,
+            sensor: Sensor | int = 0,
+            seed: int = 0,
+            spp: int = 0,
+        ) -> NoReturn:
             """Refused: the order, 77 000, needs more than single precision has.
 
             A plugin splits it into two parts when it is loaded, where gradients are lost.
@@ -123,9 +165,11 @@ def define():
 
         # --- both directions
 
-        def _camera(self, scene, source, sensor, seed, paths, pixels):
+        def _camera(
+            self, scene: Scene, source: Emitter, sensor: Sensor, seed: UInt, paths: int, pixels: int
+        ) -> list[Float]:
             """Mean and standard error over the paths of each pixel, all of them in one pass."""
-            before, channels = self._kept(pixels)
+            before, channels = self._stored(pixels)
             at_once = max(1, self.samples_per_pass // paths)
             for index, first in enumerate(range(0, pixels, at_once)):
                 if index < before:
@@ -161,10 +205,12 @@ def define():
                 self._report(index + 1, first + count, pixels, channels)
             return channels
 
-        def _forward(self, scene, source, sensor, seed, paths, pixels):
+        def _forward(
+            self, scene: Scene, source: Emitter, sensor: Sensor, seed: UInt, paths: int, pixels: int
+        ) -> list[Float]:
             """Light accumulated in the pixels where it arrives."""
             total = paths * pixels
-            before, sums = self._kept(pixels)
+            before, sums = self._stored(pixels)
             context = mi.BSDFContext(mi.TransportMode.Importance)
             width = dr.opaque(mi.UInt32, sensor.film().size().x)
             for index, first in enumerate(range(0, total, self.samples_per_pass)):
@@ -200,21 +246,20 @@ def define():
             variance = dr.maximum(squares - mean, 0)
             return [*(s * energy for s in stokes), dr.sqrt(variance) * energy]
 
-        def _kept(self, pixels):
+        def _stored(self, pixels: int) -> tuple[int, list[Float]]:
             """Number of passes stored by an earlier run, and their results."""
-            passes, arrays = self.batches.kept() if self.batches else (0, {})
-            # passes of another size, for another machine's memory, end at other paths
-            if not passes or int(arrays.get("samples_per_pass", -1)) != self.samples_per_pass:
+            passes, arrays = stored_passes(self.batches, self.samples_per_pass)
+            if not passes:
                 return 0, [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
             return passes, [mi.Float(row) for row in arrays["values"]]
 
-        def _report(self, passes, done, total, values):
+        def _report(self, passes: int, done: int, total: int, values: Sequence[Float]) -> None:
             dr.eval(values)
             if self.progress or self.batches:
                 dr.sync_thread()
             if self.batches and done < total:
                 size = np.array(self.samples_per_pass)
-                self.batches.keep(
+                self.batches.store(
                     passes,
                     lambda: {
                         "values": np.stack([value.numpy() for value in values]),
@@ -224,14 +269,14 @@ def define():
             if self.progress:
                 self.progress(done, total)
 
-        def to_string(self):
+        def to_string(self) -> str:
             return f"Fringes[estimator={self.estimator}]"
 
     return Fringes
 
 
 @dr.syntax
-def _surfaces(scene, ray, rng, context, active):
+def _surfaces(scene: Scene, ray: Ray, rng: Generator, context: Context, active: Mask) -> Spectrum:
     """Mueller matrix of all surfaces along a line, for light of the source.
 
     From the source's axes to those of the light that arrives, both Mitsuba's own; a single factor
@@ -251,13 +296,13 @@ def _surfaces(scene, ray, rng, context, active):
         else:
             weight = matrix * si.to_world_mueller(weight, si.wi, si.wi)
         matrix = dr.select(active, weight, matrix)
-        left = ray.maxt - si.t
+        rest = ray.maxt - si.t
         ray = si.spawn_ray(ray.d)
-        ray.maxt = left
+        ray.maxt = rest
     return matrix
 
 
-def _applied(matrix, stokes):
+def _applied(matrix: Spectrum, stokes: Stokes) -> Stokes:
     """The Stokes vector behind a matrix; intensity alone in unpolarised variants."""
     if not mi.is_polarized:
         return [matrix[0] * stokes[0], mi.Float(0), mi.Float(0), mi.Float(0)]
@@ -267,13 +312,13 @@ def _applied(matrix, stokes):
     ]
 
 
-def _about_horizontal(stokes, direction):
+def _about_horizontal(stokes: Stokes, direction: Vector) -> Stokes:
     """The Stokes vector about the horizontal axis instead of Mitsuba's."""
     axis = mi.mueller.stokes_basis(direction)
-    return list(rotate_stokes(stokes, direction, axis, horizontal_axis(direction)))
+    return rotate_stokes(stokes, direction, axis, horizontal_axis(direction))
 
 
-def _reach(scene, sensor) -> float:
+def _reach(scene: Scene, sensor: Sensor) -> float:
     """A distance from the stop beyond which there are no surfaces, m."""
     box = scene.bbox()
     if not box.valid():
@@ -284,7 +329,7 @@ def _reach(scene, sensor) -> float:
     return 1.1 * (sum(v * v for v in offset) ** 0.5 + float(sphere.radius)) + 1e-3
 
 
-def _no_gradients():
+def _no_gradients() -> NoReturn:
     fail(
         NAME,
         "gradients",
@@ -293,7 +338,7 @@ def _no_gradients():
     )
 
 
-def _check_straight(scene):
+def _check_straight(scene: Scene) -> None:
     """Refuse surfaces that refract light, which would be ignored."""
     kinds = mi.BSDFFlags
     bending = kinds.DiffuseTransmission | kinds.GlossyTransmission | kinds.DeltaTransmission
@@ -303,7 +348,7 @@ def _check_straight(scene):
             fail(NAME, "scene", shape.id(), "surfaces that light passes straight or not at all")
 
 
-def _check_apart(scene, source, sensor):
+def _check_separation(scene: Scene, source: Emitter, sensor: Sensor) -> None:
     """Refuse surfaces so close behind another one that a ray which leaves that one misses them."""
     shapes = scene.shapes()
     if len(shapes) < 2:
@@ -317,13 +362,13 @@ def _check_apart(scene, source, sensor):
         for shape in shapes
     ]
     # Mitsuba moves the start of a ray by this fraction of its coordinates and 1 m
-    apart = OFFSET * (1 + np.abs(scene_extent(shapes)).max())
+    least = OFFSET * (1 + np.abs(scene_extent(shapes)).max())
     for first, second in itertools.combinations(range(len(shapes)), 2):
         with np.errstate(invalid="ignore"):
             gap = np.abs(places[first] - places[second])
-        if (gap[np.isfinite(gap)] < apart).any():
+        if (gap[np.isfinite(gap)] < least).any():
             names = f"{name_of(shapes[first])} and {name_of(shapes[second])}"
-            fail(NAME, "scene", names, f"surfaces at least {apart:.2g} m apart")
+            fail(NAME, "scene", names, f"surfaces at least {least:.2g} m apart")
 
 
 register(KIND, NAME, define)

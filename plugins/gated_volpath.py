@@ -120,6 +120,8 @@ import contextlib
 import functools
 import gc
 import warnings
+from collections.abc import Iterator, Mapping
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -128,31 +130,37 @@ import numpy as np
 from .bounds import Bounds
 from .laser import channel_of
 from .parameters import choice, fail, whole
+from .passes import Batches, Progress, stored_passes
 from .path_sampling import Lidar
 from .physical import Physical
 from .registration import register
 from .supported import check_air, check_supported
 from .surfaces import media_of
+from .variant_types import Float, Parameters, Properties, Scene, Sensor, Tensor, UInt
 
 # how samples scatter and where they fly next is in `path_sampling`, of both estimators
 NAME, KIND = "gated_volpath", "integrator"
 
 STOKES = ("S0", "S1", "S2", "S3")
+Moments: TypeAlias = tuple[int, list[Float], list[Float], Float]
+"""Of the samples of some cells: their number, means, summed products of deviations and the largest
+squared deviation of S0. Numbers by cell, but for the first."""
+
 # products of deviations that are summed: S0's alone, or all that the errors of S0 and S1 need
 PRODUCTS = ((0, 0), (1, 1), (0, 1))
 # Deviations are multiplied by it before they are squared: a signal of 1e-19 has squares that
 # underflow in single precision. A power of two, so that nothing is rounded.
 MAGNIFIED = 2.0**50
-# Share of one sample in the variance of S0 from which on the standard error is not trusted. A
-# little less than one half: of two samples each has exactly that.
+# Fraction of the variance of S0 that comes from one sample from which on the standard error is
+# unreliable. A little less than one half: of two samples each has exactly that.
 HALF = 0.4999
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class GatedVolpath(mi.CppADIntegrator):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             self.max_order = whole(props, NAME, "max_order", 1, 1)
             self.estimator = choice(props, NAME, "estimator", "gated", ("gated", "analog"))
@@ -160,17 +168,16 @@ def define():
             self.covariance = bool(props.get("covariance", False))
             self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
-            # pixels of the last image that receive light, and those of them that cannot be trusted
+            # pixels of the last image that receive light, and those of them whose standard error
+            # is unreliable
             self.lit, self.untrusted = 0, 0
             self.physical = Physical(NAME)
             self.bounds = Bounds()
-            # called with (samples done, samples in all) after every pass, when set
-            self.progress = None
-            # stores finished passes, when set: `kept()` returns their number and arrays by name;
-            # `keep` takes their number and a function that returns the arrays
-            self.batches = None
+            # set by whoever renders
+            self.progress: Progress | None = None
+            self.batches: Batches | None = None
 
-        def aov_names(self):
+        def aov_names(self) -> list[str]:
             return []
 
         def quantities(self) -> list[str]:
@@ -181,7 +188,7 @@ def define():
             shares = ("S0_largest_share",) if self.shares else ()
             return [*STOKES, "S0_stderr", *by_order, *more, *shares]
 
-        def channel_names(self, sensor) -> list[str]:
+        def channel_names(self, sensor: Sensor) -> list[str]:
             """Names of the last axis of the rendered tensor."""
             return [
                 f"gate{gate:03d}.{quantity}"
@@ -189,22 +196,30 @@ def define():
                 for quantity in self.quantities()
             ]
 
-        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        def render(
+            self,
+            scene: Scene,
+            sensor: Sensor | int = 0,
+            seed: int = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Tensor:
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates, beams = sensor.gate_count, sensor.beam_count
             quantities = len(self.quantities())
             trace = self._gated if self.estimator == "gated" else self._analog
-            before, arrays = self.batches.kept() if self.batches else (0, {})
-            if arrays and int(arrays.get("samples_per_pass", -1)) != self.samples_per_pass:
-                before, arrays = 0, {}  # passes of another size
+            before, arrays = stored_passes(self.batches, self.samples_per_pass)
             image = _float(arrays.get("image"), beams * gates * quantities)
             done, total = 0, _moments(arrays)
-            # of the finished pixels that receive light, how many there are, and are not trusted
+            # of the finished pixels that receive light: how many there are, and how many of them
+            # have an unreliable standard error
             counts = np.array(arrays.get("counts", (0, 0)))
             with dr.suspend_grad(), _nothing_freed():
                 passes = enumerate(self._passes(sensor, samples), 1)
                 for number, (first, count, start, now, complete) in passes:
                     done += count * now * self._unit(sensor)
+                    # random numbers depend on beam and number alone: stored passes are skipped
                     if number <= before:
                         continue
                     part = trace(scene, sensor, seed, first, count, start, now)
@@ -215,34 +230,48 @@ def define():
                         for value, place in zip(results, cells, strict=False):
                             dr.scatter(image, value, place)
                         dr.eval(image)
-                        lit, share = results[0].numpy() > 0, results[-1].numpy()
-                        counts += lit.sum(), (lit & (share >= HALF)).sum()
+                        lit, fraction = results[0].numpy() > 0, results[-1].numpy()
+                        counts += lit.sum(), (lit & (fraction >= HALF)).sum()
                         total = None
+                    # kernels run asynchronously: what is reported or stored must have been computed
                     if self.progress or self.batches:
                         dr.eval(image, total)
                         dr.sync_thread()
                     if self.batches and done < beams * samples:
-                        store = functools.partial(self._kept, image, total, counts.copy())
-                        self.batches.keep(number, store)
+                        made = functools.partial(
+                            _arrays, image, total, counts.copy(), self.samples_per_pass
+                        )
+                        self.batches.store(number, made)
                     if self.progress:
                         self.progress(done, beams * samples)
             self.lit, self.untrusted = (int(count) for count in counts)
             if not self.shares:
-                _warn_of_untrusted(self.lit, self.untrusted)
+                _warn_of_unreliable(self.lit, self.untrusted)
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
 
-        def _kept(self, image, total, counts):
-            made_of = {"samples_per_pass": np.array(self.samples_per_pass), "counts": counts}
-            return _arrays(image, total) | made_of
-
-        def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        def render_backward(
+            self,
+            scene: Scene,
+            params: Parameters,
+            grad_in: Tensor,
+            sensor: Sensor | int = 0,
+            seed: int = 0,
+            spp: int = 0,
+        ) -> None:
             """Gradients of the scene from those of the image (of S0 to S3; S0_stderr has none)."""
             for means, places in self._differentiable(scene, sensor, seed, spp):
                 grads = [dr.gather(mi.Float, grad_in.array, place) for place in places]
                 dr.backward(sum(dr.sum(m * g) for m, g in zip(means, grads, strict=True)))
 
-        def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        def render_forward(
+            self,
+            scene: Scene,
+            params: Parameters,
+            sensor: Sensor | int = 0,
+            seed: int = 0,
+            spp: int = 0,
+        ) -> Tensor:
             """Gradients of the image (of S0 to S3) from those of the scene."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             width, height = sensor.film().size()
@@ -254,7 +283,9 @@ def define():
                     dr.scatter_reduce(dr.ReduceOp.Add, image, dr.grad(mean), place)
             return mi.TensorXf(image, shape)
 
-        def _differentiable(self, scene, sensor, seed, spp):
+        def _differentiable(
+            self, scene: Scene, sensor: Sensor | int, seed: int, spp: int
+        ) -> Iterator[tuple[list[Float], list[UInt]]]:
             """Means of passes, differentiable in the parameters, and their image indices."""
             if self.estimator != "gated" or self.max_order > 1:
                 fail(
@@ -266,15 +297,19 @@ def define():
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
             for first, count, start, now, _ in self._passes(sensor, samples):
+                # Mitsuba's derivatives call this with gradients suspended
                 with dr.resume_grad():
                     _, means, *_ = self._gated(
                         scene, sensor, seed, first, count, start, now, differentiable=True
                     )
+                    # passes of one image are added up: each has its part of the samples
                     fraction = now * gates / samples
                     means = [m * fraction for m in means[: len(STOKES)]]
                     yield means, self._places(first * gates, count * gates)[: len(STOKES)]
 
-        def _prepare(self, scene, sensor, seed, spp):
+        def _prepare(
+            self, scene: Scene, sensor: Sensor | int, seed: int, spp: int
+        ) -> tuple[Sensor, UInt, int]:
             """The sensor, an opaque seed, and the number of samples per beam, all checked."""
             if isinstance(sensor, int):
                 sensor = scene.sensors()[sensor]
@@ -302,11 +337,13 @@ def define():
             dr.make_opaque(seed)  # a new seed compiles nothing
             return sensor, seed, samples
 
-        def _unit(self, sensor) -> int:
+        def _unit(self, sensor: Sensor) -> int:
             """Samples per round: one per gate with the gated estimator."""
             return sensor.gate_count if self.estimator == "gated" else 1
 
-        def _passes(self, sensor, samples):
+        def _passes(
+            self, sensor: Sensor, samples: int
+        ) -> Iterator[tuple[int, int, int, int, bool]]:
             """All beams, a few at a time; many samples of a beam in several passes.
 
             Yields first beam, number of beams, first round, number of rounds, and whether these
@@ -314,6 +351,7 @@ def define():
             """
             beams, unit = sensor.beam_count, self._unit(sensor)
             rounds = samples // unit
+            # at least two, for a variance within the pass
             rounds_at_once = min(rounds, max(2, self.samples_per_pass // unit))
             beams_at_once = max(1, self.samples_per_pass // (rounds_at_once * unit))
             for first in range(0, beams, beams_at_once):
@@ -326,13 +364,23 @@ def define():
                     yield first, min(beams_at_once, beams - first), start, now, last
                     start += now
 
-        def _places(self, first: int, cells: int):
+        def _places(self, first: int, cells: int) -> list[UInt]:
             """Image indices of each quantity for a range of cells (beam by beam, gate by gate)."""
             quantities = len(self.quantities())
             cell = (dr.arange(mi.UInt32, cells) + dr.opaque(mi.UInt32, first)) * quantities
             return [cell + index for index in range(quantities)]
 
-        def _gated(self, scene, sensor, seed, first, count, start, rounds, differentiable=False):
+        def _gated(
+            self,
+            scene: Scene,
+            sensor: Sensor,
+            seed: UInt,
+            first: int,
+            count: int,
+            start: int,
+            rounds: int,
+            differentiable: bool = False,
+        ) -> Moments:
             """Means and summed products of deviations, last collisions forced into the gates."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * gates * rounds)
@@ -346,6 +394,7 @@ def define():
             sample = lidar.emit(seed, beam, number)
 
             low, high = sensor.ranges(sample.frame.n, sample.start)
+            # whole paths, twice the ranges; light emitted later has less of it before the gate
             width = 2 * (high - low) / gates
             near = 2 * (low - sample.delay) + width * gate
             where = sample.rng.next_float32()
@@ -355,6 +404,8 @@ def define():
             )
             dr.eval(stokes, by_order)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
+            # deviations from the pass's own mean: a sum of squares less a square would cancel in
+            # single precision
             off = [
                 MAGNIFIED * (s - dr.gather(mi.Float, m, cell))
                 for s, m in zip(stokes[:2], means[:2], strict=True)
@@ -363,7 +414,16 @@ def define():
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
             return rounds, means + self._per_order(by_order, rounds), deviations, largest
 
-        def _analog(self, scene, sensor, seed, first, count, start, rounds):
+        def _analog(
+            self,
+            scene: Scene,
+            sensor: Sensor,
+            seed: UInt,
+            first: int,
+            count: int,
+            start: int,
+            rounds: int,
+        ) -> Moments:
             """The same, with analog free flights."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * rounds)
@@ -393,15 +453,17 @@ def define():
             number = _opaque(rounds)
             means = [s / number for s in sums]
             large = [MAGNIFIED * mean for mean in means[:2]]
+            # here contributions are scattered to their gates before a mean is known; most are 0,
+            # so that squares exceed the mean's by far and hardly cancel
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
             return rounds, means + self._per_order(by_order, rounds), deviations, largest
 
-        def _products(self):
+        def _products(self) -> tuple[tuple[int, int], ...]:
             """The pairs of Stokes components whose products are summed."""
             return PRODUCTS if self.covariance else PRODUCTS[:1]
 
-        def _per_order(self, by_order, rounds):
+        def _per_order(self, by_order: Float, rounds: int) -> list[Float]:
             if not self.orders:
                 return []
             cells = dr.arange(mi.UInt32, dr.width(by_order) // self.max_order)
@@ -410,14 +472,14 @@ def define():
                 for order in range(self.max_order)
             ]
 
-        def to_string(self):
+        def to_string(self) -> str:
             return f"GatedVolpath[max_order={self.max_order}, estimator={self.estimator}]"
 
     return GatedVolpath
 
 
 @contextlib.contextmanager
-def _nothing_freed():
+def _nothing_freed() -> Iterator[None]:
     """Suspend Python's garbage collection while kernels are recorded.
 
     A scene freed between two virtual calls changes the set of instances that they may call; Dr.Jit
@@ -432,19 +494,25 @@ def _nothing_freed():
             gc.enable()
 
 
-def _opaque(number: float):
+def _opaque(number: float) -> Float:
     """A number that changes from scan to scan without being compiled into a kernel."""
     return dr.opaque(mi.Float, number)
 
 
-def _float(values, size):
+def _float(values: np.ndarray | None, size: int) -> Float:
     """An array of floats, zero where there are none yet."""
     return dr.zeros(mi.Float, size) if values is None else mi.Float(values)
 
 
-def _arrays(image, total):
+def _arrays(
+    image: Float, total: Moments | None, counts: np.ndarray, samples_per_pass: int
+) -> dict[str, np.ndarray]:
     """Finished beams, and the moments of those that are not, for NumPy."""
-    arrays = {"image": image.numpy()}
+    arrays = {
+        "image": image.numpy(),
+        "samples_per_pass": np.array(samples_per_pass),
+        "counts": counts,
+    }
     if total is not None:
         number, means, deviations, largest = total
         arrays |= {
@@ -456,7 +524,7 @@ def _arrays(image, total):
     return arrays
 
 
-def _moments(arrays):
+def _moments(arrays: Mapping[str, np.ndarray]) -> Moments | None:
     """The moments from the arrays of `_arrays`."""
     if "number" not in arrays:
         return None
@@ -464,15 +532,20 @@ def _moments(arrays):
     return int(arrays["number"]), means, deviations, mi.Float(arrays["largest"])
 
 
-def _results(number, means, deviations, largest):
-    """The image's quantities from the moments of all samples, and the largest share after them."""
+def _results(
+    number: int, means: list[Float], deviations: list[Float], largest: Float
+) -> list[Float]:
+    """The image's quantities from the moments of all samples.
+
+    The last one is the fraction of the variance of S0 that comes from one sample.
+    """
     errors = _errors(_opaque(number), deviations)
     whole = deviations[0]
-    share = dr.select(whole > 0, dr.minimum(largest / whole, 1), 0)
-    return [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:], share]
+    fraction = dr.select(whole > 0, dr.minimum(largest / whole, 1), 0)
+    return [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:], fraction]
 
 
-def _merge(first, second):
+def _merge(first: Moments, second: Moments) -> Moments:
     """Moments of two sets of samples together (Chan, Golub & LeVeque 1983)."""
     n1, means1, deviations1, largest1 = first
     n2, means2, deviations2, largest2 = second
@@ -488,7 +561,7 @@ def _merge(first, second):
     return n1 + n2, means, deviations, dr.maximum(largest1, largest2)
 
 
-def _errors(number, deviations):
+def _errors(number: Float, deviations: list[Float]) -> list[Float]:
     """Standard error of S0, and with all three sums that of S1 and their correlation."""
     variances = [dr.maximum(s, 0) / (number * (number - 1.0)) for s in deviations[:2]]
     errors = [dr.sqrt(v) / MAGNIFIED for v in variances]
@@ -498,11 +571,11 @@ def _errors(number, deviations):
     return [*errors, dr.select(both > 0, dr.clip(deviations[2] / both, -1, 1), 0)]
 
 
-def _warn_of_untrusted(lit: int, untrusted: int):
-    if untrusted > 0.01 * lit:
+def _warn_of_unreliable(lit: int, unreliable: int) -> None:
+    if unreliable > 0.01 * lit:
         warnings.warn(
-            f"{NAME}: in {untrusted} of {lit} pixels that receive light one sample carries "
-            "half of the variance or more; their standard errors cannot be trusted; expected more "
+            f"{NAME}: in {unreliable} of {lit} pixels that receive light one sample carries "
+            "half of the variance or more; their standard errors are unreliable; expected more "
             "samples",
             stacklevel=3,
         )

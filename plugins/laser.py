@@ -45,6 +45,7 @@ unbiased. Spectral variants draw wavelengths at random, of which none is the las
 """
 
 import math
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -53,15 +54,28 @@ from .parameters import at_least, check_pose, fail, pose, positive
 from .polarization import rotate_stokes, transverse
 from .random_numbers import beam_radius_squared
 from .registration import register
+from .variant_types import (
+    Box,
+    Drawn,
+    Float,
+    Interaction,
+    Mask,
+    Point,
+    Properties,
+    Ray,
+    Spectrum,
+    Traversal,
+    Vector,
+)
 
 NAME, KIND = "laser", "emitter"
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class Laser(mi.Emitter):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             radius = positive(props, NAME, "beam_radius", 0.1)
             cut = positive(props, NAME, "beam_cut", math.inf)
@@ -81,14 +95,16 @@ def define():
             """Energy of a pulse, J."""
             return float(self.m_energy[0])
 
-        def _derive(self):
+        def _derive(self) -> None:
             dr.make_opaque(self.m_energy, self.m_radius, self.m_cut, self.m_divergence, self.m_pose)
             # fraction of an uncut beam inside the aperture; radii are drawn from that fraction
             cut = self.m_cut[0] / self.m_radius[0]
             self.m_inside = dr.opaque(mi.Float, -math.expm1(-2 * cut**2))
             self.m_divergence_half = dr.opaque(mi.Float, self.m_divergence[0] * 1e-3 / 2)
 
-        def sample_local(self, sample_position, sample_direction):
+        def sample_local(
+            self, sample_position: Point, sample_direction: Point
+        ) -> tuple[Point, Vector]:
             """Origin and direction of a ray in the laser's own frame, axis along +z."""
             origin = mi.Point3f(0, 0, 0)
             radius = self.m_radius * dr.sqrt(beam_radius_squared(self.m_inside, sample_position.x))
@@ -99,12 +115,14 @@ def define():
             sine, cosine = dr.sincos(dr.two_pi * sample_direction.y)
             return origin, dr.normalize(mi.Vector3f(tangent * cosine, tangent * sine, 1))
 
-        def _fluence(self, r2):
+        def _fluence(self, r2: Float) -> Float:
             """Of a pulse of 1 J over the aperture, J/m^2, at a squared distance from its middle."""
             scale2 = dr.square(self.m_radius)
             return 2 * dr.inv_pi / (scale2 * self.m_inside) * dr.exp(-2 * r2 / scale2)
 
-        def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        def sample_ray(
+            self, time: Float, sample1: Float, sample2: Point, sample3: Point, active: Mask = True
+        ) -> tuple[Ray, Spectrum]:
             """A ray of the beam; the weight's first column is its Stokes vector, in joules."""
             origin, local = self.sample_local(sample2, sample3)
             to_world = self.m_pose
@@ -112,7 +130,7 @@ def define():
             ray = mi.Ray3f(to_world @ origin, direction, time, self.wavelengths())
             return ray, self._polarised(self.m_energy, direction)
 
-        def _polarised(self, value, direction):
+        def _polarised(self, value: Float, direction: Vector) -> Spectrum:
             """Light of that intensity along a direction, with the laser's Stokes vector."""
             if not mi.is_polarized:
                 return mi.Spectrum(value)
@@ -127,7 +145,9 @@ def define():
                 weight[row, 0] = component * value
             return weight
 
-        def sample_direction(self, it, sample, active=True):
+        def sample_direction(
+            self, it: Interaction, sample: Point, active: Mask = True
+        ) -> tuple[Drawn, Spectrum]:
             """A place of the aperture that lights a point, and the fluence that it brings there."""
             place = self.m_pose.inverse() @ it.p
             half = self.m_divergence_half
@@ -147,7 +167,7 @@ def define():
             ds.d *= dr.rcp(ds.dist)
             return ds, self.eval_direction(it, ds, active)
 
-        def eval_direction(self, it, ds, active=True):
+        def eval_direction(self, it: Interaction, ds: Drawn, active: Mask = True) -> Spectrum:
             """Fluence (J/m^2) at a point from a place of the aperture, over the place's density.
 
             With places drawn from the aperture's fluence f, the energy times the density of
@@ -179,11 +199,13 @@ def define():
             value = dr.select(active & (place.z > 0), value * self.m_energy, 0)
             return self._polarised(value, -ds.d)
 
-        def pdf_direction(self, it, ds, active=True):
+        def pdf_direction(self, it: Interaction, ds: Drawn, active: Mask = True) -> Float:
             """0: no other way of sampling finds the laser."""
             return mi.Float(0)
 
-        def sample_position(self, time, sample, active=True):
+        def sample_position(
+            self, time: Float, sample: Point, active: Mask = True
+        ) -> tuple[Drawn, Float]:
             """A place of the aperture, by its fluence, and the inverse of its density (m^2)."""
             origin, _ = self.sample_local(sample, sample)
             ps = dr.zeros(mi.PositionSample3f)
@@ -193,11 +215,13 @@ def define():
             ps.pdf = self._fluence(dr.squared_norm(mi.Vector2f(origin.x, origin.y)))
             return ps, dr.rcp(ps.pdf)
 
-        def sample_wavelengths(self, si, sample, active=True):
+        def sample_wavelengths(
+            self, si: Interaction, sample: Float, active: Mask = True
+        ) -> tuple[Float, Spectrum]:
             """The laser's own."""
             return self.wavelengths(), mi.Spectrum(1)
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             super().traverse(callback)
             kind = mi.ParamFlags.NonDifferentiable
             callback.put("pulse_energy", self.m_energy, kind)
@@ -206,7 +230,7 @@ def define():
             callback.put("divergence_full_mrad", self.m_divergence, kind)
             callback.put("to_world", self.m_pose, kind)
 
-        def parameters_changed(self, keys=()):
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             for field, value, least in (
                 ("pulse_energy", self.m_energy[0], "above 0"),
                 ("beam_radius", self.m_radius[0], "above 0"),
@@ -219,18 +243,18 @@ def define():
             check_pose(self.m_pose, NAME)
             self._derive()
 
-        def wavelengths(self):
+        def wavelengths(self) -> Float:
             """The laser's wavelength in nm, for a ray (empty outside spectral variants)."""
             kind = type(mi.Ray3f().wavelengths)
             return kind(self.wavelength * 1e9) if mi.is_spectral else kind()
 
-        def eval(self, si, active=True):
+        def eval(self, si: Interaction, active: Mask = True) -> Spectrum:
             return mi.Spectrum(0)
 
-        def bbox(self):
+        def bbox(self) -> Box:
             return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
 
-        def to_string(self):
+        def to_string(self) -> str:
             return (
                 f"Laser[wavelength={self.wavelength:g} m, pulse_energy={self.pulse_energy:g} J, "
                 f"beam_radius={self.m_radius[0]:g} m, "
@@ -245,17 +269,14 @@ def channel_of(wavelength: float) -> int:
     return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0
 
 
-def _stokes(text) -> tuple[float, float, float, float]:
+def _stokes(text: object) -> tuple[float, float, float, float]:
     try:
-        values = [float(v) for v in str(text).replace(",", " ").split()]
+        i, q, u, v = (float(word) for word in str(text).replace(",", " ").split())
     except ValueError:
-        values = []
-    if len(values) != 4:
         fail(NAME, "stokes", text, "four numbers I, Q, U, V, for example '1, 1, 0, 0'")
-    degree = math.hypot(*values[1:])
-    if values[0] != 1 or not degree <= 1 + 1e-6:
+    if i != 1 or not math.hypot(q, u, v) <= 1 + 1e-6:
         fail(NAME, "stokes", text, "I = 1 and Q^2 + U^2 + V^2 <= 1")
-    return tuple(values)
+    return i, q, u, v
 
 
 register(KIND, NAME, define)

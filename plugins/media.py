@@ -3,14 +3,18 @@
 import drjit as dr
 import mitsuba as mi
 
-from .bounds import UNIFORM, UNKNOWN, leave, locate
+from .bounds import UNIFORM, UNKNOWN, Bounds, leave, locate
+from .surfaces import Air
+from .variant_types import Float, Generator, Interaction, Mask, MediumPtr, Point, Vector
 
 # Optical depth along a segment by which the control variate may exceed the least extinction, and
 # the majorant over the largest difference of extinction and control. Both only concern efficiency.
 RAISED, MAJORANT = 0.5, 2.0
 
 
-def interaction(medium, position, direction, wavelengths, time):
+def interaction(
+    medium: MediumPtr, position: Point, direction: Vector, wavelengths: Float, time: Float
+) -> Interaction:
     """The medium interaction of light that arrives at ``position`` along ``direction``."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p = position
@@ -22,26 +26,28 @@ def interaction(medium, position, direction, wavelengths, time):
     return mei
 
 
-def coefficients(medium, mei, channel, active):
+def coefficients(
+    medium: MediumPtr, mei: Interaction, channel: int, active: Mask
+) -> tuple[Float, Float]:
     """Scattering and extinction coefficient (m^-1) at an interaction."""
     scattering, _, extinction = medium.get_scattering_coefficients(mei, active)
     return scattering[channel], extinction[channel]
 
 
 def transmittance(
-    air,
-    bounds,
-    medium,
-    origin,
-    direction,
-    distance,
-    channel,
-    wavelengths,
-    time,
-    rng,
-    active,
-    differentiable=False,
-):
+    air: Air,
+    bounds: Bounds,
+    medium: MediumPtr,
+    origin: Point,
+    direction: Vector,
+    distance: Float,
+    channel: int,
+    wavelengths: Float,
+    time: Float,
+    rng: Generator,
+    active: Mask,
+    differentiable: bool = False,
+) -> tuple[Float, MediumPtr]:
     """Unbiased estimate of the transmittance along a straight line, and the medium at its end.
 
     Homogeneous media in closed form, others by residual ratio tracking (Novak et al. 2014, ACM TOG
@@ -54,6 +60,8 @@ def transmittance(
     estimated at one uniform place of the line, independent of the estimate of T.
     """
     where = rng.next_float32(active) * distance if differentiable else mi.Float(-1)
+    # a loop cannot be differentiated backwards without storing its states: the derivative is
+    # estimated outside of it
     with dr.suspend_grad():
         value, end, between = _walk(
             air,
@@ -74,14 +82,26 @@ def transmittance(
         inside = active & (between != None)
         _, extinction = coefficients(between, mei, channel, inside)
         depth = dr.select(inside, extinction * distance, 0)
+        # 1, whose derivative is that of -depth
         value *= dr.exp(dr.detach(depth) - depth)
     return value, end
 
 
 @dr.syntax
 def _walk(
-    air, bounds, medium, origin, direction, distance, where, channel, wavelengths, time, rng, active
-):
+    air: Air,
+    bounds: Bounds,
+    medium: MediumPtr,
+    origin: Point,
+    direction: Vector,
+    distance: Float,
+    where: Float,
+    channel: int,
+    wavelengths: Float,
+    time: Float,
+    rng: Generator,
+    active: Mask,
+) -> tuple[Float, MediumPtr, MediumPtr]:
     """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
@@ -96,35 +116,45 @@ def _walk(
         inside = active & (medium != None)
         kind = bounds.kind(medium)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
+        # in closed form, without a random number
         uniform = inside & (kind == UNIFORM)
         _, extinction = coefficients(medium, mei, channel, uniform)
         depth = dr.select(uniform, extinction * (end - travelled), 0)
+        # known when the kernel is recorded: without a varying medium there is no inner loop
         if dr.hint(bounds.varies, mode="scalar"):
             tracking = inside & ~uniform
             unknown = tracking & (kind == UNKNOWN)
+            # a volume of another kind has no blocks: one majorant everywhere
             whole = medium.get_majorant(mei, unknown)[channel]
             start, step, counts, first = bounds.enter(medium, origin, direction)
             block = locate(start, step, counts, travelled)
-            left = -dr.log(1 - rng.next_float32(tracking))
+            flight = -dr.log(1 - rng.next_float32(tracking))
+            # per metre, so that the segment's excess over its least extinction is RAISED at most
             raised = RAISED / (end - travelled)
             while dr.hint(tracking, label="ratio tracking"):
                 least, mean, most = bounds.extinction(block, counts, first)
                 control = dr.minimum(mean, least + raised)
+                # twice the largest difference: factors 1 - difference / majorant stay within 0.5
+                # and 1.5, so that their product has a bounded variance and is never negative
                 majorant = MAJORANT * dr.maximum(most - control, control - least)
                 majorant = dr.select(unknown, whole, majorant)
                 stop, onward = leave(start, step, counts, block)
                 stop = dr.clip(stop, travelled, end)
-                # optical depths of the majorant: in the block, and left before the next collision
-                free = majorant * (stop - travelled)
-                collides = tracking & (left < free)
-                place = dr.select(collides, travelled + left / majorant, stop)
+                # in optical depths of the majorant, as is ``flight``: what is not used up in this
+                # block goes on in the next, whose majorant is another one
+                in_block = majorant * (stop - travelled)
+                collides = tracking & (flight < in_block)
+                place = dr.select(collides, travelled + flight / majorant, stop)
                 depth += dr.select(tracking, control * (place - travelled), 0)
                 mei = interaction(medium, origin + direction * place, direction, wavelengths, time)
                 _, extinction = coefficients(medium, mei, channel, collides)
                 value = dr.select(collides, value * (1 - (extinction - control) / majorant), value)
-                left = dr.select(collides, -dr.log(1 - rng.next_float32(collides)), left - free)
+                flight = dr.select(
+                    collides, -dr.log(1 - rng.next_float32(collides)), flight - in_block
+                )
                 block = dr.select(collides, block, onward)
                 travelled = dr.select(tracking, place, travelled)
+                # a product that is 0 stays 0
                 tracking &= (value > 0) & (collides | (stop < end))
         value = dr.select(hit & ~passes, 0, value * dr.exp(-depth))
         medium = dr.select(hit, behind, medium)
@@ -135,8 +165,18 @@ def _walk(
 
 @dr.syntax
 def collision(
-    air, bounds, medium, origin, direction, distance, channel, wavelengths, time, rng, active
-):
+    air: Air,
+    bounds: Bounds,
+    medium: MediumPtr,
+    origin: Point,
+    direction: Vector,
+    distance: Float,
+    channel: int,
+    wavelengths: Float,
+    time: Float,
+    rng: Generator,
+    active: Mask,
+) -> tuple[Float, MediumPtr, Mask]:
     """Distance to the first real collision by delta tracking, its medium, and whether it happened.
 
     Not forced: a sample without a collision within ``distance``, or at an opaque surface, is lost.
@@ -150,25 +190,28 @@ def collision(
         end, hit, passes, medium, behind = air.next_surface(
             crossings, origin, direction, travelled, distance, medium, active
         )
+        # also through uniform media: samples are drawn from the physical distribution, which is
+        # what the closed form of `transmittance` is validated against
         tracking = active & (medium != None)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
         blind = tracking & (bounds.kind(medium) <= UNIFORM)
         whole = medium.get_majorant(mei, blind)[channel]
         start, step, counts, first = bounds.enter(medium, origin, direction)
         block = locate(start, step, counts, travelled)
-        left = -dr.log(1 - rng.next_float32(tracking))
+        flight = -dr.log(1 - rng.next_float32(tracking))
         while dr.hint(tracking, label="delta tracking"):
             majorant = dr.select(blind, whole, bounds.extinction(block, counts, first).z)
             stop, onward = leave(start, step, counts, block)
             stop = dr.clip(stop, travelled, end)
-            free = majorant * (stop - travelled)
-            collides = tracking & (left < free)
-            place = dr.select(collides, travelled + left / majorant, stop)
+            in_block = majorant * (stop - travelled)
+            collides = tracking & (flight < in_block)
+            place = dr.select(collides, travelled + flight / majorant, stop)
             mei = interaction(medium, origin + direction * place, direction, wavelengths, time)
             _, extinction = coefficients(medium, mei, channel, collides)
+            # the others are null collisions, behind which the flight goes on unchanged
             real = collides & (rng.next_float32(collides) * majorant < extinction)
             found |= real
-            left = dr.select(collides, -dr.log(1 - rng.next_float32(collides)), left - free)
+            flight = dr.select(collides, -dr.log(1 - rng.next_float32(collides)), flight - in_block)
             block = dr.select(collides, block, onward)
             travelled = dr.select(tracking, place, travelled)
             tracking &= ~real & (collides | (stop < end))

@@ -39,6 +39,7 @@ below L. ``data`` (with a last axis of one channel, differentiable), ``time_star
     </medium>
 """
 
+from collections.abc import Sequence
 from itertools import product
 
 import drjit as dr
@@ -48,15 +49,16 @@ import numpy as np
 from .parameters import fail, number
 from .parameters import table as read_table
 from .registration import register
+from .variant_types import Cell, Float, Interaction, Mask, Properties, Spectrum, Table, Traversal
 
 NAME, KIND = "moving_volume", "volume"
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class MovingVolume(mi.Volume):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             for field in ("data", "time_start", "time_stop"):
                 if field not in props:
@@ -76,7 +78,7 @@ def define():
             dr.make_opaque(self.m_to_local, self.m_offset)
             self._check()
 
-        def eval_1(self, it, active=True):
+        def eval_1(self, it: Interaction, active: Mask = True) -> Float:
             """Values at the places and times of interactions."""
             time = (it.time - self.m_start) * self.m_rate
             place = self.m_to_local @ mi.Vector3f(it.p) + self.m_offset
@@ -102,34 +104,34 @@ def define():
                 for index, weight in lookups
             )
 
-        def eval(self, it, active=True):
+        def eval(self, it: Interaction, active: Mask = True) -> Spectrum:
             return mi.UnpolarizedSpectrum(self.eval_1(it, active))
 
-        def to_grid(self):
+        def to_grid(self) -> np.ndarray:
             """The map from the world to the unit cube that the grid fills, 4 x 4."""
             matrix = np.eye(4)
             matrix[:3, :3] = np.array(self.m_to_local)[..., 0]
             matrix[:3, 3] = np.array(self.m_offset).ravel()
             return matrix
 
-        def max(self):
+        def max(self) -> float:
             return float(dr.max(dr.detach(self.m_data.array))[0])
 
-        def resolution(self):
+        def resolution(self) -> Cell:
             return mi.ScalarVector3i(*self.m_data.shape[3:0:-1])
 
-        def channel_count(self):
+        def channel_count(self) -> int:
             return 1
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             callback.put("data", self.m_data, mi.ParamFlags.Differentiable)
             callback.put("time_start", self.m_start, mi.ParamFlags.NonDifferentiable)
             callback.put("time_stop", self.m_stop, mi.ParamFlags.NonDifferentiable)
 
-        def parameters_changed(self, keys=()):
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             self._check()
 
-        def _check(self):
+        def _check(self) -> None:
             shape = self.m_data.shape
             if len(shape) != 5 or shape[4] != 1 or min(shape) < 1:
                 fail(NAME, "data", f"shape {shape}", "times x z x y x x x 1")
@@ -145,7 +147,7 @@ def define():
             self.m_rate = dr.opaque(mi.Float, rate)
             dr.make_opaque(self.m_start, self.m_stop)
 
-        def to_string(self):
+        def to_string(self) -> str:
             times, *cells = self.m_data.shape[:4]
             start, stop = self.m_start[0], self.m_stop[0]
             return f"MovingVolume[{times} states of {cells} cells from {start:g} to {stop:g} s]"
@@ -153,7 +155,7 @@ def define():
     return MovingVolume
 
 
-def read_states(source) -> np.ndarray:
+def read_states(source: Table) -> np.ndarray:
     """States of a grid (tensor or file name), (times, z, y, x)."""
     states = read_table(NAME, "data", source, 4)
     if states.ndim != 4 or min(states.shape) < 1:

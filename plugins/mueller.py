@@ -33,6 +33,8 @@ scaled as well.
     {"type": "mueller", "table": mi.TensorXf(table)}
 """
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -41,6 +43,17 @@ from .parameters import fail
 from .parameters import table as read_table
 from .polarization import rotate_from_scattering_plane, scattering_angle
 from .registration import register
+from .variant_types import (
+    Context,
+    Float,
+    Interaction,
+    Mask,
+    Point,
+    Properties,
+    Spectrum,
+    Traversal,
+    Vector,
+)
 
 NAME, KIND = "mueller", "phase"
 
@@ -50,11 +63,11 @@ CELL = 1.0
 NEWTON_STEPS = 3
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class Mueller(mi.PhaseFunction):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             if "table" not in props:
                 fail(NAME, "table", None, "a tensor of N x 7 numbers or a file name")
@@ -63,8 +76,8 @@ def define():
             self.m_table = mi.TensorXf(np.array(table, np.float32))
             self.m_flags = +mi.PhaseFunctionFlags.Isotropic
 
-        def _tabulate(self, table):
-            """Elements, and the probabilities of cells, of a table as it was given."""
+        def _tabulate(self, table: np.ndarray) -> None:
+            """Elements, and the probabilities of cells, of a table as it was stated."""
             table = check_table(table)
             table = _refined(table)
             self.m_angle = mi.Float(np.radians(table[:, 0]))
@@ -72,13 +85,13 @@ def define():
             # probability of every cell but for the factor of 2 pi, exact for a1 linear in angle
             self.m_cell = mi.DiscreteDistribution(mi.Float(_cells(table)))
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             callback.put("table", self.m_table, mi.ParamFlags.NonDifferentiable)
 
-        def parameters_changed(self, keys=()):
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             self._tabulate(self.m_table.numpy())
 
-        def elements(self, angle, active=True):
+        def elements(self, angle: Float, active: Mask = True) -> list[Float]:
             """The six elements at a scattering angle in radians, per steradian."""
             last = dr.width(self.m_angle) - 1
             index = dr.binary_search(
@@ -97,7 +110,7 @@ def define():
                 for column in (self.m_elements if mi.is_polarized else self.m_elements[:1])
             ]
 
-        def sample_angle(self, which, sample, active=True):
+        def sample_angle(self, which: Float, sample: Float, active: Mask = True) -> Float:
             """Scattering angles of the density a1 per steradian; ``which`` selects the cell.
 
             Within a cell, where the density in angle is nearly linear, its integral is inverted by
@@ -121,7 +134,9 @@ def define():
                 step = dr.clip(step - change, 0, width)
             return first + step
 
-        def eval_pdf(self, ctx, mei, wo, active=True):
+        def eval_pdf(
+            self, ctx: Context, mei: Interaction, wo: Vector, active: Mask = True
+        ) -> tuple[Spectrum, Float]:
             incident = -mei.wi
             elements = self.elements(scattering_angle(incident, wo), active)
             pdf = elements[0]
@@ -129,7 +144,14 @@ def define():
                 return mi.Spectrum(pdf), pdf
             return rotate_from_scattering_plane(incident, wo, elements), pdf
 
-        def sample(self, ctx, mei, sample1, sample2, active=True):
+        def sample(
+            self,
+            ctx: Context,
+            mei: Interaction,
+            sample1: Float,
+            sample2: Point,
+            active: Mask = True,
+        ) -> tuple[Vector, Spectrum, Float]:
             sine, cosine = dr.sincos(self.sample_angle(sample1, sample2.x, active))
             sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample2.y)
             wo = mi.Frame3f(-mei.wi).to_world(
@@ -138,7 +160,7 @@ def define():
             value, pdf = self.eval_pdf(ctx, mei, wo, active)
             return wo, dr.select(pdf > 0, value * dr.rcp(pdf), 0), pdf
 
-        def to_string(self):
+        def to_string(self) -> str:
             return f"Mueller[{dr.width(self.m_angle)} angles]"
 
     return Mueller
@@ -168,22 +190,23 @@ def check_table(table: np.ndarray) -> np.ndarray:
     return table
 
 
-def _refined(table):
+def _refined(table: np.ndarray) -> np.ndarray:
     """The same elements, linear in angle, at more nodes: cells of a degree, a1 of a factor of 2."""
     angle, a1 = table[:, 0], table[:, 1]
-    nodes = [angle, np.arange(0, 180, CELL)]
+    parts = [angle, np.arange(0, 180, CELL)]
     for cell in np.flatnonzero(np.abs(np.diff(np.log2(a1))) > 1):
         ends = a1[cell : cell + 2]
-        levels = np.geomspace(*ends, 1 + int(np.ceil(abs(np.log2(ends[1] / ends[0])))))
+        steps = int(np.ceil(abs(np.log2(ends[1] / ends[0]))))
+        levels = np.geomspace(ends[0], ends[1], 1 + steps)
         fraction = (levels[1:-1] - ends[0]) / (ends[1] - ends[0])
-        nodes.append(angle[cell] + fraction * (angle[cell + 1] - angle[cell]))
-    nodes = np.concatenate(nodes)
-    # as single precision tells them apart
+        parts.append(angle[cell] + fraction * (angle[cell + 1] - angle[cell]))
+    nodes = np.concatenate(parts)
+    # as single precision distinguishes them
     nodes = nodes[np.unique(np.radians(nodes).astype(np.float32), return_index=True)[1]]
     return np.column_stack([nodes, *(np.interp(nodes, angle, c) for c in table[:, 1:].T)])
 
 
-def _cells(table):
+def _cells(table: np.ndarray) -> np.ndarray:
     """Integral of a1 sin(angle) over each cell of a table, for a1 linear in angle."""
     theta, a1 = np.radians(table[:, 0]), table[:, 1]
     slope = np.diff(a1) / np.diff(theta)
@@ -191,7 +214,7 @@ def _cells(table):
     return cells + slope * np.diff(np.sin(theta))
 
 
-def _integral(first, step, low, slope):
+def _integral(first: Float, step: Float, low: Float, slope: Float) -> Float:
     """Integral of (low + slope s) sin(first + s) ds from 0 to ``step``, without cancellation."""
     half = 0.5 * step
     sine, cosine = dr.sincos(first + half)

@@ -2,12 +2,15 @@
 
 import math
 from pathlib import Path
+from typing import NoReturn
 
 import mitsuba as mi
 import numpy as np
 
+from .variant_types import Properties, Table, Transform
 
-def fail(plugin: str, field: str, value, allowed: str):
+
+def fail(plugin: str, field: str, value: object, allowed: str) -> NoReturn:
     """Raise ValueError: ``plugin.field: value is not allowed; expected ...``."""
     raise ValueError(f"{plugin}.{field}: {value!r} is not allowed; expected {allowed}")
 
@@ -16,7 +19,7 @@ def fail(plugin: str, field: str, value, allowed: str):
 TINY, HUGE = 1e-18, 1e18
 
 
-def number(props, plugin: str, field: str, default: float) -> float:
+def number(props: Properties, plugin: str, field: str, default: float) -> float:
     """The float parameter ``field``; infinite only where the default is."""
     value = props.get(field, default)
     try:
@@ -28,7 +31,7 @@ def number(props, plugin: str, field: str, default: float) -> float:
     return value
 
 
-def positive(props, plugin: str, field: str, default: float) -> float:
+def positive(props: Properties, plugin: str, field: str, default: float) -> float:
     """The float parameter ``field``, greater than zero; infinite only where the default is."""
     value = number(props, plugin, field, default)
     if not value >= TINY:
@@ -36,7 +39,7 @@ def positive(props, plugin: str, field: str, default: float) -> float:
     return value
 
 
-def at_least(props, plugin: str, field: str, default: float, least: float) -> float:
+def at_least(props: Properties, plugin: str, field: str, default: float, least: float) -> float:
     """The finite float parameter ``field``, no smaller than ``least``."""
     value = number(props, plugin, field, default)
     if not (value >= least and math.isfinite(value)):
@@ -44,7 +47,7 @@ def at_least(props, plugin: str, field: str, default: float, least: float) -> fl
     return value
 
 
-def whole(props, plugin: str, field: str, default: int, least: int) -> int:
+def whole(props: Properties, plugin: str, field: str, default: int, least: int) -> int:
     """The integer parameter ``field``, no smaller than ``least``."""
     value = int(props.get(field, default))
     if not least <= value < 2**31:
@@ -52,7 +55,9 @@ def whole(props, plugin: str, field: str, default: int, least: int) -> int:
     return value
 
 
-def choice(props, plugin: str, field: str, default: str, allowed: tuple[str, ...]) -> str:
+def choice(
+    props: Properties, plugin: str, field: str, default: str, allowed: tuple[str, ...]
+) -> str:
     """The string parameter ``field``, one of ``allowed``."""
     value = props.get(field, default)
     if value not in allowed:
@@ -60,7 +65,7 @@ def choice(props, plugin: str, field: str, default: str, allowed: tuple[str, ...
     return value
 
 
-def pose(props, plugin: str, field: str = "to_world"):
+def pose(props: Properties, plugin: str, field: str = "to_world") -> Transform:
     """The transform parameter ``field`` in the variant's precision; Mitsuba reads doubles."""
     if field not in props:
         return mi.Transform4f()
@@ -69,17 +74,17 @@ def pose(props, plugin: str, field: str = "to_world"):
     return placed
 
 
-def check_pose(placed, plugin: str, field: str = "to_world") -> None:
+def check_pose(placed: Transform, plugin: str, field: str = "to_world") -> None:
     """Refuse a pose that is not a rotation and translation: it must not scale an instrument."""
     matrix = np.array(placed.matrix, float).reshape(4, 4)
-    turn = matrix[:3, :3]
-    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0
+    rotation = matrix[:3, :3]
+    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
     # NaN compares as false
     if not (rigid and np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()):
         fail(plugin, field, matrix.round(4).tolist(), "a rotation and a translation")
 
 
-def table(plugin: str, field: str, source, columns: int) -> np.ndarray:
+def table(plugin: str, field: str, source: Table, columns: int) -> np.ndarray:
     """Numbers given as a tensor, or by the name of a ``.npy`` or text file.
 
     Text has a line per row, blanks or commas between its numbers, and ``#`` before comments.
@@ -101,7 +106,7 @@ def table(plugin: str, field: str, source, columns: int) -> np.ndarray:
         fail(plugin, field, source, f"N lines of {columns} numbers ({error})")
 
 
-def numbers(props, plugin: str, field: str, default: str) -> list[float]:
+def numbers(props: Properties, plugin: str, field: str, default: str) -> list[float]:
     """The parameter ``field`` of finite numbers, separated by commas or blanks."""
     text = str(props.get(field, default))
     try:

@@ -4,10 +4,14 @@
 physical distribution. Both give Stokes vectors about the instrument's horizontal axis.
 """
 
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
 import drjit as dr
 import mitsuba as mi
 
 from .bodies import slabs
+from .bounds import Bounds
 from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
 from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
@@ -16,6 +20,23 @@ from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
 from .resampling import choose
 from .surfaces import Air, media_of
+from .variant_types import (
+    Float,
+    Frame,
+    Generator,
+    Interaction,
+    Mask,
+    MediumPtr,
+    Point,
+    Scene,
+    Sensor,
+    Stokes,
+    UInt,
+    Vector,
+)
+
+Products: TypeAlias = Mapping[tuple[int, int], Float]
+"""Sums of products of two Stokes components, by their indices."""
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
@@ -45,7 +66,19 @@ class Sample:
     ``mi.mueller.stokes_basis(direction)``.
     """
 
-    def __init__(self, rng, frame, start, time, axes, origin, direction, aperture, delay, stokes):
+    def __init__(
+        self,
+        rng: Generator,
+        frame: Frame,
+        start: Point,
+        time: Float,
+        axes: Frame,
+        origin: Point,
+        direction: Vector,
+        aperture: Point,
+        delay: Float,
+        stokes: Stokes,
+    ) -> None:
         self.rng, self.frame, self.start, self.time, self.axes = rng, frame, start, time, axes
         self.origin, self.direction, self.aperture = origin, direction, aperture
         self.delay, self.stokes = delay, stokes
@@ -54,7 +87,9 @@ class Sample:
 class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
-    def __init__(self, scene, sensor, bounds, differentiable=False):
+    def __init__(
+        self, scene: Scene, sensor: Sensor, bounds: Bounds, differentiable: bool = False
+    ) -> None:
         self.air, self.sensor = Air(scene, sensor), sensor
         self.bounds, self.differentiable = bounds, differentiable
         self.rounded = has_tables(media_of(scene, sensor))
@@ -64,7 +99,7 @@ class Lidar:
         self.area = sensor.aperture_area()
         self.context = mi.PhaseFunctionContext()
 
-    def emit(self, seed, beam, number) -> Sample:
+    def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
         """Samples of beams by their index, with independent random numbers."""
         rng = generator(seed, beam, number)
         sensor, laser = self.sensor, self.sensor.laser
@@ -77,6 +112,7 @@ class Lidar:
         aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
+        # half the path, so that ranges of a gate shift by as much
         if laser.pulse_duration > 0:
             sigma = FWHM_TO_SIGMA * laser.pulse_duration * SPEED_OF_LIGHT / 2
             delay = sigma * mi.warp.square_to_std_normal(pair(rng)).x
@@ -88,11 +124,19 @@ class Lidar:
                 transverse(axes.s, direction),
                 mi.mueller.stokes_basis(direction),
             )
-        return Sample(
-            rng, frame, start, time, axes, origin, direction, aperture, delay, list(stokes)
-        )
+        return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
 
-    def forced(self, sample, low, high, position, max_order, split, by_order, cell):
+    def forced(
+        self,
+        sample: Sample,
+        low: Float,
+        high: Float,
+        position: Float,
+        max_order: int,
+        split: bool,
+        by_order: Float,
+        cell: UInt,
+    ) -> Stokes:
         """Stokes vector (about e_h) received from each sample's gate.
 
         ``low`` and ``high`` are twice the gate's ranges less the sample's delay, ``position`` (0
@@ -104,6 +148,8 @@ class Lidar:
         path = dr.lerp(low, high, position)
         closure = closing_distance(offset, sample.direction, path)
         back = dr.normalize(sample.aperture - (sample.origin + sample.direction * closure))
+        # times d(distance)/d(path): a vertex farther by ds lengthens the path by ds less its
+        # component along the way back
         volume = (high - low) / (1 - dr.dot(sample.direction, back))
         total = self._connect(
             sample,
@@ -126,7 +172,18 @@ class Lidar:
         return _sum(total, further)
 
     @dr.syntax
-    def _forced_further(self, sample, medium, path, width, last, split, by_order, cell, max_order):
+    def _forced_further(
+        self,
+        sample: Sample,
+        medium: MediumPtr,
+        path: Float,
+        width: Float,
+        last: UInt,
+        split: bool,
+        by_order: Float,
+        cell: UInt,
+        max_order: int,
+    ) -> Stokes:
         """Orders from two on: the path is closed once from every vertex but the last."""
         # local names, as the loop records local variables only
         aperture, rng = sample.aperture, sample.rng
@@ -155,7 +212,8 @@ class Lidar:
             mei = interaction(medium, position, direction, self.wavelengths, sample.time)
             scattering, _ = coefficients(medium, mei, self.channel, active)
             weight *= out * scattering
-            # no roulette at the first vertex: in thin air it is the signal
+            # no roulette at the first vertex: all light of two scatterings passes it, and in thin
+            # air its weight is always small
             survival = dr.select(order == 2, 1, dr.minimum(ROULETTE_FACTOR * weight, 1))
             active &= (weight > 0) & (rng.next_float32(active) < survival)
             stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
@@ -166,6 +224,7 @@ class Lidar:
             away, excess = away / distance, path - distance
             active &= excess > 0
             _, reach = slabs(self.low, self.high, position, -away)
+            # as long as the path is open, its remainder exceeds the straight way back
             rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
             closing, scattered, leg, volume = self._last_flight(
                 rng, sample, medium, mei, stokes, rest, active
@@ -185,34 +244,46 @@ class Lidar:
             active &= weight > 0
         return total
 
-    def _first_flight(self, rng, origin, direction, aperture, path):
+    def _first_flight(
+        self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
+    ) -> tuple[Float, Float]:
         """Length of a first flight and the inverse of its density; -1 where there is no air."""
         reach = closing_distance(origin - aperture, direction, path)
         enters, leaves = slabs(self.low, self.high, origin, direction)
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
-        # half the field of view's radius at half the path
+        # half the field of view's radius at half the path: nearer vertices send most of what they
+        # scatter through the field, farther ones past it
         scale = 0.25 * path * self.sensor.m_fov_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
         # for phase functions with a stronger forward peak than the isotropic one
         steps = dr.log((most + scale) / (least + scale))
         far = (least + scale) * dr.exp(steps * choice.y) - scale
-        left = dr.select(choice.x < NEAR_FRACTION, near, far)
+        gap = dr.select(choice.x < NEAR_FRACTION, near, far)
         density = dr.lerp(
-            dr.rcp((left + scale) * steps), near_density(left, least, most, scale), NEAR_FRACTION
+            dr.rcp((gap + scale) * steps), near_density(gap, least, most, scale), NEAR_FRACTION
         )
-        return dr.select((path > 0) & (most > least), reach - left, -1), dr.rcp(density)
+        return dr.select((path > 0) & (most > least), reach - gap, -1), dr.rcp(density)
 
-    def _half_field(self, axes, away):
+    def _half_field(self, axes: Frame, away: Vector) -> Float:
         """Tangent of half the widest angle between a direction and one of the field of view."""
         local = axes.to_local(away)
         vertex = dr.norm(local.xy) / (1 + local.z)
         field = self._half_fov()
         return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
-    def _half_fov(self):
+    def _half_fov(self) -> Float:
         return self.sensor.m_fov_tan / (1 + dr.sqrt(1 + dr.square(self.sensor.m_fov_tan)))
 
-    def _last_flight(self, rng, sample, medium, mei, stokes, rest, active):
+    def _last_flight(
+        self,
+        rng: Generator,
+        sample: Sample,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        rest: OpenPath,
+        active: Mask,
+    ) -> tuple[Vector, Stokes, Float, Float]:
         """Direction, Stokes vector and length of the flight to the last vertex; its weight.
 
         One of two candidates, selected by its contribution if there is no obstacle and the medium
@@ -220,9 +291,9 @@ class Lidar:
         """
         phase, axes, path = medium.phase_function(), sample.axes, rest.distance + rest.excess
         # sampling from the telescope is best for last vertices far off, in radii of its field
-        beside = rest.field / self._half_fov() - 1
-        ahead = 0.5 * rest.excess / (rest.distance * self.sensor.m_fov_tan)
-        far = dr.square(beside) + dr.square(ahead)
+        across = rest.field / self._half_fov() - 1
+        along = 0.5 * rest.excess / (rest.distance * self.sensor.m_fov_tan)
+        far = dr.square(across) + dr.square(along)
         backward = BACK_FRACTION * (1 - dr.rcp(1 + far))
         strategy = rng.next_float32(active)
         by_phase, by_back = strategy < PHASE_FRACTION, strategy > 1 - backward
@@ -232,8 +303,10 @@ class Lidar:
         inward = self._in_field(axes, rng)
         first = dr.select(by_phase, drawn, dr.select(by_back, inward, aimed))
         axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, rest.away))
+        # a quarter turn about the axis has the angle to it for which the first one was drawn
         tried = []
         for wo in (first, quarter_turn(axis, first)):
+            # towards the vertex that a direction from the telescope stands for, where drawn so
             end = sample.aperture + wo * closing_distance(sample.aperture - mei.p, wo, path)
             wo = dr.select(by_back, dr.normalize(end - mei.p), wo)
             one_plus_cosine = rest.one_plus_cosine(wo)
@@ -249,6 +322,8 @@ class Lidar:
             there = interaction(medium, end, wo, self.wavelengths, sample.time)
             back = dr.normalize(sample.aperture - end)
             received, back_pdf = self._scatter(medium, there, scattered, back, in_view)
+            # of all three strategies together (Veach & Guibas 1995, balance heuristic): none has a
+            # large weight where another one would have drawn the direction
             density = PHASE_FRACTION * pdf + backward * from_telescope
             aimed_density = rest.density(rest.excess, one_plus_cosine)
             density += (1 - PHASE_FRACTION - backward) * aimed_density
@@ -259,7 +334,15 @@ class Lidar:
         (wo, scattered, leg, volume), weight = choose(rng, *tried)
         return wo, scattered, leg, volume * weight
 
-    def _next_flight(self, rng, medium, mei, stokes, rest, active):
+    def _next_flight(
+        self,
+        rng: Generator,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        rest: OpenPath,
+        active: Mask,
+    ) -> tuple[Vector, Stokes, Float, Float]:
         """Direction, Stokes vector (of unchanged S0), length and weight of a further flight."""
         phase, rest = medium.phase_function(), rest.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
@@ -267,10 +350,10 @@ class Lidar:
         # transmittances to the gate differ little: any part of the excess length is about as likely
         most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.sensor.m_fov_tan
         choice, near = pair(rng), sample_near(0, most, scale, pair(rng), rng.next_float32(active))
-        left = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
-        left_density = near_density(left, 0, most, scale)
-        left_density = 0.5 * dr.lerp(dr.rcp(most), left_density, NEAR_FLIGHT_FRACTION)
-        used = rest.excess - 2 * left
+        gap = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
+        gap_density = near_density(gap, 0, most, scale)
+        gap_density = 0.5 * dr.lerp(dr.rcp(most), gap_density, NEAR_FLIGHT_FRACTION)
+        used = rest.excess - 2 * gap
         sample = pair(rng)
         mirrored = mi.Point2f(1 - sample.x, sample.y + 0.25)
         # two candidates again, with opposite azimuth and complementary polar sample
@@ -283,20 +366,21 @@ class Lidar:
             leg = rest.leg(used, one_plus_cosine)
             scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
             density = dr.lerp(rest.density(used, one_plus_cosine), pdf, PHASE_FLIGHT_FRACTION)
-            density *= rest.slope(used, one_plus_cosine, leg) * left_density
+            density *= rest.slope(used, one_plus_cosine, leg) * gap_density
             end = mei.p + wo * leg
             inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
             target = dr.select(inside & (density > 0), scattered[0], 0)
             tried.append((target, density, (wo, scattered, leg)))
         (wo, scattered, leg), weight = choose(rng, *tried)
+        # the change of S0 goes into the weight, on which roulette is played
         factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
         return wo, _scaled(scattered, factor), leg, dr.select(factor > 0, weight / factor, 0)
 
-    def _field_solid_angle(self):
+    def _field_solid_angle(self) -> Float:
         cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
         return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
 
-    def _in_field(self, axes, rng):
+    def _in_field(self, axes: Frame, rng: Generator) -> Vector:
         """A direction of the field of view, uniform in solid angle."""
         sample = pair(rng)
         # 1 - cos, without the difference of numbers next to one: fields of view are milliradians
@@ -305,7 +389,18 @@ class Lidar:
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
         return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
 
-    def _connect(self, sample, rng, position, direction, distance, medium, stokes, volume, active):
+    def _connect(
+        self,
+        sample: Sample,
+        rng: Generator,
+        position: Point,
+        direction: Vector,
+        distance: Float,
+        medium: MediumPtr,
+        stokes: Stokes,
+        volume: Float,
+        active: Mask,
+    ) -> Stokes:
         """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
 
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
@@ -331,7 +426,16 @@ class Lidar:
         scattering, _ = coefficients(medium, mei, self.channel, active)
         return self._receive(sample, rng, medium, mei, stokes, active, out * scattering * volume)
 
-    def _receive(self, sample, rng, medium, mei, stokes, active, weight):
+    def _receive(
+        self,
+        sample: Sample,
+        rng: Generator,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        active: Mask,
+        weight: Float,
+    ) -> Stokes:
         """Next-event estimation from an interaction to the telescope point."""
         back = sample.aperture - mei.p
         distance = dr.norm(back)
@@ -351,6 +455,8 @@ class Lidar:
             active,
             self.differentiable,
         )
+        # the telescope's point is uniform on its disc: area, cosine and distance make it a solid
+        # angle
         weight = weight * out * self.area * -dr.dot(wo, sample.axes.n) / (distance * distance)
         received, _ = self._scatter(medium, mei, stokes, wo, active)
         if not mi.is_polarized:
@@ -361,17 +467,30 @@ class Lidar:
             )
         return [dr.select(active, r * weight, 0) for r in received]
 
-    def _scatter(self, medium, mei, stokes, wo, active):
+    def _scatter(
+        self, medium: MediumPtr, mei: Interaction, stokes: Stokes, wo: Vector, active: Mask
+    ) -> tuple[Stokes, Float]:
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
         if self.rounded:
+            # Mitsuba's tables are 0 where rounding puts a cosine beyond 1
             wo = off_the_poles(mei.wi, wo)
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return apply_phase_function(value, stokes, self.channel), pdf
 
     @dr.syntax
     def analog(
-        self, sample, max_order, base, gates, sums, products, largest, magnified, split, by_order
-    ):
+        self,
+        sample: Sample,
+        max_order: int,
+        base: UInt,
+        gates: int,
+        sums: Sequence[Float],
+        products: Products,
+        largest: UInt,
+        magnified: float,
+        split: bool,
+        by_order: Float,
+    ) -> None:
         """Analog free flights; every collision is connected to the telescope.
 
         Adds contributions to ``sums``, and their products, each factor ``magnified``, to
@@ -408,11 +527,13 @@ class Lidar:
             travelled += flight
             mei = interaction(medium, position, direction, self.wavelengths, sample.time)
             scattering, extinction = coefficients(medium, mei, self.channel, active)
+            # absorption weighs, and ends no sample
             albedo = dr.select(active, scattering / extinction, 0)
             stokes = _scaled(stokes, albedo)
             range_ = 0.5 * (travelled + dr.norm(aperture - position))
             fraction = (range_ - low) / (high - low)
             counts = active & (fraction >= 0) & (fraction < 1)
+            # the distance to the last vertex is drawn, not forced: it has no weight of its own
             gain = self._receive(sample, rng, medium, mei, stokes, counts, mi.Float(1))
             now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
             done = now != gate
@@ -422,6 +543,7 @@ class Lidar:
             if dr.hint(split, mode="scalar"):
                 _add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
             order += 1
+            # later orders arrive from farther away still
             active &= (order <= max_order) & (range_ < high)
             onward, value, density = medium.phase_function().sample(
                 self.context, mei, rng.next_float32(active), pair(rng), active
@@ -432,12 +554,20 @@ class Lidar:
             _deposit(sums, products, largest, magnified, base + gate, held, began & ~active)
 
 
-def _add(total, value, cell, active=True):
+def _add(total: Float, value: Float, cell: UInt, active: Mask = True) -> None:
     # the default mode would compile the number of cells into the kernel
     dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, active, mode=dr.ReduceMode.Local)
 
 
-def _deposit(sums, products, largest, magnified, cell, held, active):
+def _deposit(
+    sums: Sequence[Float],
+    products: Products,
+    largest: UInt,
+    magnified: float,
+    cell: UInt,
+    held: Stokes,
+    active: Mask,
+) -> None:
     """Add contributions of samples to their gates, and products of their components."""
     active = active & (held[0] != 0)
     for total, value in zip(sums, held, strict=True):
@@ -449,13 +579,13 @@ def _deposit(sums, products, largest, magnified, cell, held, active):
     dr.scatter_reduce(dr.ReduceOp.Max, largest, square, cell, active, mode=dr.ReduceMode.Local)
 
 
-def _copied(stokes):
+def _copied(stokes: Sequence[Float]) -> Stokes:
     return [mi.Float(s) for s in stokes]
 
 
-def _sum(first, second):
+def _sum(first: Stokes, second: Stokes) -> Stokes:
     return [a + b for a, b in zip(first, second, strict=True)]
 
 
-def _scaled(stokes, factor):
+def _scaled(stokes: Stokes, factor: Float) -> Stokes:
     return [s * factor for s in stokes]

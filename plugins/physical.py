@@ -7,6 +7,8 @@ optimisation only needs the extremes of the array that it changes.
 """
 
 import re
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +16,8 @@ import numpy as np
 
 from .bodies import extent, name_of
 from .parameters import fail
+from .surfaces import media_of
+from .variant_types import Float, Medium, Scene, Sensor
 
 # rounding to single precision may leave an albedo of 1 this much above it
 ROUNDING = 1e-5
@@ -43,11 +47,11 @@ class Physical:
         Its name, with which messages begin.
     """
 
-    def __init__(self, plugin: str):
+    def __init__(self, plugin: str) -> None:
         self.plugin = plugin
-        self.passed: dict = {}
+        self.passed: dict[tuple[Medium, str], list[Float]] = {}
 
-    def check(self, scene, sensor) -> None:
+    def check(self, scene: Scene, sensor: Sensor) -> None:
         """Raise an error for the first unphysical parameter.
 
         Raises
@@ -56,17 +60,10 @@ class Physical:
             A coefficient, albedo, weight or asymmetry out of its range or NaN; a shape or volume
             whose position is not finite.
         """
-        media = {}
-        if sensor.get_medium() is not None:
-            media[sensor.get_medium()] = sensor.get_medium().id()
         for shape in scene.shapes():
             self._place(name_of(shape), *extent(shape))
-            for side in ("interior_medium", "exterior_medium"):
-                medium = getattr(shape, side)()
-                if medium is not None:
-                    media.setdefault(medium, f"{name_of(shape)}.{side}")
         passed = {}
-        for medium, where in media.items():
+        for medium, where in media_of(scene, sensor).items():
             parameters = mi.traverse(medium)
             for name, (_, _, node, _) in parameters.properties.items():
                 if isinstance(node, mi.Volume):
@@ -75,19 +72,22 @@ class Physical:
                 rule = next((rule for rule in RULES if rule[0].fullmatch(name)), None)
                 if rule is None or not _is_coefficient(node, value):
                     continue
-                held = _flat(value)
-                if not _same(self.passed.get((medium, name), ()), held):
-                    self.check_values(f"{where}.{name}", held, *rule[1:])
-                passed[medium, name] = held
+                arrays = _flat(value)
+                if not _same(self.passed.get((medium, name), ()), arrays):
+                    self.check_values(f"{where}.{name}", arrays, *rule[1:])
+                # the arrays themselves, so that no other one gets their index
+                passed[medium, name] = arrays
         self.passed = passed
 
-    def _place(self, field, low, high):
+    def _place(self, field: str, low: Any, high: Any) -> None:
         # NaN compares as false
         if not (np.isfinite([low, high]).all() and (np.array(low) <= np.array(high)).all()):
             box = mi.ScalarBoundingBox3f(low, high)
             fail(self.plugin, field, str(box), "a finite position; its transform is not finite")
 
-    def check_values(self, field, arrays, least, most, allowed):
+    def check_values(
+        self, field: str, arrays: Iterable[Any], least: float, most: float, allowed: str
+    ) -> None:
         """Raise an error if a parameter has a value out of its range."""
         highest = most + ROUNDING if most == 1 else most
         for array in arrays:
@@ -98,7 +98,7 @@ class Physical:
                 fail(self.plugin, field, float(wrong[0]), allowed)
 
 
-def _flat(value) -> list:
+def _flat(value: Any) -> list[Float]:
     """Copies of a parameter's values: the parameter itself changes in place."""
     if not dr.is_array_v(value):
         return [value]
@@ -108,7 +108,7 @@ def _flat(value) -> list:
     return [mi.Float(dr.detach(part)) for part in parts]
 
 
-def _is_coefficient(node, value) -> bool:
+def _is_coefficient(node: Any, value: Any) -> bool:
     """Whether a parameter is the quantity itself: in spectral variants colours are polynomials."""
     if not mi.is_spectral:
         return True
@@ -116,7 +116,7 @@ def _is_coefficient(node, value) -> bool:
     return not colours and not (dr.is_tensor_v(value) and value.shape[-1] != 1)
 
 
-def _same(before, now) -> bool:
+def _same(before: Sequence[Any], now: Sequence[Any]) -> bool:
     """Whether arrays are identical to those before, without reading their values."""
     identities = [[getattr(part, "index", part) for part in parts] for parts in (before, now)]
     return identities[0] == identities[1]

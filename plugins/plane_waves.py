@@ -43,15 +43,28 @@ from .parameters import fail, numbers, pose, positive
 from .polarization import horizontal_axis, rotate_stokes
 from .random_numbers import beam_radius_squared
 from .registration import register
+from .variant_types import (
+    Box,
+    Drawn,
+    Float,
+    Interaction,
+    Mask,
+    Point,
+    Properties,
+    Spectrum,
+    Stokes,
+    Traversal,
+    Vector,
+)
 
 NAME, KIND = "plane_waves", "emitter"
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class PlaneWaves(mi.Emitter):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             lines = [o for _, o in props.objects() if hasattr(o, "characteristic")]
             if len(lines) != 1:
@@ -88,11 +101,11 @@ def define():
             dr.make_opaque(self.m_pose)
             self.m_flags = +mi.EmitterFlags.Infinite
 
-        def flux(self):
+        def flux(self) -> Float:
             """Power per area across the axis, for a radiance of 1 in the middle."""
             return mi.Float(self.m_flux)
 
-        def sample_direction_of_light(self, sample):
+        def sample_direction_of_light(self, sample: Point) -> tuple[Vector, Float, Float]:
             """A direction of propagation (world), its weight (at most 1), the sampled flux."""
             if self.uniform:
                 disc = mi.warp.square_to_uniform_disk(sample) * self.m_sine
@@ -110,7 +123,7 @@ def define():
             local = mi.Vector3f(-dr.sqrt(1 - sine2), disc.x, disc.y)
             return dr.normalize(self.m_pose @ local), weight, mi.Float(self.m_drawn)
 
-        def radiance(self, direction):
+        def radiance(self, direction: Vector) -> Float:
             """Radiance of light travelling along ``direction`` (world), 1 in the middle."""
             local = self.m_pose.inverse() @ direction
             sine2 = dr.square(local.y) + dr.square(local.z)
@@ -119,11 +132,11 @@ def define():
             )
             return dr.select((local.x < 0) & (sine2 <= dr.square(self.m_sine)), value, 0)
 
-        def mean_stokes(self, direction):
+        def mean_stokes(self, direction: Vector) -> Stokes:
             """Stokes vector of all waves along ``direction``, about Mitsuba's axis."""
             return self._turned([mi.Float(s) for s in self.stokes], direction)
 
-        def sample_stokes(self, direction, which, sample):
+        def sample_stokes(self, direction: Vector, which: Float, sample: Point) -> Stokes:
             """A fully polarised state whose mean is `mean_stokes`."""
             degree = math.hypot(*self.stokes[1:])
             state = mi.warp.square_to_uniform_sphere(sample)
@@ -134,11 +147,11 @@ def define():
             ]
             return self._turned([mi.Float(1), *drawn], direction)
 
-        def _turned(self, stokes, direction):
+        def _turned(self, stokes: Stokes, direction: Vector) -> Stokes:
             axis = mi.mueller.stokes_basis(direction)
             return rotate_stokes(stokes, direction, horizontal_axis(direction), axis)
 
-        def eval(self, si, active=True):
+        def eval(self, si: Interaction, active: Mask = True) -> Spectrum:
             """Radiance, for integrators that look along a ray."""
             direction = si.wi  # of a ray that left the scene: the direction of the light
             value = dr.select(active, self.radiance(direction), 0)
@@ -149,20 +162,22 @@ def define():
                 radiance[row, 0] = stokes * value
             return radiance
 
-        def sample_direction(self, it, sample, active=True):
+        def sample_direction(
+            self, it: Interaction, sample: Point, active: Mask = True
+        ) -> tuple[Drawn, Spectrum]:
             """Nothing: other integrators find the source by following rays, see `pdf_direction`."""
             return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
 
-        def pdf_direction(self, it, ds, active=True):
+        def pdf_direction(self, it: Interaction, ds: Drawn, active: Mask = True) -> Float:
             return mi.Float(0)
 
-        def bbox(self):
+        def bbox(self) -> Box:
             return mi.ScalarBoundingBox3f()
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             callback.put("line", self.line, mi.ParamFlags.NonDifferentiable)
 
-        def to_string(self):
+        def to_string(self) -> str:
             return f"PlaneWaves[field_half={1e3 * self.field_half:g} mrad, line={self.line}]"
 
     return PlaneWaves

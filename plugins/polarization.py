@@ -6,11 +6,15 @@ Mueller matrix from the axis ``mi.mueller.stokes_basis(k)`` of the incident ligh
 ``mi.mueller.stokes_basis(k')`` of the scattered light, both in world coordinates.
 """
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
+from .variant_types import Float, Medium, PhaseFunction, Spectrum, Stokes, Vector
 
-def horizontal_axis(direction):
+
+def horizontal_axis(direction: Vector) -> Vector:
     """Horizontal unit vector perpendicular to ``direction``: the axis e_h of lidar Stokes vectors.
 
     For light straight up or down, where every perpendicular axis is horizontal, it is the y axis.
@@ -23,17 +27,19 @@ def horizontal_axis(direction):
     )
 
 
-def transverse(axis, direction):
+def transverse(axis: Vector, direction: Vector) -> Vector:
     """Unit vector along the part of ``axis`` that is perpendicular to ``direction``."""
     return dr.normalize(axis - direction * dr.dot(axis, direction))
 
 
-def scattering_angle(incident, scattered):
+def scattering_angle(incident: Vector, scattered: Vector) -> Float:
     """Angle between two unit vectors, in radians, exact to rounding near 0 and 180 degrees."""
     return dr.atan2(dr.norm(dr.cross(incident, scattered)), dr.dot(incident, scattered))
 
 
-def rotate_from_scattering_plane(incident, scattered, elements):
+def rotate_from_scattering_plane(
+    incident: Vector, scattered: Vector, elements: Sequence[Float]
+) -> Spectrum:
     """Mueller matrix between the Stokes bases of two directions from scattering-plane elements.
 
     Parameters
@@ -75,7 +81,7 @@ def rotate_from_scattering_plane(incident, scattered, elements):
     )
 
 
-def first_unpolarized_in_blend(medium):
+def first_unpolarized_in_blend(medium: Medium) -> PhaseFunction | None:
     """The first scalar phase function of a medium that is blended with polarised ones, or None.
 
     Such a function (``hg``, ``isotropic``) returns a multiple of the unit matrix between any two
@@ -89,12 +95,12 @@ def first_unpolarized_in_blend(medium):
     return scalar[0] if 0 < len(scalar) < len(leaves) else None
 
 
-def parts_of(phase) -> list:
+def parts_of(phase: PhaseFunction) -> list[PhaseFunction]:
     """The phase functions that a blend consists of; one that is no blend itself."""
-    nested = []
+    nested: list[PhaseFunction] = []
 
     class Nested(mi.TraversalCallback):
-        def put(self, name, value, *_):
+        def put(self, name: str, value: object, *_: object) -> None:
             if isinstance(value, mi.PhaseFunction):
                 nested.append(value)
 
@@ -102,7 +108,7 @@ def parts_of(phase) -> list:
     return [leaf for part in nested for leaf in parts_of(part)] or [phase]
 
 
-def _is_scalar(phase) -> bool:
+def _is_scalar(phase: PhaseFunction) -> bool:
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.wi, mei.sh_frame = mi.Vector3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, -1))
     matrix, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, mi.Vector3f(1, 0, 0))
@@ -110,16 +116,18 @@ def _is_scalar(phase) -> bool:
     return all(dr.all(element == diagonal[0]) for element in diagonal)
 
 
-def rotate_stokes(stokes, direction, current_axis, target_axis):
+def rotate_stokes(
+    stokes: Stokes, direction: Vector, current_axis: Vector, target_axis: Vector
+) -> Stokes:
     """Stokes vector (4 arrays) of light along ``direction``, referred to another axis."""
     cosine = dr.dot(current_axis, target_axis)
     sine = dr.dot(dr.cross(current_axis, target_axis), direction)
     cos2, sin2 = cosine * cosine - sine * sine, 2 * cosine * sine
     i, q, u, v = stokes
-    return i, cos2 * q + sin2 * u, cos2 * u - sin2 * q, v
+    return [i, cos2 * q + sin2 * u, cos2 * u - sin2 * q, v]
 
 
-def apply_phase_function(value, stokes, channel):
+def apply_phase_function(value: Spectrum, stokes: Stokes, channel: int) -> Stokes:
     """A phase function's value (Mueller matrix or number) times a Stokes vector."""
     if not mi.is_polarized:
         return [value[channel] * stokes[0]]

@@ -3,8 +3,10 @@
 import drjit as dr
 import mitsuba as mi
 
+from .variant_types import Float, Generator, Point, UInt
 
-def generator(seed, group, number):
+
+def generator(seed: UInt, group: UInt, number: UInt) -> Generator:
     """Independent random numbers for every seed, group (beam, pixel or pass) and number in it."""
     key, counter = mi.sample_tea_32(seed, group)
     state, stream = mi.sample_tea_32(key, counter + number)
@@ -13,12 +15,12 @@ def generator(seed, group, number):
     return rng
 
 
-def pair(rng):
+def pair(rng: Generator) -> Point:
     """Two numbers in [0, 1)."""
     return mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-def beam_radius_squared(inside, sample):
+def beam_radius_squared(inside: Float, sample: Float) -> Float:
     """Squared radius, over the 1/e^2 radius squared, of a place in a truncated Gaussian beam.
 
     ``inside`` is the fraction of the whole beam that is not cut off, 1 - exp(-2 cut^2); the

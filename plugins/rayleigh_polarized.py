@@ -24,45 +24,60 @@ integrate to one over the sphere.
     <phase type="rayleigh_polarized"><float name="depolarization" value="0.028"/></phase>
 """
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
 from .parameters import fail, number
 from .polarization import rotate_from_scattering_plane
 from .registration import register
+from .variant_types import (
+    Context,
+    Float,
+    Interaction,
+    Mask,
+    Point,
+    Properties,
+    Spectrum,
+    Traversal,
+    Vector,
+)
 
 NAME, KIND = "rayleigh_polarized", "phase"
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class RayleighPolarized(mi.PhaseFunction):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             self.m_depolarization = mi.Float(number(props, NAME, "depolarization", 0.0))
             self.parameters_changed()
             self.m_flags = +mi.PhaseFunctionFlags.Isotropic
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             kind = mi.ParamFlags.NonDifferentiable
             callback.put("depolarization", self.m_depolarization, kind)
 
-        def parameters_changed(self, keys=()):
-            given = self.m_depolarization[0]
-            if not 0 <= given < 0.5:
-                fail(NAME, "depolarization", given, "0 <= value < 0.5")
-            self.depolarization = given
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            depolarization = self.m_depolarization[0]
+            if not 0 <= depolarization < 0.5:
+                fail(NAME, "depolarization", depolarization, "0 <= value < 0.5")
+            self.depolarization = depolarization
             # Delta and Delta' of Hansen & Travis
-            self.m_dipole = dr.opaque(mi.Float, (1 - given) / (1 + given / 2))
-            self.m_circular = dr.opaque(mi.Float, (1 - 2 * given) / (1 - given))
+            self.m_dipole = dr.opaque(mi.Float, (1 - depolarization) / (1 + depolarization / 2))
+            self.m_circular = dr.opaque(mi.Float, (1 - 2 * depolarization) / (1 - depolarization))
 
-        def phase(self, cosine):
+        def phase(self, cosine: Float) -> Float:
             """Phase function of natural light, per steradian."""
             dipole = 0.75 * (1 + cosine * cosine)
             return dr.inv_four_pi * (self.m_dipole * dipole + (1 - self.m_dipole))
 
-        def eval_pdf(self, ctx, mei, wo, active=True):
+        def eval_pdf(
+            self, ctx: Context, mei: Interaction, wo: Vector, active: Mask = True
+        ) -> tuple[Spectrum, Float]:
             incident = -mei.wi
             cosine = dr.dot(incident, wo)
             pdf = self.phase(cosine)
@@ -77,7 +92,14 @@ def define():
             )
             return matrix, pdf
 
-        def sample(self, ctx, mei, sample1, sample2, active=True):
+        def sample(
+            self,
+            ctx: Context,
+            mei: Interaction,
+            sample1: Float,
+            sample2: Point,
+            active: Mask = True,
+        ) -> tuple[Vector, Spectrum, Float]:
             # dipole part: invert 3/8 (mu + mu^3 / 3) + 1/2 = xi (Cardano); rest: isotropic
             xi = 2 * (2 * sample2.x - 1)
             root = dr.cbrt(xi + dr.sqrt(1 + xi * xi))
@@ -92,7 +114,7 @@ def define():
             value, pdf = self.eval_pdf(ctx, mei, wo, active)
             return wo, value * dr.rcp(pdf), pdf
 
-        def to_string(self):
+        def to_string(self) -> str:
             return f"RayleighPolarized[depolarization={self.depolarization:g}]"
 
     return RayleighPolarized

@@ -7,8 +7,11 @@ of variant; and by a user's own import. Registering a plugin again replaces it.
 """
 
 from collections.abc import Callable
+from typing import NoReturn
 
 import mitsuba as mi
+
+from .variant_types import Properties
 
 _known: dict[str, tuple[str, Callable[[], type]]] = {}
 _following_variants = False
@@ -68,10 +71,10 @@ def _register_now(name: str) -> None:
     getattr(mi, f"register_{kind}")(name, make)
 
 
-def _refusal(name: str, variant: str) -> Callable:
+def _refusal(name: str, variant: str) -> Callable[[Properties], NoReturn]:
     """What a scene gets instead of a plugin in a scalar variant: one line that says so."""
 
-    def refuse(_properties):
+    def refuse(_properties: Properties) -> NoReturn:
         raise ValueError(
             f"{name}: the variant {variant} is not allowed, as it has no arrays of rays; expected "
             "llvm_ad_* or cuda_ad_*"

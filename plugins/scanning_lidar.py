@@ -67,6 +67,7 @@ of every beam) and ``times``, gates, aperture, field of view, pose and the laser
 """
 
 import warnings
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -76,6 +77,21 @@ from .parameters import check_pose, choice, fail, number, pose, positive, whole
 from .parameters import table as read_table
 from .polarization import horizontal_axis
 from .registration import register
+from .variant_types import (
+    Box,
+    Float,
+    Frame,
+    Mask,
+    Point,
+    Properties,
+    Ray,
+    Spectrum,
+    Table,
+    Transform,
+    Traversal,
+    UInt,
+    Vector,
+)
 
 NAME, KIND = "scanning_lidar", "sensor"
 CAMERA = (
@@ -84,11 +100,11 @@ CAMERA = (
 )
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class ScanningLidar(mi.Sensor):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             lasers = [o for _, o in props.objects() if hasattr(o, "sample_local")]
             if len(lasers) != 1:
@@ -128,35 +144,35 @@ def define():
         def beam_count(self) -> int:
             return int(np.prod(self.film().size()))
 
-        def beam_frame(self, beam):
+        def beam_frame(self, beam: UInt) -> Frame:
             """Axes (e_h, e_v, beam axis) of beams given by their index, in the lidar's frame."""
             axis = dr.gather(mi.Vector3f, self.m_directions, beam)
             horizontal = horizontal_axis(axis)
             return mi.Frame3f(horizontal, dr.cross(axis, horizontal), axis)
 
-        def beam_origin(self, beam):
+        def beam_origin(self, beam: UInt) -> Point:
             """Where beams start: the middle of the telescope, in the lidar's frame."""
             return dr.gather(mi.Point3f, self.m_origins, beam)
 
-        def beam_time(self, beam):
+        def beam_time(self, beam: UInt) -> Float:
             """Time of beams, s."""
             return dr.gather(mi.Float, self.m_times, beam)
 
-        def ranges(self, axis, origin):
+        def ranges(self, axis: Vector, origin: Point) -> tuple[Float, Float]:
             """First and last range (m) of all gates together along a beam axis."""
             scale = dr.rcp(axis.x) if self.gate_kind == "planar" else mi.Float(1)
-            return tuple((end - origin.x) * scale for end in (self.m_gate_start, self.m_gate_stop))
+            return (self.m_gate_start - origin.x) * scale, (self.m_gate_stop - origin.x) * scale
 
-        def sample_aperture(self, frame, sample):
+        def sample_aperture(self, frame: Frame, sample: Point) -> Vector:
             """A point of the telescope disc of a beam, uniformly, from its middle."""
             disc = mi.warp.square_to_uniform_disk(sample) * self.m_aperture
             return frame.s * disc.x + frame.t * disc.y
 
-        def aperture_area(self):
+        def aperture_area(self) -> Float:
             """Area of the telescope, m^2."""
             return dr.pi * self.m_aperture * self.m_aperture
 
-        def in_field_of_view(self, frame, to_source):
+        def in_field_of_view(self, frame: Frame, to_source: Vector) -> Mask:
             """Whether the direction ``to_source`` (any length) is in a beam's field of view."""
             local = frame.to_local(to_source)
             limit = self.m_fov_tan * local.z
@@ -167,7 +183,7 @@ def define():
             beam = dr.arange(mi.UInt32, self.beam_count)
             to_world = self.world_transform()
             axes = to_world @ dr.gather(mi.Vector3f, self.m_directions, beam)
-            return tuple(np.array(v, float).T for v in (to_world @ self.beam_origin(beam), axes))
+            return np.array(to_world @ self.beam_origin(beam), float).T, np.array(axes, float).T
 
         def origins_and_ranges(self) -> tuple[np.ndarray, np.ndarray]:
             """Of all beams: origins in the world, (n, 3), first and last recorded range, (2, n)."""
@@ -177,10 +193,12 @@ def define():
             places = np.array(self.world_transform() @ origin, float).T
             return places, np.array([np.array(end, float) for end in ranges])
 
-        def world_transform(self):
+        def world_transform(self) -> Transform:
             return self.m_pose
 
-        def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        def sample_ray(
+            self, time: Float, sample1: Float, sample2: Point, sample3: Point, active: Mask = True
+        ) -> tuple[Ray, Spectrum]:
             """The axis of the beam at a film position, for any other integrator.
 
             Its laser lights nothing then, and it has no gates: a warning says so.
@@ -195,11 +213,13 @@ def define():
             origin, time = to_world @ self.beam_origin(beam), time + self.beam_time(beam)
             return mi.Ray3f(origin, direction, time, self.laser.wavelengths()), mi.Spectrum(1)
 
-        def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
+        def sample_ray_differential(
+            self, time: Float, sample1: Float, sample2: Point, sample3: Point, active: Mask = True
+        ) -> tuple[Ray, Spectrum]:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             super().traverse(callback)
             kind = mi.ParamFlags.NonDifferentiable
             callback.put("directions", self.m_directions, kind)
@@ -212,11 +232,11 @@ def define():
             callback.put("to_world", self.m_pose, kind)
             callback.put("laser", self.laser, kind)
 
-        def parameters_changed(self, keys=()):
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             dr.make_opaque(self.m_gate_start, self.m_gate_stop, self.m_aperture, self.m_pose)
             self._check()
 
-        def _check(self):
+        def _check(self) -> None:
             start, stop = self.m_gate_start[0], self.m_gate_stop[0]
             if not 0 < self.m_aperture[0] < np.inf:
                 fail(NAME, "aperture_radius", self.m_aperture[0], "a finite radius above 0 m")
@@ -247,15 +267,15 @@ def define():
             farthest = origins[:, 0].max()
             matrix = np.array(self.m_pose.matrix, float).reshape(4, 4)
             # where beams start, in the world; a single place, if it is that of all
-            alike = (origins == origins[0]).all()
-            self.places = origins[: 1 if alike else None] @ matrix[:3, :3].T + matrix[:3, 3]
+            one_place = (origins == origins[0]).all()
+            self.places = origins[: 1 if one_place else None] @ matrix[:3, :3].T + matrix[:3, 3]
             if not farthest < start:
                 fail(NAME, "origins", f"x = {farthest:g} m", f"before gate_start = {start:g} m")
 
-        def bbox(self):
+        def bbox(self) -> Box:
             return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
 
-        def to_string(self):
+        def to_string(self) -> str:
             width, height = self.film().size()
             return (
                 f"ScanningLidar[{width} x {height} beams, {self.gate_count} {self.gate_kind} "
@@ -276,7 +296,7 @@ def angle_directions(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     return beams / np.linalg.norm(beams, axis=1, keepdims=True)
 
 
-def read_directions(source, count: int) -> np.ndarray:
+def read_directions(source: Table, count: int) -> np.ndarray:
     """A table of beam directions (tensor or file name), checked and normalised, (count, 3)."""
     table = read_table(NAME, "directions", source, 3)
     if table.shape != (count, 3):
@@ -287,7 +307,7 @@ def read_directions(source, count: int) -> np.ndarray:
     return table / length
 
 
-def read_beams(source, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def read_beams(source: Table, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A table of beams (tensor or file name), checked: origins, directions (count, 3), times."""
     table = read_table(NAME, "beams", source, 7).astype(float)
     if table.shape != (count, 7):
@@ -300,7 +320,7 @@ def read_beams(source, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return table[:, :3], table[:, 3:6] / length, table[:, 6]
 
 
-def _angles(props, name: str, count: int) -> np.ndarray:
+def _angles(props: Properties, name: str, count: int) -> np.ndarray:
     low = number(props, NAME, f"{name}_min_deg", 0.0)
     high = number(props, NAME, f"{name}_max_deg", 0.0)
     if not (-90 < low <= high < 90):

@@ -34,21 +34,24 @@ The default is the Rayleigh line of air at 232.9 K. The same line is used by the
     </texture>
 """
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .parameters import fail, number, numbers, positive
 from .registration import register
+from .variant_types import Float, Point, Properties, Traversal
 
 NAME, KIND = "spectral_line", "texture"
 
 
-def define():
+def define() -> type:
     """The plugin's class in the variant in force."""
 
     class SpectralLine(mi.Texture):
-        def __init__(self, props):
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             self.wavelength = positive(props, NAME, "wavelength", 354.7e-9)
             weights = np.array(numbers(props, NAME, "weights", "1"))
@@ -67,11 +70,11 @@ def define():
             self.m_v_los = dr.opaque(mi.Float, number(props, NAME, "v_los", 0.0))
             self._check()
 
-        def shift(self):
+        def shift(self) -> Float:
             """Frequency of the line's centre less the laser's, Hz."""
             return self.m_v_los * (2 / self.wavelength)
 
-        def sample(self, which, sample):
+        def sample(self, which: Float, sample: Point) -> Float:
             """Frequency offsets from the laser line, Hz; ``which`` selects the Gaussian."""
             index = mi.UInt32(0)
             for k in range(dr.width(self.m_offsets) - 1):
@@ -86,18 +89,18 @@ def define():
             width = np.exp(-2 * (np.pi * sigma * time) ** 2)
             return (weight * width * np.exp(2j * np.pi * offset * time)).sum(0)
 
-        def traverse(self, callback):
+        def traverse(self, callback: Traversal) -> None:
             callback.put("v_los", self.m_v_los, mi.ParamFlags.NonDifferentiable)
 
-        def parameters_changed(self, keys=()):
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             dr.make_opaque(self.m_v_los)
             self._check()
 
-        def _check(self):
+        def _check(self) -> None:
             if not np.isfinite(self.m_v_los[0]):
                 fail(NAME, "v_los", self.m_v_los[0], "a finite number")
 
-        def to_string(self):
+        def to_string(self) -> str:
             return (
                 f"SpectralLine[wavelength={self.wavelength:g} m, v_los={self.m_v_los[0]:g} m/s, "
                 f"{len(self.gaussians)} Gaussians]"

@@ -1,6 +1,6 @@
 """What a scene asks for and the integrators cannot do: refused, each in a line.
 
-Mitsuba accepts any film, sampler, emitter and surface beside a sensor. What is refused here would
+Mitsuba accepts any film, sampler, emitter and surface with a sensor. What is refused here would
 otherwise be ignored without a word. The table in the reference of `gated_volpath` lists all.
 """
 
@@ -13,12 +13,13 @@ from .bodies import extent, name_of
 from .parameters import fail
 from .polarization import first_unpolarized_in_blend
 from .surfaces import media_of
+from .variant_types import Scene, Sensor, Shape
 
-# shapes whose sides can be told apart along a line; besides all meshes
+# shapes other than meshes whose sides are distinguished along a line
 SIDED = ("Cube", "Sphere", "Rectangle", "Disk", "Cylinder")
 
 
-def check_supported(plugin: str, scene, sensor) -> None:
+def check_supported(plugin: str, scene: Scene, sensor: Sensor) -> None:
     """Raise an error for the first thing in a scene that would be ignored.
 
     Parameters
@@ -42,7 +43,7 @@ def check_supported(plugin: str, scene, sensor) -> None:
         _check_shape(plugin, shape)
 
 
-def check_sensor(plugin: str, sensor) -> None:
+def check_sensor(plugin: str, sensor: Sensor) -> None:
     """Raise an error for what a film, a sampler or a shutter asks for and would not get."""
     film, sampler = sensor.film(), sensor.sampler()
     if film.class_name() != "HDRFilm":
@@ -68,7 +69,7 @@ def check_sensor(plugin: str, sensor) -> None:
         fail(plugin, "shutter", shutter, "0 s")
 
 
-def _check_shape(plugin, shape):
+def _check_shape(plugin: str, shape: Shape) -> None:
     name, kind, bsdf = name_of(shape), shape.class_name(), shape.bsdf()
     if kind == "Instance":
         fail(plugin, name, "instance", "the shape itself")
@@ -87,8 +88,8 @@ def _check_shape(plugin, shape):
         fail(plugin, f"{name}.bsdf", bsdf.class_name(), "null, for light to enter its medium")
 
 
-def check_air(plugin: str, scene, sensor) -> None:
-    """Raise an error if no gate meets air, or for a blend that cannot be told from its parts.
+def check_air(plugin: str, scene: Scene, sensor: Sensor) -> None:
+    """Raise an error if no gate meets air, or for a blend whose parts cannot be recognised.
 
     Raises
     ------
@@ -99,7 +100,7 @@ def check_air(plugin: str, scene, sensor) -> None:
     _check_blends(plugin, scene, sensor)
 
 
-def _check_blends(plugin, scene, sensor):
+def _check_blends(plugin: str, scene: Scene, sensor: Sensor) -> None:
     """Refuse blends of polarised with unpolarised phase functions."""
     for medium in media_of(scene, sensor):
         part = first_unpolarized_in_blend(medium)
@@ -112,7 +113,7 @@ def _check_blends(plugin, scene, sensor):
             )
 
 
-def _check_gate_meets_medium(plugin, scene, sensor):
+def _check_gate_meets_medium(plugin: str, scene: Scene, sensor: Sensor) -> None:
     """A gate without any medium in it is an error of the scene, not a black image."""
     if sensor.get_medium() is not None:
         return

@@ -7,12 +7,18 @@ next. So it depends neither on the order of surfaces that touch nor on rounding,
 lost, however close behind another it lies. Where shapes overlap, the smallest one's medium holds.
 """
 
+from collections.abc import Sequence
+from typing import TypeAlias
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .bodies import (
     STEP,
+    Body,
+    Crossing,
+    Line,
     Sheet,
     box_around,
     first_hit,
@@ -22,6 +28,10 @@ from .bodies import (
     scene_of,
 )
 from .parameters import fail
+from .variant_types import Float, Mask, Medium, MediumPtr, Point, Scene, Sensor, Vector
+
+Crossings: TypeAlias = tuple[list[Line], Float | None]
+"""Of a line: what each body needs to know of it, the distance of its first opaque surface."""
 
 # m, beyond any air
 FAR = 1e9
@@ -41,34 +51,51 @@ class Air:
         Sensor and shapes contradict each other about a medium.
     """
 
-    def __init__(self, scene, sensor=None):
-        self.bodies, self.sheets, opaque = [], [], []
+    def __init__(self, scene: Scene, sensor: Sensor | None = None) -> None:
+        self.bodies: list[Body] = []
+        self.sheets: list[Sheet] = []
+        opaque = []
         self.low, self.high = box_around(scene.shapes())
         for shape in scene.shapes():
             if not passes_light(shape):
                 opaque.append(shape)
             elif shape.is_medium_transition():
                 for part in parts_of_shape(shape):
-                    (self.sheets if isinstance(part, Sheet) else self.bodies).append(part)
+                    if isinstance(part, Sheet):
+                        self.sheets.append(part)
+                    else:
+                        self.bodies.append(part)
+        # the last body that a place is in is the smallest: its medium holds
         self.bodies.sort(key=lambda body: -body.volume)
         self.opaque = scene_of(opaque) if opaque else None
         around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
         self.around = mi.MediumPtr(around)
         for body in self.bodies:
+            # a cavity that states no medium is open to what surrounds all shapes
             if body.hollow and body.interior is None:
                 body.inside = self.around
         dr.make_opaque(self.around)
+        # an open surface encloses nothing: behind it there may be air at any distance
         everywhere = around is not None or self.sheets
         self.bounds = _everywhere() if everywhere else (self.low, self.high)
 
-    def crossings(self, origin, direction):
+    def crossings(self, origin: Point, direction: Vector) -> Crossings:
         """What each body needs to know of a line, and the distance of its first opaque surface."""
         lines = [body.line(origin, direction) for body in self.bodies]
         if self.opaque is None:
             return lines, None
         return lines, first_hit(self.opaque, origin, direction, mi.Bool(True))[0]
 
-    def next_surface(self, crossings, origin, direction, start, distance, medium, active):
+    def next_surface(
+        self,
+        crossings: Crossings,
+        origin: Point,
+        direction: Vector,
+        start: Float,
+        distance: Float,
+        medium: MediumPtr,
+        active: Mask,
+    ) -> tuple[Float, Mask, Mask, MediumPtr, MediumPtr]:
         """The part of a line that begins at the distance ``start``.
 
         Returns its end, whether a surface is there, whether light passes that surface, the medium
@@ -77,10 +104,11 @@ class Air:
         active = active & (start < distance)
         lines, opaque = crossings
         end = mi.Float(distance)
+        # only open surfaces change it on the way; a body's medium follows from the body alone
         around = mi.MediumPtr(medium) if self.sheets else self.around
         within = []
         for body, line in zip(self.bodies, lines, strict=True):
-            place, inside = body.ahead(line, origin, direction, start, active)
+            place, inside = body.next_crossing(line, origin, direction, start, active)
             end = dr.minimum(end, place)
             within.append(inside)
         if self.sheets:
@@ -98,13 +126,21 @@ class Air:
             end = dr.select(passes, end, dr.minimum(opaque, end))
         return end, active & (end < distance), passes, mi.MediumPtr(here), around
 
-    def _sheets(self, origin, direction, start, end, medium, active):
+    def _sheets(
+        self,
+        origin: Point,
+        direction: Vector,
+        start: Float,
+        end: Float,
+        medium: MediumPtr,
+        active: Mask,
+    ) -> tuple[Float, MediumPtr]:
         """The same end, or that at an open surface, and the medium behind.
 
         Of surfaces that coincide within rounding, light crosses first the one in front of which is
         the medium that it is in: the last one is that whose far side is in front of no other.
         """
-        found = [sheet.ahead(origin, direction, start, active) for sheet in self.sheets]
+        found = [sheet.next_crossing(origin, direction, start, active) for sheet in self.sheets]
         for place, _, _ in found:
             end = dr.minimum(end, place)
         # all that the next search may miss, and more
@@ -122,7 +158,7 @@ class Air:
         return end, behind
 
 
-def _any(at, found, index, front):
+def _any(at: Sequence[Mask], found: Sequence[Crossing], index: int, front: MediumPtr) -> Mask:
     """Whether another of the surfaces that coincide ends at the medium ``front``."""
     result = mi.Bool(False)
     for j, (_, _, back) in enumerate(found):
@@ -131,15 +167,20 @@ def _any(at, found, index, front):
     return result
 
 
-def media_of(scene, sensor) -> list:
-    """All media of a scene and of the sensor in it, each once."""
-    media = [sensor.get_medium()]
+def media_of(scene: Scene, sensor: Sensor) -> dict[Medium, str]:
+    """All media of a scene and of the sensor in it, each with what a message calls it."""
+    media = {}
+    if sensor.get_medium() is not None:
+        media[sensor.get_medium()] = name_of(sensor.get_medium())
     for shape in scene.shapes():
-        media += [shape.interior_medium(), shape.exterior_medium()]
-    return [medium for medium in dict.fromkeys(media) if medium is not None]
+        for side in ("interior_medium", "exterior_medium"):
+            medium = getattr(shape, side)()
+            if medium is not None:
+                media.setdefault(medium, f"{name_of(shape)}.{side}")
+    return media
 
 
-def _surroundings(bodies, sheets, sensor):
+def _surroundings(bodies: list[Body], sheets: list[Sheet], sensor: Sensor) -> Medium | None:
     """The medium outside of all closed shapes, as sensor and shapes state it."""
     stated, places = sensor.get_medium(), sensor.places
     # of every beam: the largest and the smallest body in which it begins, -1 if in none
@@ -157,7 +198,7 @@ def _surroundings(bodies, sheets, sensor):
                 f"the medium of {name_of(bodies[index].shape)}, in which the telescope is, "
                 "by reference",
             )
-    # -1 is the last
+    # -1, of beams that begin in no body, is the last
     around = [*(body.exterior for body in bodies), stated]
     around = list(dict.fromkeys(around[index] for index in np.unique(outer)))
     if len(around) > 1:
@@ -179,7 +220,9 @@ def _surroundings(bodies, sheets, sensor):
     return around[0]
 
 
-def _check_fronts(bodies, sheets, sensor, light):
+def _check_fronts(
+    bodies: list[Body], sheets: list[Sheet], sensor: Sensor, light: np.ndarray
+) -> None:
     """Refuse open surfaces on whose near side is another medium than ``light``, that of beams."""
     origin, axis = (vectors.T.astype(np.float32) for vectors in sensor.beam_axes())
     origin, axis = mi.Point3f(*origin), mi.Vector3f(*axis)
@@ -187,9 +230,9 @@ def _check_fronts(bodies, sheets, sensor, light):
     first = mi.Float(dr.inf)
     for body in bodies:
         first = dr.minimum(
-            first, body.ahead(body.line(origin, axis), origin, axis, start, every)[0]
+            first, body.next_crossing(body.line(origin, axis), origin, axis, start, every)[0]
         )
-    found = [sheet.ahead(origin, axis, start, every) for sheet in sheets]
+    found = [sheet.next_crossing(origin, axis, start, every) for sheet in sheets]
     for place, _, _ in found:
         first = dr.minimum(first, place)
     light = np.resize(light, dr.width(axis))
@@ -209,5 +252,5 @@ def _check_fronts(bodies, sheets, sensor, light):
                 )
 
 
-def _everywhere():
+def _everywhere() -> tuple[Point, Point]:
     return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)

@@ -1,6 +1,6 @@
 """Advection of a scalar field by the wind: the field at other times from the field at one."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 import numpy as np
 import xarray as xr
@@ -19,7 +19,7 @@ _ORDER = 5
 _FINER = 2
 
 
-def _axis(field, name):
+def _axis(field: xr.DataArray, name: str) -> tuple[np.ndarray, float]:
     values = field[name].values.astype(float)
     steps = np.diff(values)
     if values.size < 4 or steps[0] <= 0 or np.ptp(steps) > 1e-3 * abs(steps[0]):
@@ -50,7 +50,7 @@ def _sampler(values: np.ndarray, finer: int = 1) -> Callable[[np.ndarray], np.nd
     return sample
 
 
-def _departures(velocity, steps: Sequence[float]) -> Iterator[np.ndarray]:
+def _departures(velocity: Sequence[np.ndarray], steps: Collection[float]) -> Iterator[np.ndarray]:
     """Node indices from which the air at the nodes came, after each of successive steps (s).
 
     Velocity by axis, in nodes per second.
@@ -138,11 +138,11 @@ def carrier(
         *_, last = _departures(speed, durations)
         places.append(last)
 
-    def carry(field: xr.DataArray) -> xr.DataArray:
+    def advected(field: xr.DataArray) -> xr.DataArray:
         _check_grid(field, v, w, u)
         return _reader(field, u is not None)(places)
 
-    return carry
+    return advected
 
 
 def advect_to(
@@ -182,12 +182,19 @@ def advect_to(
         intervals = np.diff(side, prepend=0.0)
         counts = np.ceil(np.abs(intervals) / longest - 1e-6).astype(int).clip(1)
         steps = np.repeat(intervals / counts, counts)
-        carried = _carried(field, v, w, u, steps, np.cumsum(counts) - 1)
-        states.update(zip(side, carried, strict=True))
+        advected = _advected(field, v, w, u, steps, np.cumsum(counts) - 1)
+        states.update(zip(side, advected, strict=True))
     return xr.concat([states[time] for time in times], xr.Variable("time", times))
 
 
-def _carried(field, v, w, u, steps, wanted) -> Iterator[xr.DataArray]:
+def _advected(
+    field: xr.DataArray,
+    v: xr.DataArray,
+    w: xr.DataArray,
+    u: xr.DataArray | None,
+    steps: Collection[float],
+    wanted: Collection[int],
+) -> Iterator[xr.DataArray]:
     """The field after successive steps (s), after those of the ``wanted`` numbers."""
     _check_grid(field, v, w, u)
     read = _reader(field, u is not None)
@@ -204,13 +211,17 @@ def _check_step(dt: float, steps: int) -> None:
         raise InputError(f"advection.steps: {steps} is not allowed; a whole number >= 1 is")
 
 
-def _velocity(v, w, u) -> dict[str, tuple[str, xr.DataArray]]:
+def _velocity(
+    v: xr.DataArray, w: xr.DataArray, u: xr.DataArray | None
+) -> dict[str, tuple[str, xr.DataArray]]:
     """Names and components by the axis that they are along."""
     along = {} if u is None else {"x": ("u", u)}
     return {**along, "y": ("v", v), "z": ("w", w)}
 
 
-def _check_grid(field, v, w, u) -> None:
+def _check_grid(
+    field: xr.DataArray, v: xr.DataArray, w: xr.DataArray, u: xr.DataArray | None
+) -> None:
     dims = set(field.dims)
     if dims not in ({"y", "z"}, {"x", "y", "z"}) or len(field.dims) != len(dims):
         raise InputError(
@@ -240,14 +251,16 @@ def _check_grid(field, v, w, u) -> None:
             )
 
 
-def _pieces(field, whole: bool) -> np.ndarray:
+def _pieces(field: xr.DataArray, whole: bool) -> np.ndarray:
     """What moves as one: the ``whole`` volume, or every plane by itself."""
     order = [axis for axis in ("x", "y", "z") if axis in field.dims]
     values = field.transpose(*order).values.astype(float)
     return values.reshape(-1, *values.shape[-3 if whole else -2 :])
 
 
-def _speeds(grid, v, w, u) -> list[np.ndarray]:
+def _speeds(
+    grid: xr.DataArray, v: xr.DataArray, w: xr.DataArray, u: xr.DataArray | None
+) -> list[np.ndarray]:
     """Components of the velocity of all `_pieces`, in nodes per second."""
     return [
         _pieces(component, u is not None) / _axis(grid, axis)[1]
@@ -255,7 +268,7 @@ def _speeds(grid, v, w, u) -> list[np.ndarray]:
     ]
 
 
-def _reader(field, whole: bool) -> Callable[[Sequence[np.ndarray]], xr.DataArray]:
+def _reader(field: xr.DataArray, whole: bool) -> Callable[[Sequence[np.ndarray]], xr.DataArray]:
     """From places of the nodes of all `_pieces` (node indices) to the field there."""
     pieces = _pieces(field, whole)
     samplers = [_sampler(piece, _FINER) for piece in pieces]

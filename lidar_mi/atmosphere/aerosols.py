@@ -29,7 +29,7 @@ class LogNormal:
     smallest: float
     largest: float
 
-    def __call__(self, radius):
+    def __call__(self, radius: np.ndarray | float) -> np.ndarray:
         """Number per radius, not normalised."""
         return np.exp(-0.5 * (np.log(radius / self.median) / math.log(self.sigma)) ** 2) / radius
 
@@ -54,7 +54,7 @@ class ModifiedGamma:
     smallest: float
     largest: float
 
-    def __call__(self, radius):
+    def __call__(self, radius: np.ndarray | float) -> np.ndarray:
         """Number per radius, not normalised."""
         x = radius / self.mode
         return np.exp(self.alpha * np.log(x) - self.alpha / self.gamma * (x**self.gamma - 1))
@@ -89,7 +89,7 @@ class Aerosol:
     elongation: float = 1.0
     number_density: float = 1e8
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         label = f"aerosol {self.name!r}"
         sizes = self.sizes
         numbers = dict(vars(sizes), number_density=self.number_density)

@@ -6,7 +6,7 @@ import xarray as xr
 from lidar_mi.errors import InputError
 
 
-def _check(background, maximum, stretch):
+def _check(background: float, maximum: float, stretch: float) -> None:
     if not (np.isfinite(background) and background >= 0):
         raise InputError(
             f"extinction.background: {background} m^-1 is not allowed; it must be >= 0"
@@ -20,7 +20,7 @@ def _check(background, maximum, stretch):
         raise InputError(f"extinction.stretch: {stretch} is not allowed; it must be >= 1")
 
 
-def _variable(wake, name, key):
+def _variable(wake: xr.Dataset, name: str, key: str) -> xr.DataArray:
     if name not in wake.data_vars:
         raise InputError(
             f"extinction.{key}: the wake has no variable {name!r}; it has "
@@ -35,7 +35,9 @@ def _variable(wake, name, key):
     return field
 
 
-def _stretched(field, stretch, reference, key):
+def _stretched(
+    field: xr.DataArray, stretch: float, reference: float | None, key: str
+) -> xr.DataArray:
     """1 - (1 - x)^stretch with x = field/reference."""
     largest = float(field.max())
     if largest == 0 and not reference:
@@ -58,7 +60,9 @@ def _stretched(field, stretch, reference, key):
     return 1 - (1 - field / reference) ** stretch
 
 
-def _finished(extinction, background, maximum, stretch):
+def _finished(
+    extinction: xr.DataArray, background: float, maximum: float, stretch: float
+) -> xr.DataArray:
     extinction = extinction.rename("extinction")
     extinction.attrs = {
         "units": "m-1",
@@ -113,15 +117,19 @@ def extinction_from_tracer(
         Numbers out of range, missing or negative variables, a reference below the data.
     """
     _check(background, maximum, stretch)
-    if tracer is None and aerosol is None:
-        raise InputError("extinction: tracer and aerosol are both left out; allowed: at most one")
-    if aerosol is None:
-        extinction = background
-    else:
+
+    def exhaust(name: str) -> xr.DataArray:
+        fraction = _stretched(_variable(wake, name, "tracer"), stretch, reference, "tracer")
+        return (maximum - background) * fraction
+
+    if aerosol is not None:
         extinction = background * _variable(wake, aerosol, "aerosol")
-    if tracer is not None:
-        fraction = _stretched(_variable(wake, tracer, "tracer"), stretch, reference, "tracer")
-        extinction = extinction + (maximum - background) * fraction
+        if tracer is not None:
+            extinction = extinction + exhaust(tracer)
+    elif tracer is not None:
+        extinction = background + exhaust(tracer)
+    else:
+        raise InputError("extinction: tracer and aerosol are both left out; allowed: at most one")
     return _finished(extinction, background, maximum, stretch)
 
 
@@ -159,6 +167,6 @@ def extinction_from_speed(
                 f"extinction: the wake has no variable {name!r}; it has "
                 f"{', '.join(map(str, wake.data_vars))}"
             )
-    speed = np.hypot(wake["v"].astype(float), wake["w"].astype(float))
+    speed = xr.ufuncs.hypot(wake["v"].astype(float), wake["w"].astype(float))
     fraction = _stretched(speed, stretch, reference, "speed")
     return _finished(background + (maximum - background) * fraction, background, maximum, stretch)

@@ -48,7 +48,7 @@ class Line:
     offsets: np.ndarray
     sigmas: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check("line.wavelength", self.wavelength, self.wavelength > 0, "m above 0")
         for name in ("weights", "offsets", "sigmas"):
             values = np.array(getattr(self, name), float, ndmin=1)
@@ -126,7 +126,7 @@ class Line:
         return self.offsets[which] + self.sigmas[which] * rng.standard_normal(n)
 
     def shifted(self, offset: float) -> "Line":
-        """The line moved by ``offset`` Hz."""
+        """The line shifted by ``offset`` Hz."""
         return replace(self, offsets=self.offsets + offset)
 
     def broadened(self, sigma: float) -> "Line":
@@ -239,8 +239,8 @@ def backscatter_line(
     return Line(wavelength, weights[present], offsets[present], sigmas[present])
 
 
-def _check(name, value, good, allowed):
-    value, good = np.atleast_1d(value), np.atleast_1d(good)
-    good = good & np.isfinite(value)
-    if not good.all():
-        raise InputError(f"{name}: {value[~good][0]:g} is not allowed; expected {allowed}")
+def _check(name: str, value: np.ndarray | float, good: np.ndarray | bool, allowed: str) -> None:
+    values = np.atleast_1d(value)
+    fine = np.atleast_1d(good) & np.isfinite(values)
+    if not fine.all():
+        raise InputError(f"{name}: {values[~fine][0]:g} is not allowed; expected {allowed}")

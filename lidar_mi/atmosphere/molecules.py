@@ -233,7 +233,7 @@ def molecular_table(
     )
 
 
-def _check(wavelength, co2):
+def _check(wavelength: float, co2: float) -> None:
     if not 0.2e-6 <= wavelength <= 2e-6:
         raise InputError(f"wavelength: {wavelength!r} m is not allowed; expected 2e-7 to 2e-6 m")
     if not 0 <= co2 <= 0.01:

@@ -11,10 +11,11 @@ The average over sizes is ours: equal steps in the logarithm of the radius.
 
 import math
 from collections.abc import Callable
+from types import ModuleType
 
 import numpy as np
 
-from lidar_mi.atmosphere.aerosols import Aerosol, LogNormal, aerosol
+from lidar_mi.atmosphere.aerosols import Aerosol, LogNormal, ModifiedGamma, aerosol
 from lidar_mi.atmosphere.scattering import ScatteringTable
 from lidar_mi.errors import InputError
 
@@ -38,7 +39,7 @@ def table_angles() -> np.ndarray:
     density = 1 / np.minimum(0.05 + 0.025 * np.minimum(fine, 180 - fine), 1.0)
     count = np.concatenate([[0], np.cumsum((density[1:] + density[:-1]) / 2)])
     angle = np.interp(np.linspace(0, count[-1], 361), count, fine)
-    # three decimals, mirrored so that both ends are alike
+    # three decimals, mirrored so that both ends are resolved equally
     half = np.round(angle[:180], 3)
     return np.concatenate([half, [90.0], 180 - half[::-1]]).round(3)
 
@@ -122,7 +123,7 @@ def make_table(
     )
 
 
-def _sizes_text(sizes):
+def _sizes_text(sizes: LogNormal | ModifiedGamma) -> str:
     limits = f"r {sizes.smallest * 1e6:g} to {sizes.largest * 1e6:g} um"
     if isinstance(sizes, LogNormal):
         return f"log-normal r {sizes.median * 1e6:g} um sigma {sizes.sigma:g}, {limits}"
@@ -132,7 +133,7 @@ def _sizes_text(sizes):
     )
 
 
-def _scatrs(module):
+def _scatrs(module: str) -> ModuleType:
     """A module of the optional library."""
     from importlib import import_module
 
@@ -145,13 +146,13 @@ def _scatrs(module):
         ) from None
 
 
-def _library():
+def _library() -> str:
     from importlib.metadata import version
 
     return f"scatrs {version('scatrs')}"
 
 
-def _sphere(x, m, _, cosine):
+def _sphere(x: float, m: complex, _: float, cosine: np.ndarray) -> tuple[float, float, np.ndarray]:
     """Efficiencies and matrix (a1 averages to one) of a sphere of size parameter x."""
     mie = _scatrs("mie")
     q = mie.efficiencies(x, m)
@@ -159,7 +160,9 @@ def _sphere(x, m, _, cosine):
     return q.q_ext, q.q_sca, np.stack([f.f11, f.f11, f.f33, f.f33, f.f12, f.f34], axis=1)
 
 
-def _spheroid(x, m, elongation, cosine):
+def _spheroid(
+    x: float, m: complex, elongation: float, cosine: np.ndarray
+) -> tuple[float, float, np.ndarray]:
     """The same for a randomly oriented prolate spheroid; x of the sphere of equal volume."""
     tmatrix, errors = _scatrs("tmatrix"), _scatrs("errors")
     try:

@@ -64,7 +64,7 @@ class ScatteringTable:
     number_density: float = 1.0
     provenance: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("angle", "elements"):
             values = np.array(getattr(self, name), float)
             values.flags.writeable = False
@@ -109,7 +109,7 @@ class ScatteringTable:
         return np.stack([np.interp(angle, self.angle, row) for row in self.elements.T], axis=-1)
 
 
-def _moments(angle, a1):
+def _moments(angle: np.ndarray, a1: np.ndarray) -> tuple[float, float]:
     """Mean over the sphere of a1 and of a1 cos(angle), exact for a1 linear in angle."""
     theta = np.radians(angle)
     slope = np.diff(a1) / np.diff(theta)
@@ -200,7 +200,7 @@ def check(table: ScatteringTable) -> None:
             )
 
 
-def _worst(label, angle, what, excess, scale):
+def _worst(label: str, angle: np.ndarray, what: str, excess: np.ndarray, scale: np.ndarray) -> None:
     worst = int((excess / scale).argmax())
     if excess[worst] > _TOLERANCE * scale[worst]:
         raise InputError(f"{label}: {what} at {angle[worst]:g} degrees; such a matrix cannot exist")

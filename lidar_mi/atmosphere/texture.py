@@ -14,7 +14,7 @@ from lidar_mi.errors import InputError
 _LARGEST_GRID = 30_000_000
 
 
-def _spacing(name, values):
+def _spacing(name: str, values: np.ndarray) -> float:
     values = np.asarray(values, dtype=float)
     steps = np.diff(values)
     if values.ndim != 1 or values.size < 2 or steps[0] <= 0 or np.ptp(steps) > 1e-3 * steps[0]:

@@ -65,7 +65,7 @@ class TurbineWake:
     downstream: float
     hub_core: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, unit in (
             ("diameter", " m"),
             ("wind_speed", " m/s"),
@@ -141,7 +141,7 @@ class TurbineWake:
         """Swirl at distances r (m) from the axis, m s^-1."""
         return self.circulation * self._profile(r)
 
-    def _profile(self, r):
+    def _profile(self, r: ArrayLike) -> np.ndarray:
         """Swirl of a hub vortex of circulation 1: Lamb-Oseen, less the tip vorticity within r."""
         r = np.asarray(r, float)
         core = -np.expm1(-LAMB_OSEEN_CONSTANT * (r / self.hub_core) ** 2)
@@ -210,7 +210,7 @@ def turbine_flow(
     outer_scale: float = 30.0,
     seed: int = 0,
 ) -> xr.Dataset:
-    """u, v, w behind a turbine: the mean wake, on all planes x alike, and turbulence.
+    """u, v, w behind a turbine: the mean wake, the same on all planes x, and turbulence.
 
     Turbulence is isotropic, of the intensity ``ambient`` plus, in squares, what the wake adds
     (`added_turbulence`) in its middle, fading outwards as the deficit does. This modulation causes

@@ -48,7 +48,7 @@ class Vortex:
     z: float
     model: Model = "lamb_oseen"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("circulation", "y", "z"):
             value = getattr(self, name)
             if not np.isfinite(value):
@@ -56,7 +56,7 @@ class Vortex:
         _check_profile(self.core_radius, self.model)
 
 
-def _check_profile(core_radius, model):
+def _check_profile(core_radius: float, model: str) -> None:
     if not (np.isfinite(core_radius) and core_radius > 0):
         raise InputError(f"vortex.core_radius: {core_radius} m is not allowed; it must be > 0 m")
     if model not in MODELS:
@@ -175,7 +175,7 @@ def vortex_pair(
     )
 
 
-def _check_pair(circulation, separation):
+def _check_pair(circulation: float, separation: float) -> None:
     for name, value, unit in (
         ("circulation", circulation, "m^2/s"),
         ("separation", separation, "m"),

@@ -5,6 +5,7 @@ the aircraft is at time 0. The wake's axis is level while the path climbs.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -128,7 +129,7 @@ class PairAlongPath:
     crow_amplitude: float = 0.0
     crow_wavelength: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         vortex_pair(self.circulation, self.separation, self.core_radius, model=self.model)
         for name, low, high, unit in (
             ("crossing_angle", 0.0, math.pi / 2, "rad"),
@@ -189,7 +190,7 @@ class PairAlongPath:
         u, v, w = np.zeros(shape), *(np.full(shape, mean) for mean in self.mean_wind)
         for side in (1, -1):
             d = [a - side * self.separation / 2 * axis for a, axis in zip(place, left, strict=True)]
-            tangent: tuple[ArrayLike, ...] = tuple(along)
+            tangent: tuple[np.ndarray, ...] = tuple(along)
             if self.crow_amplitude:
                 s = _dot(d, along)
                 offset, slope = self._deformation(s, side)
@@ -197,8 +198,8 @@ class PairAlongPath:
                 d = [a - s * b - c for a, b, c in zip(d, along, offset, strict=True)]
                 length = np.sqrt(1 + slope[3] ** 2)
                 tangent = tuple((a + b) / length for a, b in zip(along, slope[:3], strict=True))
-            ahead = _dot(d, tangent)
-            r2 = np.maximum(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - ahead**2, 0.0)
+            axial = _dot(d, tangent)
+            r2 = np.maximum(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - axial**2, 0.0)
             omega = angular_velocity(r2, side * strength, self.core_radius, self.model)
             u = u + omega * (tangent[1] * d[2] - tangent[2] * d[1])
             v = v + omega * (tangent[2] * d[0] - tangent[0] * d[2])
@@ -223,22 +224,24 @@ class PairAlongPath:
         for side in (1, -1):
             start = centre + side * self.separation / 2 * left
             offset, slope = np.zeros(3), np.zeros(3)
-            ahead = (x - start[0]) / along[0]
+            axial = (x - start[0]) / along[0]
             if self.crow_amplitude:
                 # by Newton's method: the offset moves the crossing by a fraction of the slope
                 for _ in range(20):
-                    shift, rise = self._deformation(np.asarray(ahead), side)
+                    shift, rise = self._deformation(np.asarray(axial), side)
                     offset, slope = np.array(shift, float), np.array(rise[:3], float)
-                    miss = start[0] + ahead * along[0] + offset[0] - x
-                    ahead -= miss / (along[0] + slope[0])
-            _, y, z = start + ahead * along + offset
+                    miss = start[0] + axial * along[0] + offset[0] - x
+                    axial -= miss / (along[0] + slope[0])
+            _, y, z = start + axial * along + offset
             tangent = along + slope
             steep = tangent[0] / float(np.linalg.norm(tangent))
             radius = self.core_radius / math.sqrt(steep)
             found.append(Vortex(side * strength, radius, float(y), float(z), self.model))
         return found[0], found[1]
 
-    def _deformation(self, ahead: np.ndarray, side: int):
+    def _deformation(
+        self, axial: np.ndarray, side: int
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Offset (x, y, z) of a vortex at a place along its mean axis; its slopes (x, y, z), size.
 
         The last slope is the rate of the offset along its own direction.
@@ -247,10 +250,10 @@ class PairAlongPath:
         wavelength = self.crow_wavelength or CROW_WAVELENGTH * self.separation
         inclined = (side * left + up) / math.sqrt(2)
         k = 2 * math.pi / wavelength
-        size = self.crow_amplitude * np.sin(k * ahead)
-        rate = self.crow_amplitude * k * np.cos(k * ahead)
+        size = self.crow_amplitude * np.sin(k * axial)
+        rate = self.crow_amplitude * k * np.cos(k * axial)
         return [size * axis for axis in inclined], [*(rate * axis for axis in inclined), rate]
 
 
-def _dot(first, second):
+def _dot(first: Sequence[np.ndarray], second: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]

@@ -29,9 +29,9 @@ _BEYOND = 3
 def one_period(flow: xr.Dataset) -> xr.Dataset:
     """The planes of one period of a wake that is periodic along x.
 
-    The step from the last plane to the first, and the bend there, are compared with those within
-    the volume: where the seam is more than twice as rough as the roughest place inside, the volume
-    is not periodic. A last plane that repeats the first one is left out. A wake that is uniform
+    The step from the last plane to the first, and the curvature there, are compared with those
+    within the volume: where either is more than twice the largest inside, the volume is not
+    periodic. A last plane that repeats the first one is left out. A wake that is uniform
     along its axis becomes a single plane.
 
     Parameters
@@ -64,10 +64,10 @@ def one_period(flow: xr.Dataset) -> xr.Dataset:
         size = values
         for _ in range(order):
             size = np.roll(size, -1, axis=1) - size
-        rough = np.sqrt((size**2).mean((0, 2, 3)))
-        inside, seam = rough[:-order].max(), rough[-order:].max()
+        rms = np.sqrt((size**2).mean((0, 2, 3)))
+        inside, seam = rms[:-order].max(), rms[-order:].max()
         if seam > _SEAM * inside + floor:
-            what = "step" if order == 1 else "bend"
+            what = "step" if order == 1 else "curvature"
             raise InputError(
                 "wake.depth: volume is not allowed in an encounter, as the wake is not periodic "
                 f"along x: the {what} from its last plane to its first is {seam / inside:.2g} "
@@ -165,7 +165,7 @@ class VolumeAlongPath:
             ]
         )
 
-    def _own(self, x, y, z, time) -> np.ndarray:
+    def _own(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> np.ndarray:
         """Places in the volume's axes, (3, ...), m, from its origin's coordinates on."""
         centre = self.centre_at(time)
         place = [np.asarray(a, float) - c for a, c in zip((x, y, z), centre, strict=True)]
@@ -237,7 +237,7 @@ class VolumeAlongPath:
             A wake that lies in the plane.
         """
         check_cut(self.axes[0], self.crossing_angle)
-        centre, turn = self.centre_at(time), np.stack(self.axes)
+        centre, rotation = self.centre_at(time), np.stack(self.axes)
         found = []
         for track in self._tracks:
             s = 0.0
@@ -245,8 +245,8 @@ class VolumeAlongPath:
             for _ in range(30):
                 row, slope = track(self.origin[0] + s), track(self.origin[0] + s, 1)
                 own = np.array([s, row[0] - self.origin[1], row[1] - self.origin[2]])
-                tangent = np.array([1.0, slope[0], slope[1]]) @ turn
-                place = centre + own @ turn
+                tangent = np.array([1.0, slope[0], slope[1]]) @ rotation
+                place = centre + own @ rotation
                 s -= (place[0] - x) / tangent[0]
             steep = tangent[0] / float(np.linalg.norm(tangent))
             radius, circulation = float(row[2]), float(row[3])

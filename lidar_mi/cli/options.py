@@ -11,8 +11,8 @@ from lidar_mi.errors import InputError
 
 def starting(incomplete: str, names: Iterable[str], *patterns: str) -> list[str]:
     """What a shell may complete: names, then files of some patterns and folders here."""
-    beside = incomplete.rpartition("/")[0]
-    here = Path(beside or ("/" if incomplete.startswith("/") else "."))
+    folder = incomplete.rpartition("/")[0]
+    here = Path(folder or ("/" if incomplete.startswith("/") else "."))
     found = sorted(path for pattern in patterns for path in here.glob(pattern) if path.is_file())
     found += sorted(p for p in here.glob("*/") if p.is_dir()) if patterns else []
     files = [f"{path}/" if path.is_dir() else str(path) for path in found]

@@ -58,8 +58,8 @@ def render(
     from lidar_mi.rendering.scene import files_of, render_file
 
     source, definitions = scene_file(scene), _definitions(define or [])
-    beside = source if Path(scene).is_file() else Path(source.name)
-    asked, read = out or beside.with_suffix(".exr"), files_of(source, definitions)
+    near = source if Path(scene).is_file() else Path(source.name)
+    asked, read = out or near.with_suffix(".exr"), files_of(source, definitions)
     check_target(asked, read, overwrite=overwrite)
     path = _image(asked)
     preview = path.with_suffix(".png")

@@ -314,7 +314,7 @@ def _print_wind(wind: "xr.Dataset") -> None:
     if "fit" in wind.attrs:
         _print_vortices(wind)
     if "identical_images" in wind.attrs:
-        output.print(f"warning: {wind.attrs['identical_images']}: no motion can be told from them")
+        output.print(f"warning: {wind.attrs['identical_images']}: they show no motion")
     if "defects" in wind.attrs:
         output.print(f"warning: {wind.attrs['defects']}")
     if "fixed_pattern" in wind.attrs:
@@ -396,12 +396,12 @@ def _print_series(winds: "xr.Dataset") -> None:
     print_table(Table(title, rows, heads, note))
 
 
-def _print_vortices(wind) -> None:
+def _print_vortices(wind: "xr.Dataset") -> None:
     """The numbers of a fitted vortex pair with their standard errors."""
     rows = []
     for name in (n for n in wind.data_vars if f"{n}_stderr" in wind and not wind[n].dims):
         value, stderr = float(wind[name]), float(wind[f"{name}_stderr"])
-        rows.append((name, f"{value:.2f} +- {stderr:.2f} {wind[name].attrs['units']}"))
+        rows.append((str(name), f"{value:.2f} +- {stderr:.2f} {wind[name].attrs['units']}"))
     print_rows(
         f"vortex pair, {wind.attrs['profile'].replace('_', ' ')} ({wind.attrs['fit']})", rows
     )

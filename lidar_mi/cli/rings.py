@@ -1,15 +1,21 @@
 """``lidar-mi rings``: the rings of an etalon in any image, or in a series of them."""
 
 import csv
+import functools
 import io
+import operator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lidar_mi.cli.options import Overwrite, quantity
 from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 EXAMPLES = (
     "Examples: `lidar-mi rings fringes.png` - `lidar-mi rings frame.exr --layer Y "
@@ -102,7 +108,7 @@ def rings(
     output.print(f"image    {path}")
 
 
-def _frames(images: list[Path], layer: str | None):
+def _frames(images: list[Path], layer: str | None) -> Iterator[tuple[str, "np.ndarray"]]:
     """Every frame of the files, each with its name; refused if their sizes differ."""
     from lidar_mi.io.images import read_frames
 
@@ -118,8 +124,16 @@ def _frames(images: list[Path], layer: str | None):
             yield f"{path}[{number}]", frame.astype(float)
 
 
-def _one(images, layer, frame, average, saturation):
+def _one(
+    images: list[Path],
+    layer: str | None,
+    frame: int | None,
+    average: bool,
+    saturation: float | None,
+) -> "np.ndarray":
     """The frame that is asked for, or the mean of all."""
+    import torch
+
     from lidar_mi.io.images import frames_in, read_frames
     from lidar_mi.retrieval.rings.frames import checked
 
@@ -127,11 +141,11 @@ def _one(images, layer, frame, average, saturation):
         frames = list(_frames(images, layer))
         for name, one in frames:
             try:
-                checked(one, saturation)
+                checked(torch.from_numpy(one), saturation)
             except InputError as error:
                 raise InputError(f"{name}: {error}") from None
         _remark([one for _, one in frames])
-        return sum(one for _, one in frames) / len(frames)
+        return functools.reduce(operator.add, (one for _, one in frames)) / len(frames)
     places = [(path, n) for path in images for n in range(frames_in(path, layer)[0])]
     if frame is None and len(places) > 1:
         raise InputError(
@@ -142,11 +156,11 @@ def _one(images, layer, frame, average, saturation):
         raise InputError(
             f"--frame: {number} is not allowed; expected 0 to {len(places) - 1} of {images[0]}"
         )
-    path, one = places[number]
-    return read_frames(path, layer, [one])[0].astype(float)
+    path, within = places[number]
+    return read_frames(path, layer, [within])[0].astype(float)
 
 
-def _remark(frames) -> None:
+def _remark(frames: Sequence["np.ndarray"]) -> None:
     """Frames that are there twice."""
     from lidar_mi.retrieval.checks import identical
 
@@ -154,7 +168,13 @@ def _remark(frames) -> None:
         output.print(f"warning: {same}")
 
 
-def _series(images, layer, options, out, overwrite) -> None:
+def _series(
+    images: list[Path],
+    layer: str | None,
+    options: tuple[tuple[float, float] | None, float | None, float | None],
+    out: Path | None,
+    overwrite: bool,
+) -> None:
     from lidar_mi import __version__
     from lidar_mi.io.target import check_target
     from lidar_mi.io.text import write_text

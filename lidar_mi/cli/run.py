@@ -1,7 +1,8 @@
 """``lidar-mi run``: run an experiment."""
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -9,6 +10,9 @@ from lidar_mi.cli.options import Changes, RunName, Variant
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
+
+if TYPE_CHECKING:
+    from lidar_mi.experiment.schema.experiment import Experiment
 
 EXAMPLES = (
     "Examples: `lidar-mi run wake_backscatter.yaml` (a shipped experiment) - "
@@ -62,7 +66,13 @@ def run(
             output.print(f"{label} {folder / file}")
 
 
-def _run_study(variants, out, path, overwrite, start) -> None:
+def _run_study(
+    variants: Mapping[str, "Experiment"],
+    out: Path | None,
+    path: Path,
+    overwrite: bool,
+    start: Callable[..., Mapping[str, Mapping[str, float]]],
+) -> None:
     """Variants of one experiment, each in its own folder, and their comparison."""
     from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment.folder.run_folder import read_answer
@@ -82,6 +92,6 @@ def _run_study(variants, out, path, overwrite, start) -> None:
     output.print(f"report   {folder / 'report.html'}")
 
 
-def _averaged(experiment) -> tuple[int, ...]:
+def _averaged(experiment: "Experiment") -> tuple[int, ...]:
     """Numbers of images of rings that an experiment averages."""
     return experiment.doppler.retrieval.averaged if experiment.doppler else ()

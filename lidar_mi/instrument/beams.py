@@ -12,7 +12,7 @@ from lidar_mi.instrument.motion import Pose, tilted
 class Beams:
     """Every beam of a scan, in film order: row by row from the top left, or in order of time.
 
-    Light takes the true pose, the retrieval is told the reported one. Lengths in m; x is measured
+    Light takes the true pose, the retrieval knows the reported one. Lengths in m; x is measured
     in the frame of the air, in which the gates are fixed: the telescope is at ``ScanPlan.position``
     at the scan's reference time, and the middle of the gates at ``position + centre``.
 
@@ -23,7 +23,7 @@ class Beams:
     origin, direction : (n, 3) arrays
         True place of the telescope and true unit vectors.
     reported_origin, reported_direction : (n, 3) arrays
-        The same as the retrieval is told them.
+        The same, as the retrieval knows them.
     velocity, reported_velocity : (n, 3) arrays, optional
         Of the telescope less that of straight flight, m/s.
     """

@@ -1,8 +1,8 @@
 """The CCD behind the etalon, with or without gain: detection of photons, and its noise."""
 
 import math
-from collections.abc import Sequence
-from typing import Annotated, Literal
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
@@ -100,7 +100,7 @@ class CCD(Description):
     )
 
     @model_validator(mode="after")
-    def _gain_has_its_kind(self):
+    def _gain_has_its_kind(self) -> Self:
         if self.multiplication == "none" and self.multiplication_gain != 1:
             raise ValueError(
                 f"multiplication_gain: {self.multiplication_gain:g} is not allowed with "
@@ -201,8 +201,8 @@ def expose(
         raise InputError("modes: expected numbers above 0, or inf for no speckle")
     numbers = _image_numbers(images, expected)
     means = expected * ccd.quantum_efficiency
-    light = background * ccd.quantum_efficiency
-    dark = ccd.dark_current * ccd.integration_time * ccd.binning**2
+    light: torch.Tensor | float = background * ccd.quantum_efficiency
+    dark: torch.Tensor | float = ccd.dark_current * ccd.integration_time * ccd.binning**2
     if ccd.response_rms > 0:
         response = _response(ccd, expected)
         means, light = means * response, light * response
@@ -219,7 +219,13 @@ def expose(
     return frames
 
 
-def _read(mean, floor, modes, ccd, generator):
+def _read(
+    mean: torch.Tensor,
+    floor: torch.Tensor | float,
+    modes: torch.Tensor,
+    ccd: CCD,
+    generator: torch.Generator,
+) -> torch.Tensor:
     """One image in photoelectrons."""
     if not bool(torch.isinf(modes).all()):
         shape = modes.expand(mean.shape)
@@ -236,8 +242,8 @@ def _read(mean, floor, modes, ccd, generator):
     return electrons / ccd.multiplication_gain
 
 
-def _output(photoelectrons, ccd, generator):
-    """Electrons that reach the output: multiplied, within the wells, the response bent."""
+def _output(photoelectrons: torch.Tensor, ccd: CCD, generator: torch.Generator) -> torch.Tensor:
+    """Electrons that reach the output: multiplied, clipped at the wells, of nonlinear response."""
     electrons, gain = photoelectrons, ccd.multiplication_gain
     if ccd.multiplication == "iccd":
         electrons = intensified(electrons, gain, ccd.intensifier_excess, generator)
@@ -251,14 +257,14 @@ def _output(photoelectrons, ccd, generator):
     return electrons
 
 
-def _response(ccd, expected):
+def _response(ccd: CCD, expected: torch.Tensor) -> torch.Tensor:
     """Responses of the pixels: those of the chip, whatever is drawn on it."""
     generator = torch.Generator().manual_seed(ccd.response_seed)
     drawn = torch.randn(expected.shape[-2:], generator=generator, dtype=torch.float64)
     return (1 + ccd.pixel_response_rms * drawn).clamp(min=0).to(expected.device)
 
 
-def _bad_pixels(ccd, expected):
+def _bad_pixels(ccd: CCD, expected: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Whether pixels are hot, whether they are dead: those of the chip, no pixel both."""
     height, width = expected.shape[-2:]
     order = np.random.default_rng([ccd.response_seed, 1]).permutation(height * width)
@@ -270,8 +276,8 @@ def _bad_pixels(ccd, expected):
     return rank < hot, (rank >= hot) & (rank < bad)
 
 
-def _generator(seed, number, device):
-    """Streams of all pairs of seed and number are hashed apart."""
+def _generator(seed: int, number: int, device: torch.device) -> torch.Generator:
+    """The stream of a seed and a number, independent of those of all other pairs."""
     for name, value in (("seed", seed), ("images", number)):
         if not isinstance(value, int | np.integer) or value < 0:
             raise InputError(f"{name}: {value!r} is not allowed; expected an integer, 0 or more")
@@ -280,7 +286,7 @@ def _generator(seed, number, device):
     return torch.Generator(device).manual_seed(int(state) >> 1)
 
 
-def _image_numbers(images, expected):
+def _image_numbers(images: int | Iterable[int] | None, expected: torch.Tensor) -> list[int]:
     count = expected.shape[0] if expected.ndim == 3 else None
     if images is None:
         images = count or 1
@@ -292,7 +298,7 @@ def _image_numbers(images, expected):
     return numbers
 
 
-def _check_image(expected, background):
+def _check_image(expected: torch.Tensor, background: float) -> None:
     if expected.ndim not in (2, 3):
         raise InputError(
             f"expected: {expected.ndim} dimensions are not allowed; expected (height, width) or "

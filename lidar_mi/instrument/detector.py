@@ -1,6 +1,6 @@
 """The detector: its description, and the mean photoelectrons of echo, sky and dark current."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -61,7 +61,7 @@ class Detector(Description):
     )
 
     @model_validator(mode="after")
-    def _modes_of_speckle(self):
+    def _modes_of_speckle(self) -> Self:
         if self.speckle_modes is not None and not self.speckle:
             raise ValueError(
                 f"speckle_modes: {self.speckle_modes:g} is not allowed without speckle"

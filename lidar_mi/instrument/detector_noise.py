@@ -223,13 +223,13 @@ def noisy_scan(
 def without_noise(scan: xr.Dataset) -> xr.Dataset:
     """A scan without the variables of `noisy_scan`."""
     noise = ("S0_noisy", "S0_noise_std", "Y_noisy", "Y_noise_std")
-    kept = scan.drop_vars(noise, errors="ignore")
-    kept.attrs = {
+    signal = scan.drop_vars(noise, errors="ignore")
+    signal.attrs = {
         k: value
         for k, value in scan.attrs.items()
         if not k.startswith("detector_") and k != "monte_carlo_fraction"
     }
-    return kept
+    return signal
 
 
 def noise_budget(
@@ -319,7 +319,7 @@ def _plan(scan: xr.Dataset) -> ScanPlan:
     return ScanPlan(scan["y"].values, scan["z"].values, **gates, position=0.0)
 
 
-def _generator(seed) -> np.random.Generator:
+def _generator(seed: int | Sequence[int]) -> np.random.Generator:
     try:
         return np.random.default_rng(np.random.SeedSequence(seed))
     except (TypeError, ValueError):

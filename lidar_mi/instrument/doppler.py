@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
@@ -105,7 +105,7 @@ class DopplerLidar(Description):
     ] = Field(quantity("1 nm"), description="equivalent width of the filter")
 
     @model_validator(mode="after")
-    def _pulse_has_its_width(self):
+    def _pulse_has_its_width(self) -> Self:
         # time-bandwidth product of a Gaussian pulse, 2 ln 2 / pi
         if self.laser_width * self.pulse_duration < 0.44 and self.pulse_duration > 0:
             raise ValueError(
@@ -197,7 +197,7 @@ def filtered_coherence_time(line: Line, transmission: Callable[[np.ndarray], np.
     return float((transmitted**2).sum() / transmitted.sum() ** 2 / (nu[1] - nu[0]))
 
 
-def _behind_etalon(etalon, line, order):
+def _behind_etalon(etalon: Etalon, line: Line, order: float) -> Callable[[np.ndarray], np.ndarray]:
     """Transmission as a function of the frequency, in the place of a fractional order."""
     amplitudes = harmonics(etalon, line.wavelength)
     spectral_range = etalon.free_spectral_range(line.wavelength)

@@ -67,10 +67,10 @@ class DopplerScan(Description):
         middles stay in the plane, or at the distance from where it was at the reference time.
         """
         directions = self.directions() if beams is None else beams.reported_direction
-        flown = 0.0 if beams is None else beams.reported_origin[:, 0]
+        advance = 0.0 if beams is None else beams.reported_origin[:, 0]
         if self.gates == "planar":
-            return (lidar.range - flown) / directions[:, 0]
-        return np.full(len(directions), lidar.range) - flown
+            return (lidar.range - advance) / directions[:, 0]
+        return np.full(len(directions), lidar.range) - advance
 
 
 class PlatformErrors(Description):
@@ -100,7 +100,7 @@ class PlatformErrors(Description):
 def pointed(directions: np.ndarray, errors: PlatformErrors, seed: int = 0) -> np.ndarray:
     """True lines of sight, (n, 3), for the assumed directions.
 
-    The attitude rotates all alike (yaw, pitch, roll, in this order), then each one is tilted by
+    The attitude rotates all of them (yaw, pitch, roll, in this order), then each one is tilted by
     normally distributed small angles about two axes perpendicular to it.
     """
     missed = attitude(errors.roll, errors.pitch, errors.yaw)
@@ -274,10 +274,10 @@ def scan_wind(
     steered = directions if beams is None else beams.direction
     actual = pointed(steered, errors, int(jitter_seed))
     points, weights = sight_volumes(actual, ranges, lidar)
-    velocity = told = np.array([speed, 0.0, 0.0])
+    velocity = reported = np.array([speed, 0.0, 0.0])
     if beams is not None:
         points = points + beams.origin[:, None]
-        velocity, told = velocity + beams.velocity, told + beams.reported_velocity
+        velocity, reported = velocity + beams.velocity, reported + beams.reported_velocity
     if isinstance(wind, xr.Dataset):
         met = wind_of_lines(wind, points, None if beams is None else beams.time)
     else:
@@ -295,7 +295,7 @@ def scan_wind(
             "range_bin": ((), lidar.range_bin, {"units": "m", "long_name": "length of range bin"}),
             "platform_velocity": _variable(
                 "axis" if beams is None else ("line", "axis"),
-                told,
+                reported,
                 "m s-1",
                 "velocity of the platform",
             ),
@@ -319,7 +319,9 @@ def scan_wind(
 _LOS = "velocity toward the instrument along the line of sight"
 
 
-def _variable(dims, values, units, long_name):
+def _variable(
+    dims: str | tuple[str, ...], values: np.ndarray, units: str, long_name: str
+) -> tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]:
     return dims, values, {"units": units, "long_name": long_name}
 
 

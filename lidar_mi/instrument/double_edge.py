@@ -1,13 +1,13 @@
 """The double-edge receiver: two Fabry-Perot filters, one on each flank of the line.
 
-Two etalons alike but for their gaps transmit peaks ``spacing`` apart, the laser's frequency in the
-middle. A Doppler shift moves the line toward one peak and away from the other; the ratio of the
-two signals is the measurement (Flesia & Korb 1999, Appl. Opt. 38, 432). The light falls
+Two etalons that differ in their gaps alone transmit peaks ``spacing`` apart, the laser's frequency
+in the middle. A Doppler shift moves the line toward one peak and away from the other; the ratio of
+the two signals is the measurement (Flesia & Korb 1999, Appl. Opt. 38, 432). The light falls
 through the etalons as a collimated beam onto one detector each.
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,7 +47,7 @@ class DoubleEdge(Description):
     )
 
     @model_validator(mode="after")
-    def _reflects_what_it_does_not_transmit(self):
+    def _reflects_what_it_does_not_transmit(self) -> Self:
         if self.arrangement == "sequential" and (self.etalon.absorption or self.etalon.coatings):
             raise ValueError(
                 "arrangement: sequential is not allowed with absorption or coatings; expected "
@@ -91,7 +91,7 @@ def harmonics(receiver: DoubleEdge, wavelength: float) -> np.ndarray:
     )
 
 
-def _both_sides(amplitudes):
+def _both_sides(amplitudes: np.ndarray) -> np.ndarray:
     """Coefficients of a real series for n from -K to K."""
     return np.concatenate([amplitudes[:0:-1].conj(), amplitudes])
 

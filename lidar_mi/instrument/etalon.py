@@ -12,7 +12,7 @@ The Mitsuba plugin `etalon` computes the same transmission ray by ray; tests com
 """
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -96,7 +96,7 @@ class Etalon(Description):
     )
 
     @model_validator(mode="after")
-    def _mirrors_make_sense(self):
+    def _mirrors_make_sense(self) -> Self:
         if self.reflectivity + self.absorption >= 1:
             raise ValueError(
                 f"absorption: {self.absorption:g} is not allowed with reflectivity "
@@ -258,7 +258,7 @@ def transmission(
     cosine, offset : array
         Of the angle inside the gap; frequency less that of the laser, Hz.
     line : lidar_mi.atmosphere.line.Line, optional
-        Average over this line, moved by ``offset``; default: monochromatic light.
+        Average over this line, shifted by ``offset``; default: monochromatic light.
     """
     order = fractional_order(etalon, wavelength, cosine, offset)
     return series(harmonics(etalon, wavelength, line), torch.as_tensor(order)).numpy()
@@ -308,19 +308,25 @@ def coated_transmission(
     return abs(t**2 / (1 - r**2 * round_trip)) ** 2
 
 
-def _round_trip(etalon, wavelength, cosine, offset):
+def _round_trip(
+    etalon: Etalon, wavelength: float, cosine: ArrayLike, offset: ArrayLike
+) -> np.ndarray:
     """Phase factor of a round trip through the gap, without the mirrors'."""
     gap = 2 * etalon.index * etalon.tuned_gap(wavelength) / wavelength
     return np.exp(2j * np.pi * _less_whole_orders(gap, gap, wavelength, cosine, offset))
 
 
-def _less_whole_orders(centre, gap, wavelength, cosine, offset):
+def _less_whole_orders(
+    centre: float, gap: float, wavelength: float, cosine: ArrayLike, offset: ArrayLike
+) -> np.ndarray:
     relative = np.asarray(offset, float) * wavelength / constants.c
     change = gap * (np.asarray(cosine, float) * (1 + relative) - 1)
     return (centre - math.floor(centre)) + change
 
 
-def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
+def _mirror_amplitudes(
+    etalon: Etalon, wavelength: float, cosine: ArrayLike, offset: ArrayLike, polarization: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Of one mirror: reflection in the gap, transmission.
 
     Characteristic matrices of the layers (Macleod 2010, Thin-Film Optical Filters, chap. 2) for
@@ -334,7 +340,7 @@ def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
     wavenumber = 2 * np.pi * (1 / wavelength + np.asarray(offset, float) / constants.c)
     across = etalon.index**2 * (1 - cosine**2)
 
-    def admittance(index):
+    def admittance(index: complex) -> tuple[np.ndarray, np.ndarray]:
         slope = np.sqrt(index**2 - across + 0j) / index
         return (index * slope if polarization == "s" else index / slope), slope
 

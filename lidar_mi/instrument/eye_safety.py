@@ -50,7 +50,7 @@ class ViewingAid:
     objective: float = 0.05
     transmission: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _positive("viewing_aid.magnification", self.magnification, "")
         _positive("viewing_aid.objective", self.objective, " m")
         _positive("viewing_aid.transmission", self.transmission, "")
@@ -412,7 +412,9 @@ def _grouping_time(nm: float) -> float:
     return 5e-6 if nm < 1050 else 13e-6
 
 
-def _repeated(wavelength: float, pulse: float, rate: float, total: float, burst) -> float:
+def _repeated(
+    wavelength: float, pulse: float, rate: float, total: float, burst: tuple[float, float]
+) -> float:
     grouping = _grouping_time(_nanometres(wavelength))
     if pulse > grouping:
         return permissible_exposure(wavelength, pulse)

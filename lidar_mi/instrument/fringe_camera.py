@@ -240,7 +240,9 @@ def ring_radii(
     return camera.focal_length * np.sqrt(sine2 / (1 - sine2)) / camera.pixel
 
 
-def _passed(camera, etalon, line, speeds, subsamples):
+def _passed(
+    camera: FringeCamera, etalon: Etalon, line: Line, speeds: np.ndarray, subsamples: int
+) -> tuple[torch.Tensor, float]:
     """Light behind the etalon (N, height, width), and the sum of what came."""
     if subsamples not in _NODES:
         raise InputError(f"subsamples: {subsamples!r} is not allowed; expected 1 or 2")
@@ -263,8 +265,8 @@ def _passed(camera, etalon, line, speeds, subsamples):
     return passed, light
 
 
-def _check(name, value, good, allowed):
-    value, good = np.atleast_1d(value), np.atleast_1d(good)
-    good = good & np.isfinite(value)
-    if not good.all():
-        raise InputError(f"{name}: {value[~good][0]:g} is not allowed; expected {allowed}")
+def _check(name: str, value: np.ndarray | float, good: np.ndarray | bool, allowed: str) -> None:
+    values = np.atleast_1d(value)
+    fine = np.atleast_1d(good) & np.isfinite(values)
+    if not fine.all():
+        raise InputError(f"{name}: {values[~fine][0]:g} is not allowed; expected {allowed}")

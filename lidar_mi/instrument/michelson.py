@@ -99,5 +99,5 @@ def transmission(michelson: Michelson, offset: ArrayLike) -> np.ndarray:
     array (outputs x elements, N)
     """
     constant, cosine = harmonics(michelson).T[..., None]
-    turn = np.exp(2j * math.pi * np.asarray(offset, float) * michelson.delay)
-    return constant.real + 2 * (cosine * turn).real
+    phasor = np.exp(2j * math.pi * np.asarray(offset, float) * michelson.delay)
+    return constant.real + 2 * (cosine * phasor).real

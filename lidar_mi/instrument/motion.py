@@ -6,7 +6,7 @@ Pitch is positive nose up, yaw nose to port, roll port wing up.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal, Self, cast
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_serializer, field_validator, model_validator
@@ -48,7 +48,7 @@ class Sinusoid(Description):
         return f"{value!r} {'rad' if self.axis in ANGLES else 'm'}"
 
     @model_validator(mode="after")
-    def _small_angle(self):
+    def _small_angle(self) -> Self:
         if self.axis in ANGLES and self.amplitude > 1:
             raise ValueError(
                 f"amplitude: {self.amplitude:g} rad is not allowed; expected at most 1 rad, with "
@@ -77,7 +77,7 @@ class Motion(Description):
     )
 
     @model_validator(mode="after")
-    def _one_attitude(self):
+    def _one_attitude(self) -> Self:
         if self.trajectory is not None and self.attitude is not None:
             raise ValueError("attitude: not allowed with trajectory, which has it; expected one")
         return self
@@ -209,7 +209,7 @@ def random_process(
 
 
 def true_pose(
-    motion: Motion, time: np.ndarray, speed: float, seed: int, flown: Trajectory | None = None
+    motion: Motion, time: np.ndarray, speed: float, seed: int, path: Trajectory | None = None
 ) -> Pose:
     """The true pose at times since the first scan.
 
@@ -222,7 +222,7 @@ def true_pose(
         Of straight flight, m/s.
     seed : int
         Of the experiment.
-    flown : Trajectory
+    path : Trajectory
         Of ``motion.trajectory``.
 
     Raises
@@ -231,7 +231,7 @@ def true_pose(
         See `Trajectory.at`.
     """
     time = np.asarray(time, float)
-    given = flown.at(time, speed) if flown else None
+    recorded = path.at(time, speed) if path else None
     offset = {axis: np.zeros(len(time)) for axis in (*PLACES, *ANGLES)}
     rate = {axis: np.zeros(len(time)) for axis in PLACES}
     for one in motion.sinusoids:
@@ -248,8 +248,10 @@ def true_pose(
             )
     place, velocity = (np.stack([parts[axis] for axis in PLACES], -1) for parts in (offset, rate))
     turned = attitude(*(offset[axis] for axis in ANGLES))
-    if given is None:
+    if recorded is None:
         return Pose(place, velocity, turned)
     return Pose(
-        given.place + place, given.velocity + velocity, cast(Rotation, given.attitude * turned)
+        recorded.place + place,
+        recorded.velocity + velocity,
+        cast(Rotation, recorded.attitude * turned),
     )

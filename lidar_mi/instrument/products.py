@@ -62,7 +62,7 @@ def depolarization_stderr_bound(
         <s^2> / n = stderr(S0)^2 + S0^2 / n.
 
     No smaller bound is certain: it would be reached if few samples contributed all the
-    depolarisation. In single scattering, where all samples of a beam are nearly alike, the error is
+    depolarisation. In single scattering, where all samples of a beam are nearly equal, the error is
     orders of magnitude smaller.
 
     Parameters
@@ -258,5 +258,5 @@ def untrusted_pixels(scan: xr.Dataset) -> str | None:
         return None
     return (
         f"in {untrusted} of {lit} pixels that receive light one Monte Carlo sample carries half of "
-        "the variance or more; their standard errors cannot be trusted; expected more samples"
+        "the variance or more; their standard errors are unreliable; expected more samples"
     )

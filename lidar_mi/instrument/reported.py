@@ -1,4 +1,4 @@
-"""What is told of the platform's pose: the truth, late and with the errors of a navigation unit.
+"""The reported pose of the platform: the truth, late and with the errors of a navigation unit.
 
 Errors are truth minus the reported value, in the lidar's frame.
 """

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -74,7 +74,7 @@ class Scan(Description):
         return self.timing.pulses_per_beam if self.timing else 1
 
     @model_validator(mode="after")
-    def _fits_into_memory(self):
+    def _fits_into_memory(self) -> Self:
         count = self.columns * self.rows
         if count > MOST_BEAMS:
             raise ValueError(
@@ -128,7 +128,7 @@ class ScanPlan:
         """1 / cos of the angle between beam and x axis, (rows, columns), y and z ascending.
 
         With ``beams`` of the reported ones, as are `ranges` and `gate_length`: an instrument
-        corrects its signal by the geometry that it is told.
+        corrects its signal by the geometry that it knows.
         """
         if self.beams is not None:
             return self.as_image(1 / self.beams.reported_direction[:, 0])

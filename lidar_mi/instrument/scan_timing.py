@@ -7,7 +7,7 @@ of rate and acceleration are those of a scanner with one mirror for each axis.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -114,7 +114,7 @@ class ScanTiming(Description):
     ) = Field(None, description="of the scanner, on each axis")
 
     @model_validator(mode="after")
-    def _keys_of_the_pattern(self):
+    def _keys_of_the_pattern(self) -> Self:
         pattern, given = self.pattern, (self.duration, self.beam_rate)
         for key, used, default in (
             ("cycles", _CURVES, None),
@@ -240,10 +240,10 @@ class ScanTiming(Description):
             step = _largest(np.diff(slow))
             width = abs(fast[-1] - fast[0]) * len(fast) / max(1, len(fast) - 1)
             back = width if self.pattern == "raster" else 0.0
-            turn = 4 * (rate + _ratio(back, dead)) if back else 2 * rate
+            change = 4 * (rate + _ratio(back, dead)) if back else 2 * rate
             rate = max(rate + 2 * _ratio(back, dead), 2 * _ratio(step, dead))
             acceleration = max(
-                acceleration, _ratio(turn, dead), 4 * _ratio(_ratio(step, dead), dead)
+                acceleration, _ratio(change, dead), 4 * _ratio(_ratio(step, dead), dead)
             )
         return Load(rate, acceleration)
 

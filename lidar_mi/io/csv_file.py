@@ -1,6 +1,7 @@
 """Tables as comma-separated text: one row a vector, units in the head, flags also in words."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,8 +12,8 @@ from lidar_mi.io.text import write_text
 def write_csv(path: str | Path, data: xr.Dataset) -> None:
     """Write all values of a data set, one row for each place.
 
-    Columns are coordinates, then variables, as ``v [m s-1]``; numbers that the whole data set
-    shares are repeated in every row. After a column of flags, ``flag in words`` has the reasons,
+    Columns are coordinates, then variables, as ``v [m s-1]``; numbers of the whole data set
+    are repeated in every row. After a column of flags, ``flag in words`` has the reasons,
     or ``valid``. Missing numbers are ``NaN``.
 
     Raises
@@ -38,7 +39,7 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     write_text(path, table.rename(columns=heads).to_csv(index=False, na_rep="NaN"))
 
 
-def _in_words(flags: np.ndarray, attributes: dict) -> list[str]:
+def _in_words(flags: np.ndarray, attributes: dict[str, Any]) -> list[str]:
     """Reasons of every flag, ``valid`` where there is none."""
     masks = np.atleast_1d(attributes["flag_masks"]).astype(int)
     names = attributes["flag_meanings"].split()

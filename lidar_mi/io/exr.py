@@ -15,6 +15,7 @@ file has the layers ``S0`` ... ``S3``, ``S0_stderr`` and ``Y``, in the camera's 
 """
 
 import re
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -108,7 +109,7 @@ def read_fringes(path: str | Path) -> xr.Dataset:
     return label_fringes({name: layers[name] for name in QUANTITIES}, header)
 
 
-def label_fringes(layers: dict[str, np.ndarray], attributes: dict) -> xr.Dataset:
+def label_fringes(layers: dict[str, np.ndarray], attributes: dict[str, Any]) -> xr.Dataset:
     """Layers (height, width) of a fringe camera with names, units and pixel numbers as axes."""
     rows, columns = layers["S0"].shape
     image = xr.Dataset(
@@ -125,7 +126,7 @@ def label_fringes(layers: dict[str, np.ndarray], attributes: dict) -> xr.Dataset
     return image
 
 
-def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> None:
+def _write(path: Path, attributes: dict[str, Any], channels: dict[str, np.ndarray]) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for key, value in attributes.items():
         header[key] = value.astype(np.float32) if isinstance(value, np.ndarray) else value
@@ -147,12 +148,12 @@ def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> Non
     write_atomically(path, buffer.getvalue())
 
 
-def read_header(path: str | Path) -> dict:
+def read_header(path: str | Path) -> dict[str, Any]:
     """Header attributes of any EXR file; errors as of `read_layers`."""
     return _read(path, header_only=True)[0]
 
 
-def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
+def read_layers(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header attributes and all layers of any EXR file, rows from the top.
 
     Raises
@@ -163,7 +164,9 @@ def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
     return _read(path)
 
 
-def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[str, np.ndarray]]:
+def _read(
+    path: str | Path, *, header_only: bool = False
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an OpenEXR image")
@@ -189,7 +192,7 @@ def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[st
     return header, layers
 
 
-def _layers(parts) -> dict[str, np.ndarray]:
+def _layers(parts: Sequence[Any]) -> dict[str, np.ndarray]:
     """Pixels by the names of channels; of several parts by PART.CHANNEL."""
     names = [part.name() if len(parts) > 1 else "" for part in parts]
     found = {}
@@ -200,7 +203,7 @@ def _layers(parts) -> dict[str, np.ndarray]:
     return found
 
 
-def axis_of(header: dict, name: str, size: int, path: str | Path) -> np.ndarray:
+def axis_of(header: dict[str, Any], name: str, size: int, path: str | Path) -> np.ndarray:
     """A header's axis of an image, ascending, m.
 
     Raises
@@ -293,7 +296,9 @@ def _once_per_scan(scan: xr.Dataset) -> list[str]:
     ]
 
 
-def unpack(image: np.ndarray, names: list[str], gates: int) -> dict[str, tuple]:
+def unpack(
+    image: np.ndarray, names: list[str], gates: int
+) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
     """A rendered tensor (rows from the top, y falling) as variables on (gate, z, y), ascending."""
     rows, columns, _ = image.shape
     values = image.reshape(rows, columns, gates, len(names))[::-1, ::-1]

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.exr import read_header
@@ -31,7 +32,7 @@ def steps_of(paths: Sequence[str | Path]) -> list[float] | None:
     return [_step(*pair) for pair in pairwise(headers)]
 
 
-def _step(earlier: dict, later: dict) -> float:
+def _step(earlier: dict[str, Any], later: dict[str, Any]) -> float:
     """The time between two images of a run; negative if the telescope has gone backwards."""
     dt = _rounded(earlier["dt"])
     way = later["telescope_position"] - earlier["telescope_position"]
@@ -43,7 +44,7 @@ def _rounded(seconds: float) -> float:
     return float(f"{seconds:.6g}")  # headers hold float32
 
 
-def _header(path: str | Path) -> dict:
+def _header(path: str | Path) -> dict[str, Any]:
     try:
         return read_header(path)
     except InputError:  # an image of another kind

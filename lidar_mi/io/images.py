@@ -99,7 +99,7 @@ def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
     return frames.count, frames.channels
 
 
-def _numbered(path, frames, numbers):
+def _numbered(path: Path, frames: Frames, numbers: Sequence[int]) -> np.ndarray:
     for number in numbers:
         if not 0 <= number < frames.count:
             raise InputError(
@@ -238,7 +238,9 @@ def read_images(
     return [_on_axes(path, layer, spacing, one.astype(float)) for one in images]
 
 
-def _on_axes(path, layer, spacing, pixels):
+def _on_axes(
+    path: str | Path, layer: str | None, spacing: float | None, pixels: np.ndarray
+) -> xr.DataArray:
     """Pixels, top row first, on the axes of their file or of even spacing."""
     if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")
@@ -316,7 +318,7 @@ def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | N
     Returns
     -------
     xr.Dataset, dims (z, y), or None
-        `beam_time` (s) and, where the pixels are beams beside the nodes, `y_reported` and
+        `beam_time` (s) and, where the pixels are beams that miss the nodes, `y_reported` and
         `z_reported` (m). The attribute `frozen_air` is 1 if all beams saw the air of the scan's
         reference time, as simulated ones may. None if the file does not state times.
 

@@ -1,6 +1,7 @@
 """Aircraft of JSBSim: the files that it ships, and copies on which a wake acts."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -52,11 +53,13 @@ def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
     tree.write(path)
 
 
-def _main(path):
+def _main(path: Path) -> bool:
     return path.stem == path.parent.name
 
 
-def _vector(parent, tag, values, **attributes):
+def _vector(
+    parent: ElementTree.Element, tag: str, values: Sequence[str], **attributes: str
+) -> None:
     element = ElementTree.SubElement(parent, tag, attributes)
     for axis, value in zip(AXES, values, strict=True):
         ElementTree.SubElement(element, axis).text = value

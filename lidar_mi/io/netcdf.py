@@ -15,6 +15,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
+from lidar_mi.io.compression import compression
 from lidar_mi.io.size import check_size
 
 # What never written cells hold (NC_FILL_* of netcdf.h), but in types of one byte, which the library
@@ -31,10 +32,6 @@ _NEVER_WRITTEN = {
 }
 # How files begin, what they are, and what makes NetCDF that is read of them.
 _KINDS = (
-    (b"\x1f\x8b", "is compressed with gzip", "gunzip {0}"),
-    (b"BZh", "is compressed with bzip2", "bunzip2 {0}"),
-    (b"\xfd7zXZ", "is compressed with xz", "unxz {0}"),
-    (b"\x28\xb5\x2f\xfd", "is compressed with zstd", "unzstd {0}"),
     (b"PK\x03\x04", "is a zip archive", "unzip {0}"),
     (b"\x0e\x03\x13\x01", "is HDF4", "ncks {0} out.nc"),
     (b"GRIB", "is GRIB", "cdo -f nc4 copy {0} out.nc"),
@@ -49,7 +46,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     """A NetCDF-4 or NetCDF-3 file, its times as numbers, its values read when they are asked for.
 
     Values are unpacked and missing ones NaN, as CF says: ``_FillValue``, ``missing_value`` and,
-    without ``_FillValue``, what the library writes into cells that nobody wrote. The limits
+    without ``_FillValue``, what the library writes into cells that were never written. The limits
     ``valid_min``, ``valid_max`` and ``valid_range`` hold in `load_variable`.
 
     Raises
@@ -72,7 +69,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
             raise _damaged(path, error) from None
 
 
-def _open(path, **how) -> xr.Dataset:
+def _open(path: str | Path, **how: Any) -> xr.Dataset:
     """The data set of a file, by the library that reads its kind."""
     path = Path(path)
     kind = _kind(path)
@@ -119,6 +116,9 @@ def _kind(path: Path) -> str:
         ) from None
     if magic[:3] == b"CDF" and magic[3:4] in (b"\x01", b"\x02", b"\x05"):
         return f"CDF-{magic[3]}"
+    if packed := compression(magic):
+        name, program = packed
+        raise InputError(f"{path}: is compressed with {name}; {_convert(f'{program} {{0}}', path)}")
     for begin, what, command in _KINDS:
         if magic.startswith(begin):
             raise InputError(f"{path}: {what}; {_convert(command, path)}")
@@ -132,7 +132,7 @@ def _convert(command: str, path: Path, wanted: str = "NetCDF-4 or NetCDF-3 class
     return f"expected {wanted}: {command.format(shlex.quote(str(path)))}"
 
 
-def _declared(path):
+def _declared(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
     """Bytes read on opening and the largest chunk read for a value; filters that are missing."""
     found: list[tuple[str, int]] = []
     filters: dict[int, str] = {}
@@ -172,7 +172,7 @@ def _missing_filters(variable: h5py.Dataset) -> dict[int, str]:
 def _mark_missing(variable: xr.Variable) -> None:
     """Let xarray find what CF calls missing and it does not.
 
-    What the library writes into cells that nobody wrote; the sign of ``missing_value`` where
+    What the library writes into cells that were never written; the sign of ``missing_value`` where
     ``_Unsigned`` changes that of the values.
     """
     attributes, kind = variable.attrs, variable.dtype
@@ -261,7 +261,7 @@ def valid_range(variable: xr.DataArray, path: str | Path) -> tuple[float, float]
     return limits[0], limits[1]
 
 
-def _damaged(path, error):
+def _damaged(path: str | Path, error: Exception) -> InputError:
     reason = next(iter(str(error).splitlines()), "") or type(error).__name__
     return InputError(f"{path}: is damaged ({reason}); allowed: a whole NetCDF file")
 

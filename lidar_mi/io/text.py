@@ -61,7 +61,7 @@ def _encoding(content: bytes) -> str | None:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         with suppress(UnicodeDecodeError):
             return "UTF-16" if "\n" in content.decode("utf-16") else None
-    # control characters beside tabs, ends of lines and pages are in no text
+    # control characters other than tabs, ends of lines and pages are in no text
     return None if re.search(rb"[\x00-\x08\x0e-\x1f\x7f]", content) else "LATIN1"
 
 

@@ -62,7 +62,7 @@ def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about:
     write_json(path, data)
 
 
-def _as_data(fit: VortexPairFit) -> dict:
+def _as_data(fit: VortexPairFit) -> dict[str, Any]:
     return {
         "success": fit.success,
         "reasons": list(fit.reasons),
@@ -126,7 +126,7 @@ def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
     return {name: _from_data(fit, f"{path}: fits.{name}") for name, fit in data["fits"].items()}
 
 
-def _from_data(data: dict, where: str) -> VortexPairFit:
+def _from_data(data: dict[str, Any], where: str) -> VortexPairFit:
     try:
         parameters = np.array(data["parameters"], dtype=float)
         covariance = np.array(data["covariance"], dtype=float)

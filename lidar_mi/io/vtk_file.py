@@ -1,7 +1,9 @@
 """VTK files: fields on grids and at points in space, for ParaView and its kin."""
 
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -51,7 +53,7 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
     """
     kind, shape = suffix(data), data[[*AXES]].sizes
     dims = tuple(map(str, shape)) if kind in (".vts", ".vtu") else AXES
-    points = {}
+    points: dict[str, np.ndarray | tuple[np.ndarray, ...]] = {}
     for name, variable in data.variables.items():
         there = set(variable.dims) & set(dims) or (kind == ".vtu" and not variable.dims)
         if variable.dtype.kind in "iuf" and name not in AXES and there:
@@ -59,7 +61,7 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
     if {"v", "w"} <= set(data.data_vars) and set(data["v"].dims) & set(dims):
         v, w = (_values(data[name], data, dims) for name in ("v", "w"))
         u = _values(data["u"], data, dims) if "u" in data else np.zeros_like(v)
-        points["wind [m s-1]"] = u, v, w  # type: ignore[assignment]
+        points["wind [m s-1]"] = u, v, w
     axes = [np.atleast_1d(data[axis].values).astype(float) for axis in AXES]
     start: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
@@ -86,7 +88,12 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
         write_atomically(path, file.with_suffix(kind).read_bytes())
 
 
-def _legacy(start, steps, sizes, points) -> bytes:
+def _legacy(
+    start: Sequence[float],
+    steps: Sequence[float],
+    sizes: Sequence[int],
+    points: Mapping[str, np.ndarray | tuple[np.ndarray, ...]],
+) -> bytes:
     """VTK's legacy format: big endian, white space in names as in a URL."""
     rows = {"DIMENSIONS": sizes, "ORIGIN": start, "SPACING": steps}
     text = [f"# vtk DataFile Version 3.0\n# software: lidar-mi {__version__}\nBINARY"]
@@ -118,5 +125,5 @@ def _values(variable: xr.DataArray, data: xr.Dataset, dims: tuple[str, ...]) -> 
     """On all nodes, in the memory layout that VTK has: x runs fastest."""
     sizes = {dim: data.sizes.get(dim, 1) for dim in dims}
     missing = {dim: size for dim, size in sizes.items() if dim not in variable.dims}
-    full = variable.variable.set_dims({**missing, **variable.sizes}).transpose(*dims).values
-    return np.asfortranarray(full)
+    own: Any = variable.variable  # xarray states no types for its `set_dims`
+    return np.asfortranarray(own.set_dims(missing | dict(variable.sizes)).transpose(*dims).values)

@@ -1,8 +1,9 @@
 """Wake flows from NetCDF files with CF units: read, checked, in SI units on ascending axes."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pint
@@ -50,7 +51,7 @@ def _numbers(variable: xr.DataArray, path: Path) -> np.ndarray:
     return load_variable(variable, path).values.astype(float)
 
 
-def _file_names(names, path):
+def _file_names(names: Mapping[str, str] | None, path: Path) -> tuple[dict[str, str], set[str]]:
     """Our name -> the file's, for all dimensions and variables; and those of opposite sign."""
     known = (*_DIMENSIONS, *_VARIABLES)
     names, opposite = dict(names or {}), set()
@@ -77,7 +78,9 @@ def _file_names(names, path):
     return table, opposite
 
 
-def _pick_time(data, name, time, path):
+def _pick_time(
+    data: xr.Dataset, name: str, time: float | None, path: Path
+) -> tuple[xr.Dataset, float | None]:
     """The data set at one time, without the dimension, and that time in s (None: unknown)."""
     if name not in data.dims and name not in data.variables:
         if time is None:
@@ -122,14 +125,16 @@ def _pick_time(data, name, time, path):
     return data.isel({name: index}) if name in data.dims else data, float(times[index])
 
 
-def _rounding(variable, values):
+def _rounding(variable: xr.DataArray, values: np.ndarray) -> np.ndarray:
     """To which the file rounds a variable's values; integers are as they were meant."""
     kind = np.dtype(variable.encoding.get("dtype", variable.dtype))
     half = np.spacing(np.abs(values).astype(kind)) / 2 if kind.kind == "f" else 0.0 * values
     return half.astype(float)
 
 
-def _axis(data, name, ours, path, sign):
+def _axis(
+    data: xr.Dataset, name: str, ours: str, path: Path, sign: float
+) -> tuple[np.ndarray, bool]:
     """The axis in metres, ascending, exact if it is even, and whether the file's descends."""
     if name not in data.variables:
         raise InputError(
@@ -159,7 +164,13 @@ def _axis(data, name, ours, path, sign):
     return (exact if is_even(values) else values), falls
 
 
-def _positive_down(data, table, sign, heights, path) -> list[str]:
+def _positive_down(
+    data: xr.Dataset,
+    table: Mapping[str, str],
+    sign: Mapping[str, float],
+    heights: Iterable[str],
+    path: Path,
+) -> list[str]:
     """Axes of heights that the file says to be depths, unless the sign is changed by their name."""
     down = [
         name
@@ -179,7 +190,7 @@ def _positive_down(data, table, sign, heights, path) -> list[str]:
     return down
 
 
-def _plane_index(axis, x, path, name):
+def _plane_index(axis: np.ndarray, x: float, path: Path, name: str) -> int:
     """Index of the plane nearest to x, which must lie in one of the planes' cells."""
     half = (axis[1] - axis[0]) / 2 if axis.size > 1 else 0.0
     # rounding of the file's axis, whatever its origin; of a single plane 1 mm
@@ -192,7 +203,14 @@ def _plane_index(axis, x, path, name):
     return int(np.argmin(np.abs(axis - x)))
 
 
-def _check_values(values, axes, name, path, may_be_negative, limits):
+def _check_values(
+    values: np.ndarray,
+    axes: Mapping[str, np.ndarray],
+    name: str,
+    path: Path,
+    may_be_negative: bool,
+    limits: tuple[float, float],
+) -> None:
     """Every value finite and, unless it may, not negative; ``limits``: those of valid values."""
     low, high = limits
     within = f", valid ones are {low:g} to {high:g}" if low > -np.inf or high < np.inf else ""
@@ -240,7 +258,7 @@ def read_wake(
     x : float, optional
         m; keeps the one plane nearest to it. Default: all planes.
     require : iterable of str
-        Variables that must be present besides v and w, out of u, tracer, aerosol.
+        Variables that must be present in addition to v and w: u, tracer, aerosol.
 
     Returns
     -------
@@ -253,8 +271,8 @@ def read_wake(
     ------
     InputError
         Naming file and variable: unreadable, missing, wrong dims or units, values that are not
-        finite, a tracer or aerosol that is asked for and negative somewhere, axes that turn
-        back, a time or plane that is not there.
+        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not
+        monotonic, a time or plane that is not there.
     """
     path = Path(path)
     table, opposite = _file_names(names, path)
@@ -269,7 +287,7 @@ def read_wake(
         return _read(data, table, sign, asked, time, x, path)
 
 
-def _hint(name, table, there):
+def _hint(name: str, table: Mapping[str, str], there: Iterable[Any]) -> str:
     """How to give the name in the file, or the one there that is nearest to the name given."""
     if table[name] != name:
         others = [str(one) for one in there]
@@ -281,12 +299,14 @@ def _hint(name, table, there):
     return f"; expected wake.names: {{{name}: its name there}}{none}"
 
 
-def _own_dims(data, table, name, spatial) -> dict[str, str]:
+def _own_dims(
+    data: xr.Dataset, table: Mapping[str, str], name: str, spatial: Mapping[str, str]
+) -> dict[str, str]:
     """The dimensions in space of a variable, and which of ours each is; empty: others.
 
     One of them may be staggered: another than that of the other variables, with values of its own.
     """
-    dims = [d for d in data[table[name]].dims if d != table["time"]]
+    dims = [str(d) for d in data[table[name]].dims if d != table["time"]]
     missing = [d for d in spatial if d not in dims]
     extra = [d for d in dims if d not in spatial]
     if len(missing) != len(extra) or len(extra) > 1 or any(d not in data.variables for d in extra):
@@ -295,7 +315,7 @@ def _own_dims(data, table, name, spatial) -> dict[str, str]:
     return {d: spatial[staggered.get(d, d)] for d in dims}
 
 
-def _in_the_ground(variable, height, path) -> int:
+def _in_the_ground(variable: xr.DataArray, height: str, path: Path) -> int:
     """Number of lowest levels at which a variable has no value, as solvers mask the ground."""
     last = variable.sizes[height] - 1
     for level in range(last):
@@ -304,12 +324,20 @@ def _in_the_ground(variable, height, path) -> int:
     return 0
 
 
-def _staggered(own, spatial) -> set[str]:
+def _staggered(own: Mapping[str, Mapping[str, str]], spatial: Mapping[str, str]) -> set[str]:
     """Axes that some variable has at nodes of its own."""
     return {ours for dims in own.values() for d, ours in dims.items() if d not in spatial}
 
 
-def _read(data, table, sign, asked, time, x, path):
+def _read(
+    data: xr.Dataset,
+    table: Mapping[str, str],
+    sign: Mapping[str, float],
+    asked: Collection[str],
+    time: float | None,
+    x: float | None,
+    path: Path,
+) -> xr.Dataset:
     for name in _VARIABLES:
         if name in asked and table[name] not in data.data_vars:
             raise InputError(
@@ -372,9 +400,9 @@ def _read(data, table, sign, asked, time, x, path):
         index = _plane_index(axes["x"], x, path, table["x"])
         axes["x"] = axes["x"][index : index + 1]
         # planes that are not needed are not read
-        kept = found.get(table["x"], axes["x"])
-        if kept.size > 1 and is_even(kept) and "x" not in _staggered(own, spatial):
-            index = int(np.argmin(np.abs(kept - axes["x"][0])))
+        planes = found.get(table["x"], axes["x"])
+        if planes.size > 1 and is_even(planes) and "x" not in _staggered(own, spatial):
+            index = int(np.argmin(np.abs(planes - axes["x"][0])))
             data = data.isel({table["x"]: slice(index, index + 1)})
             found[table["x"]] = axes["x"]
 

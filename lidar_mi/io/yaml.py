@@ -1,5 +1,6 @@
 """YAML, strictly: plain data, of bounded size, and a key that stands twice is an error."""
 
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,13 @@ _NO_VALUE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """PyYAML as it is would expand aliases without end and take the last of two equal keys."""
 
-    def __init__(self, stream):
+    def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._depth = self._count = 0
         # values in a node, by its id; not there before the node is complete
         self._sizes: dict[int, int] = {}
 
-    def compose_node(self, parent, index):
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event = self.peek_event()
         self._count += 1
         self._depth += 1
@@ -47,7 +48,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
             raise _fault(f"more than {LARGEST} values, aliases included", event.start_mark)
         return node
 
-    def construct_object(self, node, deep=False):
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
             value = super().construct_object(node, deep)
             # what is larger is no float, and cannot be shown
@@ -59,7 +60,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         text = repr(node.value) if isinstance(node, yaml.ScalarNode) else "a section"
         raise _fault(f"{one_line(text, 60)} is not of the type {kind}", node.start_mark)
 
-    def construct_mapping(self, node, deep=False):
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
         data = super().construct_mapping(node, deep)
         seen = set()
@@ -71,13 +72,13 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         return data
 
 
-def _children(node):
+def _children(node: yaml.Node) -> list[yaml.Node]:
     if isinstance(node, yaml.MappingNode):
         return [part for pair in node.value for part in pair]
     return node.value if isinstance(node, yaml.SequenceNode) else []
 
 
-def _fault(problem, mark):
+def _fault(problem: str, mark: yaml.Mark) -> yaml.constructor.ConstructorError:
     return yaml.constructor.ConstructorError(None, None, problem, mark)
 
 

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -39,7 +40,7 @@ def extrude(
     plan : ScanPlan
         The scan from farthest away.
     scans : sequence of ScanPlan
-        All scans that have beams of their own: these may be more oblique or cross beside the plane.
+        All scans that have beams of their own: these may be more oblique, or miss the plane.
 
     Raises
     ------
@@ -49,7 +50,8 @@ def extrude(
     radius = beam_reach(lidar, plan.gate_stop)
     slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre
     oblique = plan.obliquity().max()
-    beside = np.zeros((2, 2))  # the plane, beams cross: before and behind it along y and z
+    # how far outside of the plane beams cross: before and behind it along y and z
+    margins = np.zeros((2, 2))
     for beams in (scan.beams for scan in scans):
         if beams is not None:
             secant = 1 / beams.direction[:, 0]
@@ -58,12 +60,12 @@ def extrude(
             places = beams.true_places(plan.centre + plan.position)
             ends = np.array([plane[axis].values[[0, -1]] for axis in ("y", "z")])
             outside = np.stack([ends[:, 0] - places.min(0), places.max(0) - ends[:, 1]], 1)
-            beside = np.maximum(beside, outside)
+            margins = np.maximum(margins, outside)
     # spherical gates are curved: their rim lies nearer by the beam's obliquity
     bulge = (oblique - 1) * plan.gate_stop if plan.gate_kind == "spherical" else 0
     margin = radius * slope + bulge
     pad = {}
-    for axis, sides in zip(("y", "z"), beside, strict=True):
+    for axis, sides in zip(("y", "z"), margins, strict=True):
         before, behind = np.ceil((radius + sides) / _spacing(plane, axis)).astype(int)
         pad[axis] = (int(before), int(behind))
     cells = math.prod(plane.sizes[axis] + sum(n) for axis, n in pad.items())
@@ -95,7 +97,7 @@ def render_scans(
     plans: Sequence[ScanPlan],
     lidar: BackscatterLidar,
     environment: float,
-    phase: dict,
+    phase: dict[str, Any],
     albedo: float,
     settings: RenderSettings,
     seed: int,
@@ -120,7 +122,7 @@ def render_scans(
     albedo : float
         Single-scattering albedo of slab and environment.
     seed : int
-        Scan k uses seed + k * 2^16, far apart for neighbouring experiments.
+        Scan k uses seed + k * 2^16, well separated for neighbouring experiments.
     progress : callable, optional
         Called with (scan, samples done, samples in all).
     scans : sequence of int, optional
@@ -147,13 +149,13 @@ def render_scans(
             renderer = ScanRenderer(
                 air, plan, lidar, environment, phase, albedo, settings, molecules
             )
-        told = partial(progress, index) if progress else None
-        kept = batches(index) if batches else None
-        yield renderer.render(air, plan, seed + (index << 16), told, kept)
+        report = partial(progress, index) if progress else None
+        store = batches(index) if batches else None
+        yield renderer.render(air, plan, seed + (index << 16), report, store)
 
 
 class ScanRenderer:
-    """A scene that is kept from scan to scan; only the first scan compiles anything.
+    """A scene that is reused from scan to scan; only the first scan compiles anything.
 
     Parameters
     ----------
@@ -171,11 +173,11 @@ class ScanRenderer:
         plan: ScanPlan,
         lidar: BackscatterLidar,
         environment: float,
-        phase: dict,
+        phase: dict[str, Any],
         albedo: float,
         settings: RenderSettings,
         molecules: Molecules | None = None,
-    ):
+    ) -> None:
         air = (environment, phase, albedo, settings, molecules)
         self._scene = mi.load_dict(scene_dict(extinction, plan, lidar, *air))
         self._parameters = mi.traverse(self._scene)
@@ -221,17 +223,17 @@ def scene_dict(
     plan: ScanPlan,
     lidar: BackscatterLidar,
     environment: float,
-    phase: dict,
+    phase: dict[str, Any],
     albedo: float,
     settings: RenderSettings,
     molecules: Molecules | None = None,
-) -> dict:
+) -> dict[str, Any]:
     """The Mitsuba scene of one scan as a dictionary for ``mi.load_dict``."""
     samples = settings.without_detector(plan.gate_count)
     low, high = _box(extinction)
     place = mi.ScalarTransform4f().translate(low).scale(high - low)
 
-    def volume(field):
+    def volume(field: xr.DataArray) -> dict[str, Any]:
         if "time" in field.dims:
             data = mi.TensorXf(_voxels(field)[..., 0])
             return {"type": "moving_volume", "data": data, "to_world": place, **_ends(field)}
@@ -240,10 +242,12 @@ def scene_dict(
 
     around = within = {"albedo": albedo, "phase": phase}
     if molecules:
-        both, fraction = _mixed(environment, albedo, molecules)
-        around = {"albedo": both, "phase": _blend(phase, molecules, fraction)}
-        both, fraction = (volume(field) for field in _mixed(extinction, albedo, molecules))
-        within = {"albedo": both, "phase": _blend(phase, molecules, fraction)}
+        both, fraction = _mixed(xr.DataArray(environment), albedo, molecules)
+        mixture = _blend(phase, molecules, float(fraction))
+        around = {"albedo": float(both), "phase": mixture}
+        both, fraction = _mixed(extinction, albedo, molecules)
+        mixture = _blend(phase, molecules, volume(fraction))
+        within = {"albedo": volume(both), "phase": mixture}
     return {
         "type": "scene",
         "integrator": {
@@ -296,20 +300,28 @@ def scene_dict(
     }
 
 
-def _mixed(extinction, albedo: float, molecules: Molecules):
+def _mixed(
+    extinction: xr.DataArray, albedo: float, molecules: Molecules
+) -> tuple[xr.DataArray, xr.DataArray]:
     """Albedo of air, and the fraction of its scattering that is molecular."""
     by_molecules = molecules.albedo * molecules.extinction
     # rounding may leave a little less extinction than the molecules'
-    by_others = albedo * np.maximum(extinction - molecules.extinction, 0)
+    by_others = albedo * xr.ufuncs.maximum(extinction - molecules.extinction, 0)
     return (by_molecules + by_others) / extinction, by_molecules / (by_molecules + by_others)
 
 
-def _blend(phase: dict, molecules: Molecules, fraction) -> dict:
+def _blend(
+    phase: dict[str, Any], molecules: Molecules, fraction: float | dict[str, Any]
+) -> dict[str, Any]:
     return {"type": "blendphase", "weight": fraction, "others": phase, "molecules": molecules.phase}
 
 
 def _move(
-    parameters, extinction: xr.DataArray, plan: ScanPlan, albedo: float, molecules: Molecules | None
+    parameters: Any,
+    extinction: xr.DataArray,
+    plan: ScanPlan,
+    albedo: float,
+    molecules: Molecules | None,
 ) -> None:
     """Update the telescope, its beams and the air in the slab to a later scan."""
     parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
@@ -365,7 +377,15 @@ def _box(extinction: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low), np.array(high)
 
 
-def _as_dataset(image, names, plan, lidar, environment, settings, seed) -> xr.Dataset:
+def _as_dataset(
+    image: np.ndarray,
+    names: list[str],
+    plan: ScanPlan,
+    lidar: BackscatterLidar,
+    environment: float,
+    settings: RenderSettings,
+    seed: int,
+) -> xr.Dataset:
     """The rendered tensor (rows from the top, y falling) as a labelled dataset."""
     variables = unpack(image, names, plan.gate_count)
     y = attenuated_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)

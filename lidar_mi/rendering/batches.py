@@ -15,7 +15,7 @@ Arrays = dict[str, np.ndarray]
 class Batches:
     """The results of an image's finished passes.
 
-    The integrators of the plugins read the `kept` passes at their start, and call `keep` after
+    The integrators of the plugins read the `stored` passes at their start, and call `store` after
     every pass.
 
     Parameters
@@ -31,13 +31,13 @@ class Batches:
         Time spent by earlier runs on the stored passes.
     """
 
-    def __init__(self, load: Callable[[], Arrays | None], save: Callable[[Arrays], None]):
+    def __init__(self, load: Callable[[], Arrays | None], save: Callable[[Arrays], None]) -> None:
         self._load, self._save = load, save
         self.seconds = 0.0
         self._start = time.monotonic()
         self._next = self._start + INTERVAL
 
-    def kept(self) -> tuple[int, Arrays]:
+    def stored(self) -> tuple[int, Arrays]:
         """Number of stored passes, and their results."""
         arrays = self._load()
         if arrays is None:
@@ -45,7 +45,7 @@ class Batches:
         self.seconds = float(arrays.pop("seconds"))
         return int(arrays.pop("passes")), arrays
 
-    def keep(self, passes: int, arrays: Callable[[], dict[str, Any]]) -> None:
+    def store(self, passes: int, arrays: Callable[[], dict[str, Any]]) -> None:
         """Store the results of so many passes, if the interval is over."""
         start = time.monotonic()
         if start < self._next:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -79,19 +79,21 @@ def render_fringes(
         parameters.update()
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
-        kept = batches(index) if batches else None
-        scene.integrator().batches = kept
+        store = batches(index) if batches else None
+        scene.integrator().batches = store
         start = time.perf_counter()
         image = render_image(scene, seed=(seed + (index << 16)) % 2**31)
         image.attrs |= {
             "v_los": float(speed),  # the scene's is rounded to float32
             "lens": settings.lens,
-            "render_seconds": (kept.seconds if kept else 0.0) + time.perf_counter() - start,
+            "render_seconds": (store.seconds if store else 0.0) + time.perf_counter() - start,
         }
         yield image
 
 
-def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: FringeSettings) -> dict:
+def scene_dict(
+    etalon: Etalon, camera: FringeCamera, line: Line, settings: FringeSettings
+) -> dict[str, Any]:
     """The Mitsuba scene of a fringe camera as a dictionary for ``mi.load_dict``."""
     wavelength = line.wavelength
     x, y = camera.centre_pixel
@@ -169,7 +171,7 @@ def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: Fring
     }
 
 
-def render_image(scene, samples: int = 0, seed: int = 0) -> xr.Dataset:
+def render_image(scene: Any, samples: int = 0, seed: int = 0) -> xr.Dataset:
     """Render a loaded scene of a `ccd` with the `fringes` integrator and describe the image.
 
     Parameters
@@ -216,12 +218,12 @@ def render_image(scene, samples: int = 0, seed: int = 0) -> xr.Dataset:
     return label_fringes(layers, attributes)
 
 
-def _mirrors(etalon: Etalon) -> dict:
+def _mirrors(etalon: Etalon) -> dict[str, Any]:
     if etalon.coatings is None:
         return {"reflectivity": etalon.reflectivity, "absorption": etalon.absorption}
     layers = (f"{n!r} {d!r} {k!r}" for n, d, k in etalon.coatings)
     return {"coating": ", ".join(layers), "plate_index": etalon.plate_index}
 
 
-def _numbers(values) -> str:
+def _numbers(values: Iterable[float]) -> str:
     return ", ".join(repr(float(v)) for v in values)

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -14,11 +14,14 @@ from lidar_mi.atmosphere.scattering import ScatteringTable, mix, rayleigh_table
 from lidar_mi.errors import InputError
 from lidar_mi.io.scattering_table import aerosol_table, is_complete, read_table
 
+Keys: TypeAlias = Any
+"""Keys of the section ``scattering``, or of one of its parts; their schema is in a room above."""
+
 
 class Scatterer(NamedTuple):
     """``phase``: dictionary of the phase function for ``mi.load_dict``; ``albedo``."""
 
-    phase: dict
+    phase: dict[str, Any]
     albedo: float
 
 
@@ -26,7 +29,7 @@ class Molecules(NamedTuple):
     """Uniform molecular part of the air: extinction (m^-1), phase function, albedo."""
 
     extinction: float
-    phase: dict
+    phase: dict[str, Any]
     albedo: float
 
 
@@ -50,8 +53,8 @@ def molecules(extinction: float, wavelength: float, band: str = "cabannes") -> M
 
 
 def scatterer(
-    scattering,
-    beside: str | Path = ".",
+    scattering: Keys,
+    folder: str | Path = ".",
     wavelength: float = 532e-9,
     notice: Notice = lambda text, fraction: None,
 ) -> Scatterer:
@@ -61,8 +64,8 @@ def scatterer(
     ----------
     scattering : lidar_mi.experiment.schema.scattering.Scattering
         Its own albedo, if given, replaces that of the scatterers.
-    beside : path
-        Folder of the tables.
+    folder : path
+        Of the tables.
     wavelength : float
         Of the laser, m; aerosols and molecules scatter accordingly.
     notice : callable, optional
@@ -89,15 +92,15 @@ def scatterer(
         case "mixture":
             fractions = [part.fraction for part in scattering.parts]
             tables = [
-                _table(part, beside, wavelength, f"scattering.parts.{index}", notice)
+                _table(part, folder, wavelength, f"scattering.parts.{index}", notice)
                 for index, part in enumerate(scattering.parts)
             ]
             phase, albedo = _tabulated(mix(tables, fractions))
-        case "table" if not is_complete(table_files(scattering, beside)["scattering.table"]):
-            path = table_files(scattering, beside)["scattering.table"]
+        case "table" if not is_complete(table_files(scattering, folder)["scattering.table"]):
+            path = table_files(scattering, folder)["scattering.table"]
             phase = {"type": "mueller", "table": str(path)}
         case _:
-            table = _table(scattering, beside, wavelength, "scattering", notice)
+            table = _table(scattering, folder, wavelength, "scattering", notice)
             phase, albedo = _tabulated(table)
     return Scatterer(phase, albedo if scattering.albedo is None else scattering.albedo)
 
@@ -116,7 +119,7 @@ def backscatter_phase_function(air: Scatterer) -> float:
     return float(np.ravel(np.array(intensity))[0])
 
 
-def table_files(scattering, beside: str | Path = ".") -> dict[str, Path]:
+def table_files(scattering: Keys, folder: str | Path = ".") -> dict[str, Path]:
     """The table files that an experiment names, by the field that names them.
 
     Raises
@@ -128,14 +131,16 @@ def table_files(scattering, beside: str | Path = ".") -> dict[str, Path]:
     files = {}
     for field, part in ({"scattering.table": scattering} | named).items():
         if part.table is not None:
-            path = Path(beside) / part.table
+            path = Path(folder) / part.table
             if not path.is_file():
                 raise InputError(f"{field}: {path} not found; expected a scattering-matrix file")
             files[field] = path.resolve()
     return files
 
 
-def _table(part, beside, wavelength, field, notice) -> ScatteringTable:
+def _table(
+    part: Keys, folder: str | Path, wavelength: float, field: str, notice: Notice
+) -> ScatteringTable:
     """One kind of scatterer as a table."""
     match part.phase:
         case "rayleigh":
@@ -145,7 +150,7 @@ def _table(part, beside, wavelength, field, notice) -> ScatteringTable:
             return molecular_table(wavelength, band=part.band)
         case "aerosol":
             return aerosol_table(part.aerosol, wavelength, notice)
-    path = Path(beside) / part.table
+    path = Path(folder) / part.table
     table = read_table(path)
     if not math.isclose(table.wavelength, wavelength, rel_tol=1e-6):
         raise InputError(

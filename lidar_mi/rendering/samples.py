@@ -21,7 +21,7 @@ PILOT = 32
 divide: with fewer it is too uncertain where a narrow field of view cuts most samples off."""
 _LEAST_PILOT = 4
 _PILOT_PART = 1 / 16
-"""Of the largest number of samples of an image: a pilot takes hardly any time beside it."""
+"""Of the largest number of samples of an image: a pilot takes hardly any time compared with it."""
 
 
 class Samples(NamedTuple):
@@ -84,7 +84,7 @@ def pilot_samples(settings: RenderSettings, beams: int, gates: int) -> int:
 def choose_samples(
     pilot: xr.Dataset, samples: int, settings: RenderSettings, least: int = 2
 ) -> Samples:
-    """The number of samples with which the simulation's noise is small beside the detector's.
+    """The number of samples that make the simulation's noise small compared with the detector's.
 
     Parameters
     ----------

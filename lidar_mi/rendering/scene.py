@@ -144,7 +144,7 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
+def _as_dataset(image: np.ndarray, names: list[str], sensor: Any) -> xr.Dataset:
     """The rendered tensor with the beams' places in the middle of the gates as axes.
 
     A direction table need not form a grid; then pixel numbers serve as axes (``grid`` = 0).

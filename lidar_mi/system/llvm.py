@@ -66,7 +66,7 @@ def library_folders() -> list[Path]:
     return list(dict.fromkeys(folders))
 
 
-def version_of(library: str | os.PathLike) -> int | None:
+def version_of(library: str | os.PathLike[str]) -> int | None:
     """Major LLVM version that a file's name states, None where it states none.
 
     A name without a number is looked up where its links end; there Homebrew has the version as a
@@ -80,7 +80,7 @@ def version_of(library: str | os.PathLike) -> int | None:
     return int(folder[1]) if folder and _UNNUMBERED.fullmatch(real.name) else None
 
 
-def find_llvm(folders: Iterable[str | os.PathLike] | None = None) -> list[tuple[Path, int]]:
+def find_llvm(folders: Iterable[str | os.PathLike[str]] | None = None) -> list[tuple[Path, int]]:
     """LLVM libraries on this machine.
 
     Parameters
@@ -103,7 +103,7 @@ def find_llvm(folders: Iterable[str | os.PathLike] | None = None) -> list[tuple[
 
 
 def select_llvm(
-    folders: Iterable[str | os.PathLike] | None = None,
+    folders: Iterable[str | os.PathLike[str]] | None = None,
     environ: MutableMapping[str, str] = os.environ,
 ) -> str | None:
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest suitable LLVM, unless the user has set it.
@@ -126,7 +126,7 @@ def select_llvm(
 
 
 def check_llvm(
-    folders: Iterable[str | os.PathLike] | None = None,
+    folders: Iterable[str | os.PathLike[str]] | None = None,
     environ: MutableMapping[str, str] = os.environ,
 ) -> str | None:
     """Why the LLVM backend cannot run with the present choice, in one line; None if it can.
@@ -180,7 +180,7 @@ def require_llvm() -> None:
         )
 
 
-def _nothing_suitable(folders: Iterable[str | os.PathLike] | None) -> str:
+def _nothing_suitable(folders: Iterable[str | os.PathLike[str]] | None) -> str:
     found = ", ".join(f"{path} (LLVM {version})" for path, version in find_llvm(folders))
     return (
         f"libLLVM: found {found or 'none'}, Dr.Jit needs {MINIMUM_VERSION} or newer; "

@@ -8,8 +8,10 @@ that cannot be had says why, whoever asks for it.
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
 
 _MITSUBA = "mitsuba"
 _CUDA = "mitsuba.cuda_"
@@ -29,7 +31,9 @@ class _Finder:
 
     searching = False
 
-    def find_spec(self, name, path=None, target=None) -> ModuleSpec | None:
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         if self.searching or not (name == _MITSUBA or name.startswith(_CUDA)):
             return None
         self.searching = True
@@ -39,32 +43,32 @@ class _Finder:
             self.searching = False
         if spec is None or spec.loader is None:
             return spec
+        loader: Any = spec.loader  # whose methods are replaced, of this instance alone
         if name == _MITSUBA:
-            spec.loader.exec_module = _with_plugins(spec.loader.exec_module)  # type: ignore[method-assign]
+            loader.exec_module = _with_plugins(loader.exec_module)
         else:
-            loader = spec.loader
-            loader.create_module = _explained(loader.create_module, name)  # type: ignore[method-assign]
-            loader.exec_module = _explained(loader.exec_module, name)  # type: ignore[method-assign]
+            loader.create_module = _explained(loader.create_module, name)
+            loader.exec_module = _explained(loader.exec_module, name)
         return spec
 
 
-def _with_plugins(execute: Callable) -> Callable:
+def _with_plugins(execute: Callable[[ModuleType], None]) -> Callable[[ModuleType], None]:
     """The import of Mitsuba, which the plugins follow."""
 
-    def execute_and_register(module):
+    def execute_and_register(module: ModuleType) -> None:
         execute(module)
         _register()
 
     return execute_and_register
 
 
-def _explained(load: Callable, name: str) -> Callable:
+def _explained(load: Callable[[Any], Any], name: str) -> Callable[[Any], Any]:
     """The import of a variant, whose error says what this machine lacks.
 
     It stays an ImportError, by which ``mitsuba.set_variant`` goes on to the next of several names.
     """
 
-    def load_or_explain(given):
+    def load_or_explain(given: Any) -> Any:
         try:
             return load(given)
         except ImportError as error:

@@ -112,7 +112,8 @@ def test_a_last_plane_that_repeats_the_first_is_left_out():
 
 
 @pytest.mark.parametrize(
-    ("planes", "what"), [(slice(0, 20), "step"), (slice(0, 26), "bend"), (slice(0, 3), "3 planes")]
+    ("planes", "what"),
+    [(slice(0, 20), "step"), (slice(0, 26), "curvature"), (slice(0, 3), "3 planes")],
 )
 def test_what_is_not_periodic_is_refused(planes, what):
     """A part of a wave; half a wave of it, which ends where it began, with a bend; too few."""

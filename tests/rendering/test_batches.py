@@ -127,15 +127,15 @@ def test_batches_are_kept_every_half_minute(monkeypatch):
         clock[0] += slow[0]
 
     one = Batches(lambda: None, save)
-    assert one.kept() == (0, {})
+    assert one.stored() == (0, {})
     for passes in range(1, 20):
         clock[0] += 7
-        one.keep(passes, dict)
+        one.store(passes, dict)
     assert kept == [(5, 35.0), (10, 70.0), (15, 105.0)]
     slow[0] = 6.0
     for passes in range(20, 50):
         clock[0] += 7
-        one.keep(passes, dict)
+        one.store(passes, dict)
     assert np.diff([seconds for _, seconds in kept[3:]]).min() >= 60
 
 
@@ -143,6 +143,6 @@ def test_seconds_of_earlier_runs_count(monkeypatch):
     monkeypatch.setattr(batches, "INTERVAL", 0)
     kept = []
     one = Batches(lambda: {"passes": np.array(3), "seconds": np.array(100.0)}, kept.append)
-    assert one.kept() == (3, {}) and one.seconds == 100
-    one.keep(4, dict)
+    assert one.stored() == (3, {}) and one.seconds == 100
+    one.store(4, dict)
     assert float(kept[0]["seconds"]) >= 100

@@ -135,12 +135,12 @@ def make_fake(seed):
     def images(log, missing, store):
         for name in missing:
             light = np.random.default_rng([seed, IMAGES.index(name)]).random((1, 5, 7))
-            kept = batches_of(IMAGES, store, log)(IMAGES.index(name))
-            passes, arrays = kept.kept()
+            batches = batches_of(IMAGES, store, log)(IMAGES.index(name))
+            passes, arrays = batches.stored()
             total = arrays.get("total", np.zeros_like(light))
             for number in range(passes, PASSES):
                 total = total + light / (number + 1)
-                kept.keep(number + 1, lambda total=total: {"total": total})
+                batches.store(number + 1, lambda total=total: {"total": total})
             values = {q: (tuple(axes), total) for q in QUANTITIES} | {"Y": (("z", "y"), total[0])}
             scan = label_scan(xr.Dataset(values, coords=axes))
             yield name, scan.assign_attrs(render_seconds=1.0, seed=seed)

@@ -2,6 +2,7 @@
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ def read_davis(path: Path) -> Frames:
     return frames_of(path, np.stack(found))
 
 
-def _frame(path, frame):
+def _frame(path: Path, frame: Any) -> np.ndarray:
     if "PIXEL" not in frame.components or len(frame.components["PIXEL"].planes) != 1:
         raise InputError(f"{path}: frames of several planes, or vectors; expected images")
     pixels = np.asarray(frame.components["PIXEL"].planes[0])

@@ -3,6 +3,7 @@
 import math
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def read_fits(path: Path, layer: str | None) -> Frames:
     return frames_of(path, cube.reshape(-1, *cube.shape[-2:]))
 
 
-def _chosen(path, images, layer):
+def _chosen(path: Path, images: dict[int, Any], layer: str | None) -> Any:
     """The part that is meant."""
     names = {str(number): part for number, part in images.items()}
     names |= {part.name: part for part in images.values() if part.name}
@@ -73,7 +74,7 @@ def _chosen(path, images, layer):
     return next(iter(images.values()))
 
 
-def _values(part):
+def _values(part: Any) -> np.ndarray:
     """What the stored numbers stand for."""
     header = part.header
     scale, zero, blank = (header.get(key) for key in ("BSCALE", "BZERO", "BLANK"))

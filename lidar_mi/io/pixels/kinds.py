@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from lidar_mi.errors import InputError
+from lidar_mi.io.compression import compression
 
 _COMMON = "EXR, PNG, TIFF, BMP, JPEG or FITS image"
 KINDS = f"{_COMMON} (also JPEG 2000, GIF, WebP, PGM, PPM, PAM, PFM, npy, npz, mat, HDF5, im7)"
@@ -29,14 +30,6 @@ _STARTS = (
 )
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _DAVIS = ".im7"
-# of sound files that are not read: what to do
-_ELSEWHERE = (
-    (b"CDF", "NetCDF-3", "nccopy -k nc4 FILE NEW.nc"),
-    (b"\x28\xb5\x2f\xfd", "compressed by zstd", "zstd -d FILE"),
-    (b"\xfd7zXZ\0", "compressed by xz", "unxz FILE"),
-    (b"BZh", "compressed by bzip2", "bunzip2 FILE"),
-    (b"\x1f\x8b", "compressed by gzip", "gunzip FILE"),
-)
 
 
 def kind_of(path: Path) -> str:
@@ -78,7 +71,12 @@ def kind_of(path: Path) -> str:
         with suppress(OSError, EOFError, zlib.error), gzip.open(path) as file:
             if file.read(6) == b"SIMPLE":
                 return "fits"
-    for mark, what, how in _ELSEWHERE:
-        if start.startswith(mark):
-            raise InputError(f"{path}: {what} is not read as an image; expected an {KINDS}: {how}")
+    what = how = ""
+    if start[:3] == b"CDF":
+        what, how = "NetCDF-3", "nccopy -k nc4 FILE NEW.nc"
+    elif packed := compression(start):
+        name, program = packed
+        what, how = f"compressed with {name}", f"{program} FILE"
+    if what:
+        raise InputError(f"{path}: {what} is not read as an image; expected an {KINDS}: {how}")
     raise InputError(f"{path}: no readable image (it begins as none); expected an {KINDS}")

@@ -4,7 +4,7 @@ import math
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
 import numpy as np
@@ -117,7 +117,7 @@ def read_hdf5(path: Path, layer: str | None) -> Frames:
     return _matrix(path, image.T) if matlab else _stack(path, image)
 
 
-def _refuse_unreadable(path, part):
+def _refuse_unreadable(path: Path, part: h5py.Dataset) -> None:
     """Filters that are not there, values elsewhere, sizes out of proportion, packed numbers."""
     filters = part.id.get_create_plist()
     for number in range(filters.get_nfilters()):
@@ -137,7 +137,7 @@ def _refuse_unreadable(path, part):
         raise InputError(f"{path}: packed numbers ({packed[0]}); expected plain ones")
 
 
-def _chosen(path, shapes: Mapping[str, tuple], layer: str | None) -> str:
+def _chosen(path: Path, shapes: Mapping[str, tuple[int, ...]], layer: str | None) -> str:
     """The array that is meant: the one named, else the only one of two or three dimensions."""
     images = [n for n, shape in shapes.items() if len(shape) in (2, 3) and min(shape[-2:]) > 1]
     if layer is not None:
@@ -160,9 +160,9 @@ def _listed(names: list[str]) -> str:
     return shown + (", ..." if len(names) > 4 else "")
 
 
-def _numpy_header(file: Any) -> tuple[tuple[int, ...], np.dtype]:
+def _numpy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     version = np.lib.format.read_magic(file)
-    read: dict[Any, Callable] = {
+    read: dict[Any, Callable[[Any], tuple[tuple[int, ...], bool, np.dtype]]] = {
         (1, 0): np.lib.format.read_array_header_1_0,
         (2, 0): np.lib.format.read_array_header_2_0,
     }
@@ -172,7 +172,7 @@ def _numpy_header(file: Any) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _numpy_array(path, file, size):
+def _numpy_array(path: Path, file: IO[bytes], size: int) -> np.ndarray:
     """The array, if the file holds as many bytes as its header says."""
     shape, dtype = _numpy_header(file)
     if dtype.hasobject or dtype.fields:
@@ -183,7 +183,7 @@ def _numpy_array(path, file, size):
     return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def _stack(path, image):
+def _stack(path: Path, image: np.ndarray) -> Frames:
     """An array as images; refused where its axes may mean something else."""
     if image.ndim not in (2, 3):
         raise InputError(
@@ -198,7 +198,7 @@ def _stack(path, image):
     return frames_of(path, image.reshape(-1, *image.shape[-2:]))
 
 
-def _matrix(path, image):
+def _matrix(path: Path, image: np.ndarray) -> Frames:
     if image.ndim != 2:
         raise InputError(
             f"{path}: an array of {' x '.join(map(str, image.shape))}; in MATLAB files images may "

@@ -3,6 +3,7 @@
 import math
 import re
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def read_netpbm(path: Path) -> Frames:
     return frames_of(path, np.stack(found))
 
 
-def _image(path, content, place):
+def _image(path: Path, content: bytes, place: int) -> tuple[np.ndarray, int]:
     magic = content[place : place + 2]
     colours, more, width, height, largest, start = (
         _pam_header(path, content, place) if magic == b"P7" else _header(content, place, magic)
@@ -78,7 +79,7 @@ def _image(path, content, place):
     return (image[::-1] if floats else image), end
 
 
-def _header(content, place, magic):
+def _header(content: bytes, place: int, magic: bytes) -> tuple[int, int, int, int, float, int]:
     """Colours, transparency, width, height, largest value or scale, and where pixels begin."""
     text, end, words = content[place : place + _LONGEST], 2, []
     colours = _COLOURS[magic] if magic in _COLOURS else _unknown(magic)
@@ -97,7 +98,7 @@ def _header(content, place, magic):
     return colours, 0, int(words[0]), int(words[1]), scale, place + end + 1
 
 
-def _pam_header(path, content, place):
+def _pam_header(path: Path, content: bytes, place: int) -> tuple[int, int, int, int, float, int]:
     text = content[place : place + _LONGEST]
     end = text.index(b"ENDHDR\n") + len(b"ENDHDR\n")
     lines = [line.split(b"#")[0].split() for line in text[:end].splitlines()[1:-1]]
@@ -119,5 +120,5 @@ def _pam_header(path, content, place):
     return *tuples[kind], width, height, largest, place + end
 
 
-def _unknown(magic):
+def _unknown(magic: bytes) -> NoReturn:
     raise ValueError(f"it goes on with {magic[:2]!r}")

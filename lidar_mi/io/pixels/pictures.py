@@ -2,12 +2,16 @@
 
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.pixels.frames import Frames, damaged, frames_of, grey
 from lidar_mi.io.size import check_size
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 _FORMATS = ("JPEG", "BMP", "GIF", "WEBP")
 """Reading others may execute programs."""
@@ -66,7 +70,7 @@ def read_jpeg2000(path: Path) -> Frames:
     return frames_of(path, image[None])
 
 
-def _opened(path, formats):
+def _opened(path: Path, formats: tuple[str, ...] | None) -> "Image.Image":
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -75,7 +79,7 @@ def _opened(path, formats):
         return Image.open(path, formats=formats)
 
 
-def _refuse_shallow(path, file):
+def _refuse_shallow(path: Path, file: "Image.Image") -> None:
     """Five or six bits a colour, which the library spreads over 0 to 255."""
     if file.format == "BMP":
         with path.open("rb") as raw:
@@ -85,7 +89,7 @@ def _refuse_shallow(path, file):
             raise InputError(f"{path}: BMP of 16 bits a pixel; expected 1, 4, 8, 24 or 32")
 
 
-def _light(path, image):
+def _light(path: Path, image: "Image.Image") -> np.ndarray:
     if image.mode == "CMYK":
         raise InputError(f"{path}: inks (CMYK) are no light; expected grey or red, green and blue")
     if image.mode in _GREY:

@@ -3,16 +3,19 @@
 import logging
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.pixels.frames import Frames, checked, damaged, frames_of, grey
 from lidar_mi.io.size import check_size
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile, TiffPage
 
 # what the library only logs, and goes on with part of the file
 _LOSSES = re.compile(
@@ -39,8 +42,8 @@ def read_tiff(path: Path) -> Frames:
     Raises
     ------
     InputError
-        A damaged file, or one that declares too much; several axes beside height and width; pages
-        of different size; inks, mosaics, palettes of colours, white as 0, complex numbers.
+        A damaged file, or one that declares too much; several axes in addition to height and width;
+        pages of different size; inks, mosaics, palettes of colours, white as 0, complex numbers.
     """
     with _opened(path) as file:
         numbers, count, channels = _planes(path, file)
@@ -51,7 +54,7 @@ def read_tiff(path: Path) -> Frames:
         with _opened(path) as file:
             found = []
             for number in chosen:
-                page = file.pages[numbers[number]]
+                page: Any = file.pages[numbers[number]]
                 # pages can share their pixels
                 check_size(path, 8 * len(chosen) * page.imagewidth * page.imagelength)
                 found.append(_pixels(path, page))
@@ -105,12 +108,14 @@ class _Lost(logging.Handler):
             self.messages.append(message.partition("> ")[2] or message)
 
 
-def _planes(path, file):
+def _planes(path: Path, file: "TiffFile") -> tuple[list[int] | None, int, bool]:
     """Numbers of the pages that are images, how many images, and whether they are channels.
 
     No numbers (None): the images follow the first page's and have no pages of their own.
     """
-    whole = [n for n, page in enumerate(file.pages) if not (page.is_reduced or page.is_mask)]
+    # a TiffFrame, of which a series may consist, takes what it lacks from its page
+    each: Iterable[Any] = file.pages
+    whole = [n for n, page in enumerate(each) if not (page.is_reduced or page.is_mask)]
     if not whole:
         raise InputError(f"{path}: no page of full size; expected an image")
     series = file.series
@@ -139,12 +144,12 @@ def _planes(path, file):
             f"{path}: its metadata state {count} images, {len(whole)} pages are there; expected "
             "as many"
         )
-    return pages, count, axis == "C"
+    return [page for page in pages if page is not None], count, axis == "C"
 
 
-def _contiguous(path, file, count):
+def _contiguous(path: Path, file: "TiffFile", count: int) -> np.ndarray:
     """Images that follow the first page's, as ImageJ writes long stacks."""
-    page = file.pages[0]
+    page: Any = file.pages[0]
     _check(path, page, count)
     images = file.series[0].asarray()
     if images.ndim != 3 or len(images) != count or page.samplesperpixel != 1:
@@ -152,7 +157,7 @@ def _contiguous(path, file, count):
     return checked(path, images)
 
 
-def _pixels(path, page):
+def _pixels(path: Path, page: "TiffPage") -> np.ndarray:
     """One number a pixel of a page."""
     more = _check(path, page)
     axes, image = page.axes, page.asarray()
@@ -163,7 +168,7 @@ def _pixels(path, page):
     return _without_gaps(page, _upright(image, page.tags.valueof(_ORIENTATION, 1)))
 
 
-def _check(path, page, count=1):
+def _check(path: Path, page: "TiffPage", count: int = 1) -> int:
     """Refuse what is no light, or not there; the number of channels of transparency."""
     import tifffile
 
@@ -210,7 +215,7 @@ def _check(path, page, count=1):
     return len(extra)
 
 
-def _is_ramp(colours):
+def _is_ramp(colours: np.ndarray | None) -> bool:
     """Whether a palette is grey that rises with the number, so that the number is the light."""
     if colours is None:
         return False
@@ -220,7 +225,7 @@ def _is_ramp(colours):
     return bool((colours == colours[0]).all() and first[-1] and abs(first - ideal).max() <= 256)
 
 
-def _upright(image, orientation):
+def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
     """Top row first, left column first."""
     if orientation in (5, 6, 7, 8):
         image = image.T
@@ -229,7 +234,7 @@ def _upright(image, orientation):
     return image[::rows, ::columns]
 
 
-def _without_gaps(page, image):
+def _without_gaps(page: "TiffPage", image: np.ndarray) -> np.ndarray:
     """NaN for the value that GDAL's tag calls missing."""
     if _NODATA not in page.tags:
         return image

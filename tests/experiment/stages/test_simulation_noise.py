@@ -242,6 +242,6 @@ def test_samples_of_another_number_are_not_resumed():
     store = Store()
     batches = batches_of(IMAGES, store, Log(), 100)(0)
     batches._next = 0.0
-    batches.keep(3, lambda: {"image": np.ones(2)})
-    assert batches_of(IMAGES, store, Log(), 100)(0).kept()[0] == 3
-    assert batches_of(IMAGES, store, Log(), 110)(0).kept() == (0, {})
+    batches.store(3, lambda: {"image": np.ones(2)})
+    assert batches_of(IMAGES, store, Log(), 100)(0).stored()[0] == 3
+    assert batches_of(IMAGES, store, Log(), 110)(0).stored() == (0, {})

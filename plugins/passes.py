@@ -1,0 +1,36 @@
+"""What a caller may give an integrator: a report of its passes, and a store for them."""
+
+from collections.abc import Callable, Mapping
+from typing import Protocol, TypeAlias
+
+import numpy as np
+
+Progress: TypeAlias = Callable[[int, int], object]
+"""Called after every pass with the number of samples done, and of all."""
+
+
+class Batches(Protocol):
+    """A store of finished passes, from which an interrupted rendering goes on."""
+
+    def stored(self) -> tuple[int, Mapping[str, np.ndarray]]:
+        """Number of passes that an earlier run has stored, and their arrays by name."""
+        ...
+
+    def store(self, passes: int, arrays: Callable[[], dict[str, np.ndarray]]) -> None:
+        """Store the arrays of so many passes; they are asked for only if they are stored."""
+        ...
+
+
+def stored_passes(
+    batches: Batches | None, samples_per_pass: int
+) -> tuple[int, Mapping[str, np.ndarray]]:
+    """Number of passes that need not be traced again, and their arrays.
+
+    None, if those stored are of another size, for another machine's memory: they end at other
+    samples.
+    """
+    if batches is not None:
+        passes, arrays = batches.stored()
+        if passes and int(arrays.get("samples_per_pass", -1)) == samples_per_pass:
+            return passes, arrays
+    return 0, {}
