@@ -7,7 +7,9 @@ order at the centre, for each line of the light (a split line has two or three).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -119,13 +121,13 @@ class Rings(Tabular):
         split = table[:, 1:] - table[:, :1]
         return split[np.isfinite(split).any(1)]
 
-    def curve(self, radius: float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, radius: np.ndarray | float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y) of a ring of that mean radius, at angles from x toward y."""
         return RingCurves(self.centre, self.ellipticity, self.tilt).curve(radius, angle)
 
     def _shape(self) -> str:
         if not any((*self.ellipticity, *self.tilt)):
-            return "not determined by the part of the rings that is seen: taken for circles"
+            return "not determined by the visible part of the rings: taken for circles"
         return f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"
 
     def tables(self) -> list[Table]:
@@ -167,7 +169,7 @@ class Rings(Tabular):
 
 @checked_arguments
 def analyse_rings(
-    image,
+    image: Any,
     centre: tuple[float, float] | None = None,
     saturation: float | None = None,
     spacing: float | None = None,
@@ -177,7 +179,7 @@ def analyse_rings(
     Parameters
     ----------
     image : array or tensor, shape (height, width)
-        Any scale; the background may slope or bend, and parts of the rings may be hidden.
+        Any scale; the background may be sloped or curved, and parts of the rings may be hidden.
     centre : (float, float), optional
         (x, y) of the rings where it is known, px; fitted if not given.
     saturation : float, optional
@@ -213,29 +215,29 @@ def analyse_rings(
     """
     if spacing is not None and not 0 < spacing < math.inf:
         raise InputError(f"spacing: {spacing:g} px^2 is not allowed; expected above 0")
-    image = checked(image, saturation)
-    if len(image) != 1:
-        raise InputError(f"image: {len(image)} images are not allowed; expected one")
-    image = image[0].double().cpu().numpy()
+    images = checked(image, saturation)
+    if len(images) != 1:
+        raise InputError(f"image: {len(images)} images are not allowed; expected one")
+    values = images[0].double().cpu().numpy()
     free = centre is None
-    centre = ring_centre(image) if free else tuple(map(float, centre))
-    inside(*centre, image.shape)
-    geometry = aligned(image, RingCurves(centre), free)
-    sectors = Sectors(image, geometry)
+    place = ring_centre(values) if centre is None else _pair(centre)
+    inside(*place, values.shape)
+    geometry = aligned(values, RingCurves(place), free)
+    sectors = Sectors(values, geometry)
     hidden = hidden_rings(sectors, _rings_alone(sectors, spacing))
     if hidden is not None:
-        geometry = aligned(image, RingCurves(geometry.centre), free, hidden)
-        sectors = Sectors(image, geometry, hidden)
+        geometry = aligned(values, RingCurves(geometry.centre), free, hidden)
+        sectors = Sectors(values, geometry, hidden)
     pattern, doubt = _pattern(sectors, spacing)
-    fit = fit_all(image, geometry, pattern, free, hidden)
+    fit = fit_all(values, geometry, pattern, free, hidden)
     if spacing is None and repeats(fit.pattern):
         # with a background and a height of every sector the lines are one, of a shorter spacing
         pattern, doubt = _pattern(sectors, fit.pattern.spacing / len(fit.pattern.fraction))
-        fit = fit_all(image, geometry, pattern, free, hidden)
+        fit = fit_all(values, geometry, pattern, free, hidden)
     law = _law(fit)
     return Rings(
-        shape=image.shape,
-        centre=fit.geometry.centre if free else centre,
+        shape=values.shape,
+        centre=fit.geometry.centre if free else place,
         centre_std=_pair(np.sqrt(np.diag(fit.geometry_covariance))[:2]),
         radius=np.sqrt(fit.square),
         radius_std=np.sqrt(np.diag(fit.square_covariance)) / (2 * np.sqrt(fit.square)),
@@ -258,7 +260,7 @@ def analyse_rings(
     )
 
 
-def _pair(values) -> tuple[float, float]:
+def _pair(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 

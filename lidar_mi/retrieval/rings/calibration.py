@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -128,7 +129,7 @@ class Calibration(Tabular):
             ("change of -ln R of the mirrors", with_error(self.damping, std["damping"])),
             ("change of the roughness term", with_error(self.roughness, std["roughness"])),
             ("fall-off of the light to the corner", with_error(self.falloff, std["falloff"])),
-            ("pixels left out", str(bad)),
+            ("pixels masked", str(bad)),
             ("drift between frames", f"{self.drift:.3g} m/s"),
             ("chi-square", f"{self.chi_square:.4f}"),
         ]
@@ -176,14 +177,15 @@ def calibration_of(data: xr.Dataset) -> Calibration:
         A data set that is none, or not whole.
     """
     try:
-        single = json.loads(data.attrs["calibration"])
+        single: dict[str, Any] = json.loads(data.attrs["calibration"])
         arrays = {name: data[name].transpose(*dims).values for name, (dims, *_) in _ARRAYS.items()}
         for name in ("shape", "centre", "tilt", "undetermined"):
             single[name] = tuple(single[name])
         for name in ("lines", "whole_orders"):
             single[name] = tuple(single.get(name, ()))
         single["gaps"] = tuple((float(gap), float(std)) for gap, std in single.get("gaps", ()))
-        found = Calibration(**single, **arrays)
+        single.update(arrays)
+        found = Calibration(**single)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"calibration: {error} is missing or wrong; expected the file of a calibration"
@@ -224,7 +226,7 @@ def calibrated(model: RingModel, calibration: Calibration) -> RingModel:
             f"{model.order_at_centre:.1f}: another gap"
         )
 
-    def changed(harmonics):
+    def changed(harmonics: np.ndarray) -> np.ndarray:
         n = np.arange(np.shape(harmonics)[-1])
         factor = np.exp(-calibration.damping * n - calibration.roughness * n**2)
         return np.asarray(harmonics) * factor

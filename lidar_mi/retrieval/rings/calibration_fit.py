@@ -135,8 +135,8 @@ def calibrate_rings(
     for name in ("falloff", *LIGHT):
         place = PARAMETERS.index(name)
         first[:, place] = first[:, place].mean()
-    state = _State(model, first, dict.fromkeys(INSTRUMENT, 0.0))
-    state = _fitted(frames, state, noise, given, tolerances)
+    nominal = _State(model, first, dict.fromkeys(INSTRUMENT, 0.0))
+    state = _fitted(frames, nominal, noise, given, tolerances)
     bad = _bad_pixels(mean, state, noise, len(frames), given)
     if bad.any():
         given = torch.where(bad, 0.0, given)
@@ -154,19 +154,28 @@ class _State:
     """The instrument so far: its model, the frames' parameters, departures from the nominal one.
 
     ``model`` has focal length, tilt, distortion and blur in it; damping and roughness are in the
-    frames' parameters. After a fit: covariance of what is shared, parts of the local
-    solution, chi-square and its degrees of freedom.
+    frames' parameters.
     """
 
     model: RingModel
     parameters: torch.Tensor
     departure: Mapping[str, float]
-    names: tuple[str, ...] = ()
-    covariance: torch.Tensor | None = None
-    speed_by_shared: torch.Tensor | None = None
-    speed_variance: torch.Tensor | None = None
-    chi_square: float = math.nan
-    freedom: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit(_State):
+    """The instrument after a fit.
+
+    ``covariance`` is that of what all frames share, by ``names``; ``speed_by_shared`` and
+    ``speed_variance`` are the frames' own speeds' dependence on it and their own variances.
+    """
+
+    names: tuple[str, ...]
+    covariance: torch.Tensor
+    speed_by_shared: torch.Tensor
+    speed_variance: torch.Tensor
+    chi_square: float
+    freedom: int
 
 
 def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
@@ -184,7 +193,13 @@ def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
     return replace(model, focal_length=model.focal_length * factor)
 
 
-def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
+def _fitted(
+    frames: torch.Tensor,
+    state: _State,
+    noise: PixelNoise,
+    response: torch.Tensor,
+    tolerances: Mapping[str, float],
+) -> _Fit:
     """Gauss-Newton steps until what is shared no longer changes."""
     shared = (*_SHARED, *term_names("light", state.model.light_degree), *INSTRUMENT)
     local = (*_LOCAL, *term_names("background", state.model.background_degree))
@@ -230,7 +245,7 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
                 parameters[:, PARAMETERS.index(name)] += change[name]
         used = int((weight > 0).sum())
         freedom = max(used - len(shared) - few * len(frames), 1)
-        state = _State(
+        state = fit = _Fit(
             _moved(state.model, change),
             parameters,
             {name: state.departure[name] + change[name] for name in INSTRUMENT},
@@ -242,7 +257,7 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
             freedom,
         )
         if close:
-            return state
+            return fit
     raise InputError(
         "frames: the calibration does not converge; expected rings of one narrow line on the "
         "nominal instrument"
@@ -262,7 +277,9 @@ def _moved(model: RingModel, change: Mapping[str, float]) -> RingModel:
     )
 
 
-def _residual(mean: torch.Tensor, state: _State, noise, count: int, response) -> torch.Tensor:
+def _residual(
+    mean: torch.Tensor, state: _State, noise: PixelNoise, count: int, response: torch.Tensor
+) -> torch.Tensor:
     """Mean of the frames less the model, in standard deviations, (height, width).
 
     The model is taken with the mean of the frames' own parameters.
@@ -274,14 +291,22 @@ def _residual(mean: torch.Tensor, state: _State, noise, count: int, response) ->
     return torch.where(response > 0, (mean / used - expected) * (used * count / variance).sqrt(), 0)
 
 
-def _bad_pixels(mean, state: _State, noise, count: int, response) -> torch.Tensor:
+def _bad_pixels(
+    mean: torch.Tensor, state: _State, noise: PixelNoise, count: int, response: torch.Tensor
+) -> torch.Tensor:
     """Further ones that are far from the model and from their neighbours: dust, warm pixels."""
     residual = _residual(mean, state, noise, count, response).numpy()
     # what is smooth is the model's fault
     return torch.from_numpy(np.abs(residual - median_filter(residual, 5)) > _BAD)
 
 
-def _calibration(frames, state: _State, noise, response, tolerances) -> Calibration:
+def _calibration(
+    frames: torch.Tensor,
+    state: _Fit,
+    noise: PixelNoise,
+    response: torch.Tensor,
+    tolerances: Mapping[str, float],
+) -> Calibration:
     model, names = state.model, state.names
     count = len(frames)
     poor = state.chi_square > 1 + MISFIT * math.sqrt(2 / state.freedom)
@@ -305,7 +330,7 @@ def _calibration(frames, state: _State, noise, response, tolerances) -> Calibrat
     blocks = residual[:height, :width].reshape(height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
     values = dict(zip(PARAMETERS, state.parameters[0].tolist(), strict=True))
     return Calibration(
-        shape=tuple(model.shape),
+        shape=model.shape,
         pixel=model.pixel,
         wavelength=model.wavelength,
         focal_length=model.focal_length,

@@ -99,14 +99,13 @@ def combined(
     found = gap_of_covariance(fraction, errors, wavelengths, gap, gap_tolerance)
     first = _moved(lines[0], parts[0], step, covariance)
     groups = tuple(zip(found.group.tolist(), found.group_std.tolist(), strict=True))
-    given = {"lines": tuple(wavelengths), "gaps": groups}
+    first = replace(first, lines=tuple(wavelengths), gaps=groups)
     if len(groups) > 1:
-        return replace(first, **given)
+        return first
     best = int(found.chi_square.argmin())
     order = float(found.order[best, 0] + fraction[0] + mirror_orders[0])
     return replace(
         first,
-        **given,
         whole_orders=tuple(sorted(set(found.order[:, 0].tolist()))),
         focal_length=first.focal_length * math.sqrt(order / first.order_at_centre),
         order_at_centre=order,
@@ -128,7 +127,9 @@ class _Geometry:
     known: np.ndarray
 
 
-def _geometry(one: Calibration, shared: Sequence[str], tolerances) -> _Geometry:
+def _geometry(
+    one: Calibration, shared: Sequence[str], tolerances: Mapping[str, float]
+) -> _Geometry:
     value = {
         "focal_length": math.log(one.focal_length),
         "tilt_x": one.tilt[0],
@@ -151,7 +152,9 @@ def _geometry(one: Calibration, shared: Sequence[str], tolerances) -> _Geometry:
     )
 
 
-def _check_same(first: Calibration, other: Calibration, one, two, achromatic: bool) -> None:
+def _check_same(
+    first: Calibration, other: Calibration, one: _Geometry, two: _Geometry, achromatic: bool
+) -> None:
     """Refuse lines whose rings are not of one instrument."""
     known = one.known & two.known
     if not known.any():
@@ -176,7 +179,9 @@ def _per_order(one: Calibration) -> float:
     return speed_of_light / (2 * one.order_at_centre)
 
 
-def _moved(one: Calibration, part: _Geometry, step, covariance) -> Calibration:
+def _moved(
+    one: Calibration, part: _Geometry, step: np.ndarray, covariance: np.ndarray
+) -> Calibration:
     """A calibration after its shared part is moved by a step, with what is correlated to that."""
     gain = one.systematic[:, part.places] @ part.information
     change = dict(zip(("v_los", *INSTRUMENT), gain @ step, strict=True))

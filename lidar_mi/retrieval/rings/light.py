@@ -12,6 +12,7 @@ squares: Young 1941, Psychometrika 6, 49). Cells far from it, as of hot pixels a
 what hides a sector, do not count; nor do sectors without rings.
 """
 
+import math
 import warnings
 from dataclasses import dataclass
 from itertools import pairwise
@@ -82,14 +83,14 @@ def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
         rest = 1 - taken
         noise = _noise(left / np.sqrt(np.maximum(rest, 0.5)), keep & (rest >= 0.5))
         # on a crest there is more, as of photons
-        usual = _median(np.where(some & seen[:, None], np.abs(left), np.nan))
-        scale = np.maximum(noise, (1.4826 * usual) ** 2)
+        typical = _median(np.where(some & seen[:, None], np.abs(left), np.nan))
+        scale = np.maximum(noise, (1.4826 * typical) ** 2)
         keep = some & (np.abs(left) <= OUTLIER * np.sqrt(scale) + 1e-12)
         height = linear[:, 3:] @ np.stack([np.ones_like(q), q])[: len(parts)]
         mean = (height * count * keep).sum(1) / np.maximum((count * keep).sum(1), 1)
         # a sector of a few cells fits any profile, and its height is as large as its error
         seen = mean > SIGNIFICANT * std[:, 3] * np.sqrt(noise.mean())
-        usual = np.median(mean[seen]) if seen.any() else np.inf
+        usual = float(np.median(mean[seen])) if seen.any() else math.inf
         seen &= mean > SEEN * usual
         height = np.where(seen[:, None], height / usual, 0.0).clip(0)
         weight = (keep * count * height**2).sum(0)
@@ -105,7 +106,9 @@ def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
     return Light(profile, weight, noise, keep & seen[:, None])
 
 
-def _fitted(value, columns, weight):
+def _fitted(
+    value: np.ndarray, columns: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted least squares sector by sector: model, parameters, their errors for variance 1."""
     weighted = columns * weight[..., None]
     matrix = np.einsum("sqk,sql->skl", weighted, columns)
@@ -117,15 +120,15 @@ def _fitted(value, columns, weight):
     return np.einsum("sqk,sk->sq", columns, linear), linear, std
 
 
-def _noise(left, keep):
+def _noise(left: np.ndarray, keep: np.ndarray) -> np.ndarray:
     """Variance of a pixel at every annulus, from what the sectors of its neighbours deviate."""
     size = left.shape[1]
     edges = np.linspace(0, size, max(size // SMOOTH, 1) + 1).round().astype(int)
-    found = []
+    variances = []
     for first, last in pairwise(edges):
         cells = np.abs(left[:, first:last][keep[:, first:last]])
-        found.append((1.4826 * np.median(cells)) ** 2 if len(cells) else np.nan)
-    found = np.array(found)
+        variances.append((1.4826 * np.median(cells)) ** 2 if len(cells) else np.nan)
+    found = np.array(variances)
     known = found > 0
     if not known.any():
         return np.full(size, np.finfo(float).tiny)
@@ -133,7 +136,7 @@ def _noise(left, keep):
     return np.interp(np.arange(size), middle[known], found[known])
 
 
-def _median(value):
+def _median(value: np.ndarray) -> np.ndarray:
     """Over sectors; 0 where there is none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # an annulus without cells

@@ -178,7 +178,7 @@ class Profile:
         low = np.array([1 - reach, *pattern.fraction - 0.3, 0.01, 0.0])
         high = np.array([1 + reach, *pattern.fraction + 0.3, 6.0, 4.0])
 
-        def made(x):
+        def made(x: np.ndarray) -> Pattern:
             return replace(
                 pattern,
                 spacing=pattern.spacing * x[0],
@@ -286,7 +286,7 @@ def strongest_period(profile: Profile) -> float:
     value = value - basis @ (basis.T @ value)
     number = min(len(q) // 6, 150)
 
-    def strongest(frequencies):
+    def strongest(frequencies: np.ndarray) -> float:
         wave = np.exp(2j * np.pi * frequencies[:, None] * q) * profile.root
         wave = wave - (wave @ basis) @ basis.T
         along, length, mixed = wave @ value, (np.abs(wave) ** 2).sum(1), (wave**2).sum(1)
@@ -294,8 +294,8 @@ def strongest_period(profile: Profile) -> float:
         power = 2 * (length * np.abs(along) ** 2 - (mixed.conj() * along**2).real)
         return frequencies[np.argmax(power / (length**2 - np.abs(mixed) ** 2))]
 
-    rough = strongest(np.arange(1.2, number, 1 / 8))
-    return profile.last / strongest(rough + np.arange(-32, 33) / 256)
+    coarse = strongest(np.arange(1.2, number, 1 / 8))
+    return profile.last / strongest(coarse + np.arange(-32, 33) / 256)
 
 
 def _folded(profile: Profile, period: float, highest: float) -> float:
@@ -344,9 +344,9 @@ def _first(profile: Profile, spacing: float, loss: float) -> Pattern:
     return Pattern(spacing, fraction[[height.argmax()]], one, loss, 0.0)
 
 
-def _starts(pattern: Pattern, left, most: int) -> list[Pattern]:
-    """Further lines: where most is left, or the highest line split into two or three."""
-    fraction, height = left
+def _starts(pattern: Pattern, residual: tuple[np.ndarray, np.ndarray], most: int) -> list[Pattern]:
+    """Further lines: where the residual is largest, or the highest line split into two or three."""
+    fraction, height = residual
     top = int(pattern.height.argmax())
     others = np.delete(pattern.fraction, top)
     half = max(0.35 * pattern.width, 0.02)
@@ -403,12 +403,12 @@ def find_pattern(
     base = strongest_period(profile)
     tried: dict[int, Pattern] = {}
     multiples = [m for m in range(1, MULTIPLES + 1) if profile.last >= ORDERS * m * base]
-    rest = [_folded(profile, m * base, HARMONICS / base) for m in multiples]
-    for multiple, left in zip(multiples, rest, strict=True):
+    residual = [_folded(profile, m * base, HARMONICS / base) for m in multiples]
+    for multiple, left in zip(multiples, residual, strict=True):
         power = max((p.power for p in tried.values()), default=math.inf)
         first = min(tried.values(), key=lambda p: p.unexplained, default=None)
         # no shape of this period explains materially more than what has been tried
-        less = (min(rest[: multiples.index(multiple)], default=math.inf)) - left
+        less = (min(residual[: multiples.index(multiple)], default=math.inf)) - left
         if first is not None and less < MATERIAL / DOUBTFUL * power:
             continue
         found = lines_at(profile, multiple * base, noise)
@@ -418,7 +418,7 @@ def find_pattern(
         return None
     power = max(p.power for p in tried.values())
 
-    def gain(short, long):
+    def gain(short: int, long: int) -> float:
         """Of the pattern's power, what the longer spacing explains in addition; 0 for noise."""
         more = tried[short].unexplained - tried[long].unexplained
         if more < 40 * noise or repeats(tried[long]):

@@ -43,7 +43,7 @@ class Filling:
     radius: float = 1.0
     shift: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not (0 < self.radius <= 1 and abs(self.shift) <= 1):
             raise InputError(
                 f"filling: radius {self.radius!r}, shift {self.shift!r} are not allowed; expected "
@@ -98,7 +98,7 @@ class ReferenceUncertainty:
     air: Filling = Filling()
     scrambling: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in (f.name for f in fields(self) if f.name not in ("laser", "air")):
             value, positive = getattr(self, name), name in ("wavelength", "gap")
             if not (math.isfinite(value) and value >= 0 and (value > 0 or not positive)):

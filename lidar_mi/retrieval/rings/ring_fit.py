@@ -85,7 +85,7 @@ def fit_all(
         sectors = Sectors(image, geometry, hidden)
         system = _System(sectors, pattern, deviation, free)
         if not system.fitted[2:].any() and any((*geometry.ellipticity, *geometry.tilt)):
-            # what is not fitted is no shape that was found on the way
+            # a shape of an earlier round that is no longer fitted
             geometry = RingCurves(geometry.centre)
             sectors = Sectors(image, geometry, hidden)
             system = _System(sectors, pattern, deviation, free)
@@ -172,7 +172,13 @@ def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
 class _System:
     """Normal equations of one round, sector by sector."""
 
-    def __init__(self, sectors: Sectors, pattern: Pattern, deviation, free: bool):
+    def __init__(
+        self,
+        sectors: Sectors,
+        pattern: Pattern,
+        deviation: dict[tuple[int, int], float],
+        free: bool,
+    ) -> None:
         self.sectors, self.pattern = sectors, pattern
         self.order, self.line, shared = _visible(sectors, pattern)
         shaped = bool((shared >= ALL_AROUND * SECTORS).sum() >= 2)
@@ -181,11 +187,11 @@ class _System:
         self.geometry_slots = int(self.fitted.sum())
         lines = len(pattern.fraction)
         q = sectors.r2
-        bend = self._bends(q)
+        shift = self._ring_shifts(q)
         known = np.array([deviation.get(key, 0.0) for key in self.keys])
         phase = pattern.phase(q)
         for j in range(lines):
-            phase[j] -= known[self.line == j] @ bend[self.line == j]
+            phase[j] -= known[self.line == j] @ shift[self.line == j]
         spread = pattern.spread + blur(q, sectors.step, pattern.spacing)
         wave, slope, by_loss, by_spread = np.stack(
             [airy(of_line, pattern.loss, spread) for of_line in phase], 1
@@ -198,7 +204,7 @@ class _System:
         others = [j for j in range(lines) if j != low]
         shared = np.vstack(
             [
-                -(height * slope)[self.line] * bend,
+                -(height * slope)[self.line] * shift,
                 wave[others],
                 (height * by_loss).sum(0)[None],
                 (height * by_spread).sum(0)[None],
@@ -246,23 +252,23 @@ class _System:
         self.variance = float((self.left**2).sum() / max(cells, 1))
         self.width = self._width()
 
-    def _bends(self, q):
-        """What each ring's deviation adds to its line's order at every annulus: linear between."""
-        bend = np.zeros((len(self.order), len(q)))
+    def _ring_shifts(self, q: np.ndarray) -> np.ndarray:
+        """Change of a line's order at every annulus per deviation of each ring, linear between."""
+        shift = np.zeros((len(self.order), len(q)))
         for j in range(len(self.pattern.fraction)):
             of_line = np.flatnonzero(self.line == j)
             if not len(of_line):
                 continue
             place = (self.order[of_line] + self.pattern.fraction[j]) * self.pattern.spacing
             for k, ring in enumerate(of_line):
-                bend[ring] = np.interp(q, place, np.eye(len(of_line))[k])
-        return bend
+                shift[ring] = np.interp(q, place, np.eye(len(of_line))[k])
+        return shift
 
-    def solved(self):
+    def solved(self) -> tuple[np.ndarray, np.ndarray]:
         """Step of Gauss and Newton, and its standard errors for white noise."""
         return self.inverse @ self.score.sum(0), np.sqrt(self.variance * np.diag(self.inverse))
 
-    def parts(self, vector):
+    def parts(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Six of the geometry, one of each ring, of each line's height, two of the shape."""
         first, rings = self.geometry_slots, len(self.order)
         geometry = np.zeros(6)
@@ -271,11 +277,11 @@ class _System:
         heights[self.others] = vector[first + rings : len(vector) - 2]
         return geometry, vector[first : first + rings], heights, vector[-2:]
 
-    def covariance(self):
+    def covariance(self) -> np.ndarray:
         """Of all parameters, from the sectors' scores and their neighbours'."""
         return self._of_blocks() if self.width else self._of_neighbours()
 
-    def _of_neighbours(self):
+    def _of_neighbours(self) -> np.ndarray:
         lag = np.abs(np.arange(SECTORS)[:, None] - np.arange(SECTORS))
         lag = np.minimum(lag, SECTORS - lag)
         window = np.maximum(1 - lag / (1 + self.width), 0.0)
@@ -288,7 +294,7 @@ class _System:
         scale = np.sqrt(np.diag(self.inverse) / np.maximum(expected, 1e-3 * np.diag(self.inverse)))
         return self.inverse @ meat @ self.inverse * np.outer(scale, scale)
 
-    def _of_blocks(self):
+    def _of_blocks(self) -> np.ndarray:
         """Changes of the fit without a block, squared; mean over where blocks begin."""
         whole = self.matrix.sum(0)
         size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
@@ -304,7 +310,7 @@ class _System:
                 total += np.outer(change, change) / length
         return total
 
-    def _shifts(self):
+    def _shifts(self) -> tuple[np.ndarray, np.ndarray]:
         """Shift of every ring in every sector, orders, NaN where it has none; its information."""
         slots = self.ring_slots
         information = self.matrix[:, slots, slots].T

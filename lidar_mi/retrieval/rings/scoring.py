@@ -12,12 +12,12 @@ import torch
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.bound import fisher_matrix, prior_information, standard_deviations
-from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, reach
+from lidar_mi.retrieval.rings.mean_image import Waves, mean_and_jacobian, reach
 from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
 
 ITERATIONS = 40
 CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converged
-# Cells beyond so many standard deviations hold hot pixels or dust and are left out, unless more
+# Cells beyond so many standard deviations hold hot pixels or dust and are masked, unless more
 # than this fraction is: then the model is wrong, and chi-square shall say so.
 OUTLIER, MOST_OUTLIERS = 5.0, 0.03
 POOR = 1.2  # chi-square of a fit that something is wrong with
@@ -35,9 +35,9 @@ class Scored(NamedTuple):
 
 
 def robust_scoring(
-    blocks,
-    means,
-    parameters,
+    blocks: Sequence[Waves],
+    means: Sequence[torch.Tensor],
+    parameters: torch.Tensor,
     model: RingModel,
     noise: PixelNoise,
     names: Sequence[str],
@@ -52,7 +52,8 @@ def robust_scoring(
             for waves, part in zip(blocks, means, strict=True)
         ]
         number_of = sum(part.shape[1] for part in left)
-        fraction = sum((~part).sum(1) for part in left) / number_of
+        outside = torch.stack([(~part).sum(1) for part in left]).sum(0)
+        fraction = outside / number_of
         # an image with too many keeps them all
         few = (fraction <= MOST_OUTLIERS)[:, None]
         left = [part | ~few for part in left]
@@ -83,7 +84,9 @@ def cell_variance(
     return noise.variance(mean, (mean - background).clamp(min=0))
 
 
-def _residual(waves, means, parameters, model, noise) -> torch.Tensor:
+def _residual(
+    waves: Waves, means: torch.Tensor, parameters: torch.Tensor, model: RingModel, noise: PixelNoise
+) -> torch.Tensor:
     """Misfit of every cell in standard deviations."""
     mean = mean_and_jacobian(model, waves, parameters)[0]
     variance = cell_variance(mean, parameters, noise, 1e-3 * means.mean(1, keepdim=True))
@@ -91,10 +94,10 @@ def _residual(waves, means, parameters, model, noise) -> torch.Tensor:
 
 
 def _scoring(
-    blocks,
-    means,
-    kept,
-    parameters,
+    blocks: Sequence[Waves],
+    means: Sequence[torch.Tensor],
+    kept: list[torch.Tensor],
+    parameters: torch.Tensor,
     model: RingModel,
     noise: PixelNoise,
     names: Sequence[str],
@@ -128,7 +131,7 @@ def _scoring(
             score = score + (jacobian @ (weight * (part - mean))[:, :, None])[:, :, 0]
             chi_square = chi_square + (weight * (part - mean) ** 2).sum(1)
         if converged.all():
-            lost = sum((~use).sum(1) for use in kept)
+            lost = torch.stack([(~use).sum(1) for use in kept]).sum(0)
             return Scored(
                 parameters,
                 fisher,
@@ -163,7 +166,7 @@ def _scoring(
     )
 
 
-def _step_limits(model: RingModel, names, device) -> torch.Tensor:
+def _step_limits(model: RingModel, names: Sequence[str], device: torch.device) -> torch.Tensor:
     """Longest steps: one longer than the rings are wide would leave the linear range."""
     widths = {
         "v_los": model.velocity_range / 16,

@@ -30,10 +30,10 @@ class RingCurves:
     def moved(self, by: np.ndarray) -> "RingCurves":
         """With six changes added: of centre, ellipticity and tilt."""
         whole = np.array([*self.centre, *self.ellipticity, *self.tilt]) + by
-        pairs = (tuple(map(float, whole[k : k + 2])) for k in (0, 2, 4))
-        return RingCurves(*pairs)
+        x, y, cosine, sine, right, down = map(float, whole)
+        return RingCurves((x, y), (cosine, sine), (right, down))
 
-    def curve(self, radius, angle) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, radius: np.ndarray | float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y) of rings of these mean radii, at angles from x toward y."""
         cosine, sine = np.cos(angle), np.sin(angle)
         r = radius * (
