@@ -16,7 +16,7 @@ from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
-from lidar_mi.retrieval.vortices.image_fit import begun_fit, fit_vortices
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices, started_fit
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
@@ -137,7 +137,7 @@ class Estimator:
         fit = partial(fit_vortices, image1, dt=dt, noise=noise, **given)
         if expected:
             with _timed(seconds, "vortices_before"):
-                fit = begun_fit(image1, dt, noise, start=expected, **given)
+                fit = started_fit(image1, dt, noise, start=expected, **given)
         if ready:
             seconds["wind_before"] = ready()
         with _timed(seconds, "total"):

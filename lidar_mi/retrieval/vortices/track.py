@@ -86,7 +86,7 @@ class TrackSettings:
     circulation_error: float = 0.1
     place_error: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("slope", "unlike_slope", "circulation_error", "place_error"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(
@@ -371,11 +371,11 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
     _check_finite(x=x, time=time)
     if not time > track.time:
         raise InputError(f"time: {time:g} s is not allowed; the last slab's is {track.time:g} s")
-    fits = pair is not None and _is_fit(pair)
-    if fits and pair.profile != track.profile:
-        raise InputError(f"pair.profile: {pair.profile!r} is not that of the track")
-    if track.lost and fits and _has_sense(pair):
-        return first_track(pair, x, time, track.settings)
+    fit = pair if pair is not None and _is_fit(pair) else None
+    if fit is not None and fit.profile != track.profile:
+        raise InputError(f"pair.profile: {fit.profile!r} is not that of the track")
+    if track.lost and fit is not None and _has_sense(fit):
+        return first_track(fit, x, time, track.settings)
     state, covariance, transition, noise = _predicted(
         track.state,
         track.covariance,
@@ -384,25 +384,32 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         track.settings.wandering,
         track.profile,
     )
-    predicted, square, accepted = state, None, False
-    if fits:
-        measured = pair.parameters, pair.covariance
+    predicted, square, used = state, None, None
+    if fit is not None:
+        measured = fit.parameters, fit.covariance
         square = kalman.innovation(state, covariance, *measured)
-        accepted = _has_sense(pair) and square <= chi2.ppf(track.settings.gate, MEASURED)
-        if accepted:
+        if _has_sense(fit) and square <= chi2.ppf(track.settings.gate, MEASURED):
+            used = fit
             state, covariance = kalman.updated(state, covariance, *measured)
     slab = Slab(float(x), float(time), state, covariance, predicted, transition, noise, square)
     return Track(
         slabs=(*track.slabs, slab)[-track.settings.memory :],
-        fit=pair if accepted else track.fit,
+        fit=used or track.fit,
         settings=track.settings,
-        updates=track.updates + accepted,
-        rejected=track.rejected + (fits and not accepted),
-        missed=0 if accepted else track.missed + 1,
+        updates=track.updates + (used is not None),
+        rejected=track.rejected + (fit is not None and used is None),
+        missed=track.missed + 1 if used is None else 0,
     )
 
 
-def _predicted(state, covariance, dx, dt, wandering, profile):
+def _predicted(
+    state: np.ndarray,
+    covariance: np.ndarray,
+    dx: float,
+    dt: float,
+    wandering: Wandering,
+    profile: Profile,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """State and covariance after a move, its derivatives and its own covariance."""
     reached, along, later = moved(state, dx, dt, profile)
     path, time = wandered(state, dx, dt, wandering)

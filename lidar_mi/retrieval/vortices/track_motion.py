@@ -84,7 +84,7 @@ class Wandering:
     decay: float = 0.01
     departure: float = 0.035
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
             if not 0 <= value < np.inf:
