@@ -1,14 +1,15 @@
 """Figures of a flight into a wake: the approach, the track, the moments, the rolling."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.described import Progress
+from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
@@ -40,7 +41,7 @@ def draw_all(
     track: xr.Dataset | None,
     seen: xr.Dataset | None,
     span: float,
-    log: Callable,
+    log: Progress,
 ) -> list[Drawn]:
     """Draw all figures of a flight.
 
@@ -84,7 +85,7 @@ def flight_style(mode: str, series: xr.Dataset) -> tuple[str, str, str]:
     return (flight_name(mode, series.attrs.get(CONTROLLER, "")), *FLIGHTS[mode][1:])
 
 
-def _flown(series: xr.Dataset):
+def _flown(series: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     """Flights in the order in which they are drawn, the one with the lidar on top."""
     there = [str(mode) for mode in series["flight"].values]
     return [
@@ -94,14 +95,14 @@ def _flown(series: xr.Dataset):
     ]
 
 
-def _lines(axes, series, name, factor=1.0) -> None:
+def _lines(axes: Axes, series: xr.Dataset, name: str, factor: float = 1.0) -> None:
     for mode, one in _flown(series):
         label, colour, style = flight_style(mode, series)
         axes.plot(one["time"], factor * one[name], color=colour, ls=style, lw=1.8, label=label)
     axes.grid(alpha=0.3)
 
 
-def _roll(series):
+def _roll(series: xr.Dataset) -> Plate:
     figure = Figure(figsize=(10.5, 6.4), layout="compressed")
     angle, rate = figure.subplots(2, 1, sharex=True)
     _lines(angle, series, "roll", np.degrees(1))
@@ -117,7 +118,7 @@ def _roll(series):
     )
 
 
-def _approach(series, track, seen):
+def _approach(series: xr.Dataset, track: xr.Dataset, seen: xr.Dataset | None) -> Plate:
     figure = Figure(figsize=(11.5, 7.2), layout="compressed")
     above, side = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     one = series.sel(flight="feedforward")
@@ -167,7 +168,7 @@ def _approach(series, track, seen):
     )
 
 
-def _overview(series, track, seen, span):
+def _overview(series: xr.Dataset, track: xr.Dataset, seen: xr.Dataset, span: float) -> Plate:
     figure = Figure(figsize=(13.6, 4.9), layout="compressed")
     view, angle = figure.subplots(1, 2, width_ratios=(1.25, 1))
     ahead = _draw_slab(view, track, seen, span)
@@ -182,7 +183,7 @@ def _overview(series, track, seen, span):
     )
 
 
-def _cockpit(track, seen, span):
+def _cockpit(track: xr.Dataset, seen: xr.Dataset, span: float) -> Plate:
     figure = Figure(figsize=(10.5, 7.0), layout="compressed")
     axes = figure.subplots()
     ahead = _draw_slab(axes, track, seen, span)
@@ -195,7 +196,7 @@ def _cockpit(track, seen, span):
     )
 
 
-def _draw_slab(axes, track, seen, span) -> float:
+def _draw_slab(axes: Axes, track: xr.Dataset, seen: xr.Dataset, span: float) -> float:
     """Image, wind, vortices and wing; time from the delivery to the wing's arrival, s."""
     view = seen.isel(slab=best_slab(track, seen))
     draw_image(axes, view)
@@ -227,7 +228,7 @@ def best_slab(track: xr.Dataset, seen: xr.Dataset) -> int:
     return seen.sizes["slab"] - 1
 
 
-def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None) -> None:
+def draw_image(axes: Axes, view: xr.Dataset, limits: tuple[float, float] | None = None) -> None:
     """Backscatter of a slab in the pilot's view."""
     if "image" not in view:
         return
@@ -247,7 +248,7 @@ def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None
     axes.set_ylim(float(view["image_z"].min()), float(view["image_z"].max()))
 
 
-def draw_vectors(axes, view: xr.Dataset) -> None:
+def draw_vectors(axes: Axes, view: xr.Dataset) -> None:
     """Wind vectors of a slab, those that are valid."""
     if "v" not in view:
         return
@@ -266,7 +267,7 @@ def draw_vectors(axes, view: xr.Dataset) -> None:
     )
 
 
-def draw_vortices(axes, at: xr.Dataset) -> None:
+def draw_vortices(axes: Axes, at: xr.Dataset) -> None:
     """Cores of a slab: true, and as tracked."""
     for side in SIDES:
         label = side == "port"
@@ -294,7 +295,7 @@ def draw_vortices(axes, at: xr.Dataset) -> None:
             axes.add_patch(circle)
 
 
-def _track(track):
+def _track(track: xr.Dataset) -> Plate:
     figure = Figure(figsize=(11.5, 10.0), layout="compressed")
     panels = figure.subplots(len(_ROWS), 2, sharex=True)
     truth, tracked, found = (track.sel(source=s) for s in ("truth", "track", "estimate"))
@@ -344,7 +345,7 @@ def _track(track):
     )
 
 
-def _fit_limits(axes, truth, found, spread) -> None:
+def _fit_limits(axes: Axes, truth: np.ndarray, found: np.ndarray, spread: np.ndarray) -> None:
     """Values of truth and estimates, without the widest bands."""
     inside = np.isfinite(found)
     values = np.concatenate([truth[inside], found[inside]]) if inside.any() else truth
@@ -354,7 +355,7 @@ def _fit_limits(axes, truth, found, spread) -> None:
         axes.set_ylim(values.min() - margin, values.max() + margin)
 
 
-def _moment(series):
+def _moment(series: xr.Dataset) -> Plate:
     figure = Figure(figsize=(10.5, 6.4), layout="compressed")
     moment, rest = figure.subplots(2, 1, sharex=True)
     one = series.sel(flight="feedforward")
@@ -399,7 +400,7 @@ def _moment(series):
     )
 
 
-def _commands(series):
+def _commands(series: xr.Dataset) -> Plate:
     figure = Figure(figsize=(10.5, 4.0), layout="compressed")
     axes = figure.subplots()
     _lines(axes, series, "aileron_deflection", np.degrees(1))

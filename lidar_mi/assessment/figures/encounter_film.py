@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -38,12 +39,19 @@ def film(
         return
     times = series["time"].values
     start = float(seen["delivered"].min())
-    limits = tuple(float(q) for q in np.nanquantile(seen["image"], (0.01, 0.995)))
+    low, high = (float(q) for q in np.nanquantile(seen["image"], (0.01, 0.995)))
     for time in np.linspace(start, float(times[-1]), MOST_FRAMES):
-        yield _frame(series, track, seen, span, float(time), limits)
+        yield _frame(series, track, seen, span, float(time), (low, high))
 
 
-def _frame(series, track, seen, span, time, limits) -> Frame:
+def _frame(
+    series: xr.Dataset,
+    track: xr.Dataset,
+    seen: xr.Dataset,
+    span: float,
+    time: float,
+    limits: tuple[float, float],
+) -> Frame:
     figure = Figure(figsize=_SIZE, dpi=_DOTS, layout="constrained")
     view, above, roll = figure.subplots(3, 1, height_ratios=(4.4, 1.5, 1.3))
     number = int(np.flatnonzero(seen["delivered"].values <= time)[-1])
@@ -82,7 +90,15 @@ def _frame(series, track, seen, span, time, limits) -> Frame:
     return Frame(pixels, f"{time:.1f} s: roll angle {words}", time)
 
 
-def _from_above(axes, series, track, seen, slab, one, time):
+def _from_above(
+    axes: Axes,
+    series: xr.Dataset,
+    track: xr.Dataset,
+    seen: xr.Dataset,
+    slab: xr.Dataset,
+    one: xr.Dataset,
+    time: float,
+) -> None:
     known = track["delivered"].values <= time
     for side, colour in SIDES.items():
         axes.plot(track["x"], track[f"{side}_y"].sel(source="truth"), color="k", lw=0.9)
@@ -101,7 +117,7 @@ def _from_above(axes, series, track, seen, slab, one, time):
     axes.grid(alpha=0.3)
 
 
-def _rolled(axes, series, time):
+def _rolled(axes: Axes, series: xr.Dataset, time: float) -> None:
     for mode in series["flight"].values:
         label, colour, style = flight_style(str(mode), series)
         one = series.sel(flight=mode)

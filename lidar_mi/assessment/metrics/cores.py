@@ -109,7 +109,15 @@ def ring_averages(
     )
 
 
-def _ring_means(v, w, y, z, cy: float, cz: float, rings: np.ndarray) -> np.ndarray:
+def _ring_means(
+    v: np.ndarray,
+    w: np.ndarray,
+    y: np.ndarray,
+    z: np.ndarray,
+    cy: float,
+    cz: float,
+    rings: np.ndarray,
+) -> np.ndarray:
     """Means of v, w and the tangential velocity on rings around (cy, cz), (3, rings), m/s.
 
     Tangential is positive from +y towards +z.

@@ -115,7 +115,9 @@ def _plus_difference(base: Pair, more: Pair, less: Pair) -> list[xr.DataArray]:
     ]
 
 
-def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def chord_wind(
+    truth: xr.Dataset, y: np.ndarray, z: np.ndarray, dt: float, steps: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean wind over dt of the air whose path has its middle at given places.
 
     The displacement between two images is the chord of a curved path. In a solid rotation at the
@@ -254,7 +256,7 @@ def moved_rigidly(
         places.append(np.broadcast_to(place, regions.shape))
     advected = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
 
-    def cut(image):
+    def cut(image: np.ndarray) -> np.ndarray:
         return sliding_window_view(image, (search, search))[::stride, ::stride]
 
     rest = cut(measured[1].values - blurred[1].values)
@@ -339,7 +341,7 @@ def error_budget(
     return metrics
 
 
-def _difference(wind, true) -> np.ndarray:
+def _difference(wind: xr.Dataset, true: xr.Dataset | Mapping[str, np.ndarray]) -> np.ndarray:
     return np.stack([np.asarray(wind[n], float) - np.asarray(true[n], float) for n in ("v", "w")])
 
 

@@ -213,11 +213,13 @@ def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> Ta
     )
 
 
-def _values(metrics, modes, key, factor) -> list[str]:
+def _values(
+    metrics: Mapping[str, float], modes: Sequence[str], key: str, factor: float
+) -> list[str]:
     return [_shown(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
 
 
-def _departed(metrics, mode) -> bool:
+def _departed(metrics: Mapping[str, float], mode: str) -> bool:
     return metrics.get(f"encounter.{mode}.departed", 0) > 0
 
 

@@ -55,7 +55,13 @@ def sample_blocks(
             yield from _fronts(key, known, axes, places, points)
 
 
-def _fronts(key, known, axes, places, points) -> Iterator[Block]:
+def _fronts(
+    key: str,
+    known: Mapping[str, xr.DataArray],
+    axes: Mapping[str, Axis],
+    places: Mapping[str, np.ndarray],
+    points: Points,
+) -> Iterator[Block]:
     varied = [(name, larger) for name, larger in _OBJECTIVES if name in axes]
     if not varied:
         return

@@ -226,7 +226,7 @@ def _tangents(scan: xr.Dataset) -> np.ndarray:
     return directions[:, 1:] / directions[:, :1]
 
 
-def _vectors(scan, along, lines, method) -> xr.Dataset:
+def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str) -> xr.Dataset:
     directions = scan["direction"].transpose("line", "axis").values[lines]
     values, std = along[lines], scan["v_los_std"].values[lines]
     missing = ~np.isfinite(values).all(1)
@@ -275,7 +275,9 @@ def _vectors(scan, along, lines, method) -> xr.Dataset:
 _LONG = {"u": "wind along x", "v": "wind along y", "w": "wind along z"}
 
 
-def error_variables(dims, covariance: np.ndarray) -> dict:
+def error_variables(
+    dims: str | tuple[str, ...], covariance: np.ndarray
+) -> dict[str, tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]]:
     """Standard errors and correlations of u, v, w from covariances (..., 3, 3), as variables."""
     stderr = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     found = {
@@ -298,7 +300,7 @@ def error_variables(dims, covariance: np.ndarray) -> dict:
     return found
 
 
-def flag_attributes(flags: type[enum.IntFlag]) -> dict:
+def flag_attributes(flags: type[enum.IntFlag]) -> dict[str, str | np.ndarray]:
     """CF attributes of a variable that holds bits of ``flags``."""
     return {
         "long_name": "reasons to reject the vector, 0 = valid",
