@@ -162,7 +162,7 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
     }
     flagged, valid = known & (flag != 0), known & (flag == 0)
     if not valid.any():
-        # what is left of no retrieval are numbers by chance
+        # without a valid vector the others are random numbers
         axes.text(0.5, 0.5, "no valid vector", transform=axes.transAxes, ha="center", va="center")
     elif flagged.any():
         axes.quiver(y[flagged], z[flagged], v[flagged], w[flagged], color="0.75", **style)
@@ -305,14 +305,14 @@ def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Pl
             norm=TwoSlopeNorm(0, -limit, limit),
             cmap="RdBu_r",
         )
-        turn = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
+        largest = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
         image_panel(
             row[1],
             error["direction"],
             f"{METHOD_NAMES[method]}: direction",
             "direction / rad",
             extend="both",
-            norm=TwoSlopeNorm(0, -turn, turn),
+            norm=TwoSlopeNorm(0, -largest, largest),
             cmap="PuOr_r",
         )
     against = "the true wind" if reference is None else f"winds from {reference}"

@@ -115,7 +115,7 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
     ----------
     table : RequirementTable
     measured : mapping
-        The sensor's values, SI, by names of `QUANTITIES`; None, NaN or left out: not known. Names
+        The sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known. Names
         without a row in the table are ignored.
 
     Raises

@@ -37,9 +37,9 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
     std             standard deviation about each speed's own mean, pooled over all speeds
     std_stderr      its standard error, std / sqrt(2 degrees of freedom), for normal errors
     expected_std    root mean square of the random standard deviations as stated
-    expected_systematic   of the systematic ones, which all images share
+    expected_systematic   of the systematic ones, common to all images
 
-    Undetermined measures are left out.
+    Undetermined measures are absent.
 
     Parameters
     ----------

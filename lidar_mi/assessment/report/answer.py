@@ -29,8 +29,8 @@ from lidar_mi.tables import with_error
 from lidar_mi.units import shown
 
 # Fraction of errors within 1.96 standard errors below which, and within 1 above which, they are
-# said not to hold: four standard errors of these fractions for the eighty independent windows of an
-# image of 219 x 139 pixels, from a fifth of valid vectors on.
+# reported not to hold: four standard errors of these fractions for the eighty independent windows
+# of an image of 219 x 139 pixels, from a fifth of valid vectors on.
 _HOLDS, _ENOUGH = (0.85, 0.89), 0.2
 # Standard errors of a circulation from which its error is named.
 _FAR_OFF = 3.0
@@ -192,12 +192,15 @@ def _misstated(
     )
     low, high = _HOLDS
     if outer < low:
-        size, seen = "small", f"{whole_percent(outer)} of the errors are within 1.96 of them (95 %)"
+        size, covered = (
+            "small",
+            f"{whole_percent(outer)} of the errors are within 1.96 of them (95 %)",
+        )
     elif inner > high:
-        size, seen = "large", f"{whole_percent(inner)} of the errors are within 1 of them (68 %)"
+        size, covered = "large", f"{whole_percent(inner)} of the errors are within 1 of them (68 %)"
     else:
         return
-    yield f"Standard errors stated by {name} are too {size} here: {seen}."
+    yield f"Standard errors stated by {name} are too {size} here: {covered}."
 
 
 def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:

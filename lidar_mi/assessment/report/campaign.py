@@ -135,11 +135,11 @@ def _points(dataset: xr.Dataset) -> Points:
 
 
 def _links(dataset: xr.Dataset, folder: xr.DataArray) -> xr.DataArray:
-    """The report of a point, where reports are kept; else its folder."""
-    kept = (dataset["status"] == _DONE) & (dataset.attrs.get("keep") == "everything")
+    """The report of a point, where reports are stored; else its folder."""
+    stored = (dataset["status"] == _DONE) & (dataset.attrs.get("keep") == "everything")
     ends = [
-        f"{one}/run/report.html" if keep else f"{one}/"
-        for one, keep in zip(folder.values.ravel(), kept.values.ravel(), strict=True)
+        f"{one}/run/report.html" if there else f"{one}/"
+        for one, there in zip(folder.values.ravel(), stored.values.ravel(), strict=True)
     ]
     return folder.copy(data=np.array(ends, dtype=object).reshape(folder.shape))
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lidar_mi.assessment.described import ExperimentDescription, SensorDescription
+from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.requirements import Finding, Judged, as_rows, fulfilled, look_ahead
@@ -67,7 +67,7 @@ def sensor_chapter(
             purpose,
             warning,
             *_limit_of_u(metrics),
-            *_not_stated(experiment.sensor),
+            *(_not_stated(experiment.sensor.errors) if experiment.sensor else []),
             *_costs(metrics),
         ],
         drawn=drawn,
@@ -130,9 +130,9 @@ def _limit_of_u(metrics: Mapping[str, float]) -> list[str]:
     return [f"{text})" + (f"; {' or '.join(little)}: negligible." if little else ".")]
 
 
-def _not_stated(sensor: SensorDescription | None) -> list[str]:
+def _not_stated(errors: PlatformErrors) -> list[str]:
     """That the platform has errors which standard errors do not include."""
-    if sensor is None or sensor.errors == PlatformErrors():
+    if errors == PlatformErrors():
         return []
     text = (
         "The platform's attitude, pointing or speed differs from the assumed one (sensor.errors). "

@@ -1,4 +1,4 @@
-"""What is said of the simulation's own noise: in the answer, in warnings, beside the number."""
+"""Sentences on the simulation's own noise: in the answer, in warnings, with the number."""
 
 from collections.abc import Callable, Mapping
 
@@ -58,12 +58,12 @@ def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str,
         f"{whole_percent(part.fraction)} by {METHOD_NAMES[part.method]}" for part in large
     )
     beyond = " beyond two core radii" if large[0].place else ""
-    beside = ""
+    ratio = ""
     if _FRACTION in metrics:
-        beside = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
+        ratio = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
     return (
         f"Of the mean square error of v and w{beyond}, noise of the simulation, not of the lidar, "
-        f"makes {named} ({number}{beside})."
+        f"makes {named} ({number}{ratio})."
     )
 
 

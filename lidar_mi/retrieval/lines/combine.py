@@ -181,6 +181,7 @@ def combine(
     residual = lines.along - (across * mean).sum(1)
     without_image = (lines.weight * ~field.valid[lines.z, lines.y]).sum(1)
     fixed = lines.covariance + np.diag(without_image**2 * (across**2 @ field.prior_std**2))
+    # the mean of u is unknown: a prior so wide that it has no weight
     fixed += _MEAN_STD**2 * np.outer(forward, forward)
     fixed += covariance_of_lines(lines, crossflow_weights(field, lines), *overlap).sum(0)
     # the lines' velocities per m/s of an error that all vectors share
@@ -195,6 +196,7 @@ def combine(
     valid = field.valid
     wind = np.zeros((*valid.shape, 3))
     covariance = np.zeros((*valid.shape, 3, 3))
+    # in chunks of rows: the covariance of nodes and lines would fill the memory
     rows = max(1, int(CHUNK_NUMBERS / (3 * len(residual) * len(y))))
     for start in range(0, len(z), rows):
         chunk = slice(start, start + rows)
@@ -233,7 +235,7 @@ def combine(
 def _with_common(
     combined: xr.Dataset, field: Crossflow, offset: np.ndarray, stderr: np.ndarray
 ) -> xr.Dataset:
-    """The data set with the error that the images' vectors share, after its correction."""
+    """The data set with the error common to the images' vectors, after its correction."""
     for index, name in enumerate(COMPONENTS[1:]):
         about = {"long_name": f"part of {name}_stderr that all vectors share", "units": "m s-1"}
         combined[f"{name}_common_stderr"] = (), stderr[index], about
@@ -294,6 +296,7 @@ def _posterior(
             response = np.concatenate([(gain @ shared)[None], across @ of_lines[:, 1:]])
             effect = np.eye(3)[:, 1:] - np.moveaxis(response, 0, -2)
             covariance += choice.probability * (effect * field.common**2) @ effect.swapaxes(-1, -2)
+    # mixture of the choices: mean of their covariances, plus the scatter of their means
     covariance[..., 1:, 1:] += known - np.einsum("azyl,bzyl->zyab", across @ inverse, across)
     mean = np.tensordot(probability, wind, 1)
     off = wind - mean
@@ -303,7 +306,7 @@ def _posterior(
 def _common(
     field: Crossflow, choices: Sequence[Statistics], residual: np.ndarray, shared: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The error (2,) that all vectors of the images share, and its standard error, m/s."""
+    """The error (2,) common to all vectors of the images, and its standard error, m/s."""
     if not field.estimated:
         return np.zeros(2), field.common
     means, squares = [], []

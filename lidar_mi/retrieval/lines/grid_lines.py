@@ -108,6 +108,7 @@ def covariances_of_lines(
     ``weight`` is (lines, nodes, parts); ``correlations`` are those of the nodes along z and y.
     """
     columns = int(lines.y.max()) + 1
+    # neighbouring lines meet the same nodes: each is computed once
     place, node = np.unique(lines.z * columns + lines.y, return_inverse=True)
     z, y = np.divmod(place, columns)
     count, parts = len(weight), weight.shape[-1]

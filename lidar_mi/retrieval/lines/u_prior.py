@@ -19,7 +19,7 @@ _LENGTHS = 8
 # Powers of the cross-flow's shear that u's standard deviation may be proportional to.
 _POWERS = (0.0, 0.5, 1.0)
 
-# Exponents of u's correlation: rough as turbulence, and smooth.
+# Exponents of u's correlation: of turbulence, and of a smooth field.
 _EXPONENTS = (1.0, 2.0)
 
 # Number of statistics drawn, in proportion to their probability.
@@ -76,6 +76,7 @@ def relative_std(
         return {0.0: uniform} if power is None else {power: uniform}
     shear = np.sqrt(square / np.where(known_here, known, 1))
     shear = np.where(known_here, shear, shear[known_here].mean())
+    # u may vary where v and w are uniform
     shear = np.maximum(shear, 1e-3 * shear.max())
     found = {}
     for one in _POWERS if power is None else (power,):

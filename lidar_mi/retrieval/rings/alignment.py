@@ -96,7 +96,7 @@ def _pieces(sectors: Sectors) -> list[tuple[int, int]]:
 
 def _shifts(sectors: Sectors, pieces: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
     """Shift of every piece in every sector, px^2, NaN where it is not known; the pieces' r^2."""
-    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.seen, strict=True)])
+    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.used, strict=True)])
     shift = np.full((len(pieces), SECTORS), np.nan)
     for number, (first, last) in enumerate(pieces):
         size = last - first + 1

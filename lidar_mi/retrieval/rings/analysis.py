@@ -33,9 +33,11 @@ from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.tables import Table, Tabular, with_error
 
 LAW = 0.02  # orders, largest rms deviation from equal steps of an etalon's pattern
-UNEXPLAINED = 0.2  # of the pattern's power, the most that may be left where noise does not leave it
+UNEXPLAINED = 0.2  # of the pattern's power, the largest residual beyond that of noise
 
-_UNEVEN = "neighbouring parts deviate alike; errors hold for patches of up to 1/10 of the image"
+_UNEVEN = (
+    "deviations of neighbouring parts correlate; errors hold for patches of up to 1/10 of the image"
+)
 
 CREST = 0.3  # of the highest crest, the least height of one that no line may leave unexplained
 
@@ -62,7 +64,7 @@ class Rings(Tabular):
         Fractional order at the centre of each component, 0 to 1 (r^2 over spacing of its
         ring of order 0).
     fraction_covariance : array (lines, lines)
-        Of the errors, which the lines share in part.
+        Of the errors, which are in part common to the lines.
     height : array (lines,)
         Of the components, relative to the highest.
     misfit : float
@@ -70,9 +72,9 @@ class Rings(Tabular):
     roundness : float
         Rms deviation of the crests from the curves fitted: circles, ellipses, tilted circles.
     uneven : bool
-        Whether neighbouring parts of rings deviate alike, as by uneven plates. Standard errors then
-        are from six parts of the image, each known to a third. Patches wider than a tenth of the
-        image, which the fit takes for another centre or spacing, may move it by more.
+        Whether deviations of neighbouring parts of rings correlate, as by uneven plates. Errors
+        then are from six parts of the image, each known to a third. Patches wider than a tenth of
+        the image, which the fit takes for another centre or spacing, may move it by more.
     ellipticity : (float, float)
         Cosine and sine part, over twice the angle, of a ring's radius over its mean; the size is
         half the relative difference of its diameters.
@@ -83,7 +85,7 @@ class Rings(Tabular):
     doubt : str
         How the spacing could be another; empty where the image excludes it.
     r2, profile : arrays
-        What all sectors share, mean over circles, for the image; without their backgrounds.
+        Common part of all sectors, mean over circles, for the image; without their backgrounds.
     """
 
     shape: tuple[int, int]
@@ -187,7 +189,7 @@ def analyse_rings(
     spacing : float, optional
         Step of r^2 from order to order, px^2, to 2 %, where it is known, as from another image of
         the same instrument. Without it, lines at equal distances are taken for one line of a
-        shorter step, which an image cannot tell from them.
+        shorter step: an image does not distinguish them.
 
     Returns
     -------
@@ -277,8 +279,8 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     )
     if pattern is None:
         raise wrong
-    left = pattern.unexplained - 2 * noise * pattern.freedom
-    if left > UNEXPLAINED * pattern.power:
+    excess = pattern.unexplained - 2 * noise * pattern.freedom
+    if excess > UNEXPLAINED * pattern.power:
         raise wrong
     off = np.abs((pattern.phase(places) + 0.5) % 1 - 0.5).min(0)
     if (off > max(0.5 * pattern.width, 2 * LAW)).any():

@@ -1,4 +1,4 @@
-"""Cramer-Rao bound of what an image of rings tells, from its model's Fisher matrix."""
+"""Cramer-Rao bound of the parameters of an image of rings, from its model's Fisher matrix."""
 
 from collections.abc import Sequence
 

@@ -17,7 +17,7 @@ _ARRAYS = {
     "systematic": (("systematic", "systematic_2"), "1", "covariance of the instrument"),
     "frame_speed": (("frame",), "m s-1", "drift of the frame, as a speed"),
     "frame_speed_std": (("frame",), "m s-1", "standard error of frame_speed"),
-    "response": (("row", "column"), "1", "response to light, 0 for pixels left out"),
+    "response": (("row", "column"), "1", "response to light, 0 for masked pixels"),
     "misfit": (("block_row", "block_column"), "1", "mean misfit over its standard deviation"),
 }
 """Dimensions, units and names of the arrays in a file."""
@@ -50,7 +50,7 @@ class Calibration(Tabular):
     std : mapping
         Standard errors by name, of `INSTRUMENT` (focal_length relative), x, y and falloff.
     systematic : array (8, 8)
-        Covariance that all later speeds share, see `RingModel.systematic`.
+        Covariance common to all later speeds, see `RingModel.systematic`.
     frame_speed, frame_speed_std : array (frames,)
         Fractional order of every frame as a speed about their mean, m/s: the drift.
     drift : float
@@ -63,7 +63,7 @@ class Calibration(Tabular):
         Mean of the frames less the model, in standard deviations, in blocks of ``block`` pixels.
     block : int
     undetermined : tuple of str
-        Of `INSTRUMENT`, what the frames do not tell beyond the tolerances.
+        Parameters of `INSTRUMENT` that the frames determine no better than the tolerances.
     lines : tuple of float
         Wavelengths of two or more lines, where their frames gave the gap, m.
     gaps : tuple of (float, float)

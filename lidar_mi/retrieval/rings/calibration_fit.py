@@ -5,7 +5,7 @@ them; every frame has its own level of light, background and fractional order at
 and etalon drift). Maximum likelihood times normal priors, by Gauss-Newton steps: after each step
 pixels are put where the improved instrument has them.
 
-What frames of one line cannot tell: the gap (only focal length^2 / gap enters: a gap that is wrong
+Frames of one line do not determine the gap (only focal length^2 / gap enters: a gap that is wrong
 by 1e-3 changes speeds by 1e-3; `calibration_lines` has it from several lines), and defects of the
 plates together with the way in which the light fills the pupil, which differs between laser and
 air.
@@ -41,7 +41,7 @@ TOLERANCES: Mapping[str, float] = {
     "damping": 0.2,
     "roughness": 0.1,
 }
-"""Standard deviations of what is known beforehand of `INSTRUMENT`: a focal length to 5 %, a camera
+"""Standard deviations of the priors on `INSTRUMENT`: a focal length to 5 %, a camera
 mounted to 3 degrees, a lens distorting by 2 %, a focus to 20 px, mirrors to 0.2 of -ln R."""
 
 _STEPS = 25
@@ -118,7 +118,7 @@ def calibrate_rings(
         )
     noise = noise or PixelNoise()
     mean = frames.mean(0, dtype=torch.float64)
-    # those that would lead the start astray; the others once there is a fit
+    # those that would mislead the start; the others are found after a fit
     hot = spots(mean, noise, len(frames))
     whole = torch.where(hot, torch.from_numpy(median_filter(mean.numpy(), 3)), mean)
     centre = gradient_centre(whole)
@@ -179,7 +179,7 @@ class _Fit(_State):
 
 
 def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
-    """The model with the focal length that the steps of r^2 between rings say, if that is near."""
+    """The model with the focal length of the steps of r^2 between rings, if that is near."""
     try:
         spacing = analyse_rings(mean.numpy()).spacing
     except InputError:
@@ -200,11 +200,12 @@ def _fitted(
     response: torch.Tensor,
     tolerances: Mapping[str, float],
 ) -> _Fit:
-    """Gauss-Newton steps until what is shared no longer changes."""
+    """Gauss-Newton steps until the shared parameters no longer change."""
     shared = (*_SHARED, *term_names("light", state.model.light_degree), *INSTRUMENT)
     local = (*_LOCAL, *term_names("background", state.model.background_degree))
     few = len(local)
     for _ in range(_STEPS):
+        # the cells move with the instrument: their positions depend on tilt and distortion
         waves = annular_waves(state.model, state.model.centre, response, derivatives=True)
         means = waves.cells.means(frames)
         mean, jacobian = mean_and_jacobian(state.model, waves, state.parameters, (*local, *shared))
@@ -227,6 +228,7 @@ def _fitted(
                 information = tolerances[name] ** -2
                 total[k, k] += information
                 rest[k] -= state.departure[name] * information
+        # the prior makes the matrix regular: frames of few rings do not determine all seven
         covariance = torch.linalg.inv(total)
         step = covariance @ rest
         close = bool((step.abs() <= _CLOSE * covariance.diagonal().sqrt()).all())
@@ -234,6 +236,7 @@ def _fitted(
             name: max(-_LONGEST.get(name, math.inf), min(value, _LONGEST.get(name, math.inf)))
             for name, value in zip(shared, step.tolist(), strict=True)
         }
+        # back substitution, with the speed within the linear range of the waves
         own_step = own_step - by_shared @ step
         limit = state.model.velocity_range / 16
         own_step[:, 0] = own_step[:, 0].clamp(-limit, limit)
@@ -244,6 +247,7 @@ def _fitted(
             if name in ("falloff", "damping", "roughness", *LIGHT):
                 parameters[:, PARAMETERS.index(name)] += change[name]
         used = int((weight > 0).sum())
+        # every frame has local parameters of its own
         freedom = max(used - len(shared) - few * len(frames), 1)
         state = fit = _Fit(
             _moved(state.model, change),
@@ -296,7 +300,7 @@ def _bad_pixels(
 ) -> torch.Tensor:
     """Further ones that are far from the model and from their neighbours: dust, warm pixels."""
     residual = _residual(mean, state, noise, count, response).numpy()
-    # what is smooth is the model's fault
+    # a smooth residual is an error of the model
     return torch.from_numpy(np.abs(residual - median_filter(residual, 5)) > _BAD)
 
 
@@ -315,7 +319,7 @@ def _calibration(
     std = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
     speed = state.parameters[:, 0].numpy()
     own_variance = grown * state.speed_variance.numpy()
-    # the frames' mean speed depends on what is shared: v = v_0 - g . shared
+    # the frames' mean speed depends on the shared parameters: v = v_0 - g . shared
     slope = -state.speed_by_shared.mean(0).numpy()
     zero = float(slope @ covariance @ slope + own_variance.sum() / count**2)
     drift = math.sqrt(max(0.0, speed.var(ddof=1) - own_variance.mean()))

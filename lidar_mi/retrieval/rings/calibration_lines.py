@@ -1,8 +1,8 @@
-"""One instrument from frames of several lines: its gap, and all that does not depend on the light.
+"""One instrument from frames of several lines: its gap, and all that does not depend on the line.
 
 Every line is calibrated for itself; the estimates are then combined with their covariances, which
-to first order is the fit of all frames together. What lines share is the geometry. Each has its own
-fractional order, illumination, and finesse (mirrors and plates in units of its wavelength); the
+to first order is the fit of all frames together. The geometry is common to all lines. Each has its
+own fractional order, illumination, and finesse (mirrors and plates in units of its wavelength); the
 fractions give the gap by the method of exact fractions, see `lidar_mi.retrieval.rings.gap`.
 """
 
@@ -21,9 +21,9 @@ from lidar_mi.retrieval.rings.gap import gap_of_covariance
 from lidar_mi.retrieval.rings.model import INSTRUMENT
 
 CHROMATIC = ("focal_length", "blur")
-"""What a lens that is not achromatic has for every line anew."""
+"""Parameters that differ from line to line of a lens that is not achromatic."""
 _GEOMETRY = ("focal_length", "tilt_x", "tilt_y", "distortion", "blur")
-_DETERMINED = 0.1  # of the tolerance: what is known beforehand is 1 % of the information
+_DETERMINED = 0.1  # of the tolerance: the prior is then 1 % of the information
 _UNLIKELY = 1e-6  # probability below which lines have different instruments
 
 
@@ -114,10 +114,10 @@ def combined(
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """What one line says of the shared part of the instrument.
+    """Estimate from one line of the shared part of the instrument.
 
-    ``information`` is the inverse of its covariance, ``determined`` that of what its frames tell
-    without what is known beforehand, which all lines have in common.
+    ``information`` is the inverse of its covariance, ``determined`` that of its
+    frames without the prior, which all lines have in common.
     """
 
     places: list[int]  # in `Calibration.systematic`

@@ -143,7 +143,7 @@ def circular_average(
     Returns
     -------
     radius, mean, weight : arrays
-        px; the value's unit; sum of the pixels' weights. Radii of weight 0 are left out.
+        px; the value's unit; sum of the pixels' weights. Radii of weight 0 are omitted.
     """
     height, width = image.shape
     x2 = (np.arange(width) - centre[0]) ** 2

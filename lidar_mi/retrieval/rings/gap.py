@@ -1,9 +1,9 @@
 """Gap of an etalon from lines of known wavelength: the method of exact fractions.
 
 The order at the centre is 2 n gap / wavelength = N + e, with N a whole number that a frame does not
-tell and e the fractional order that it does. Each N of the first line gives a gap; the other lines
-allow only those whose fractions come out as measured (Benoit 1898, J. Phys. Theor. Appl. 7, 57;
-Born & Wolf 1999, Principles of Optics, 7th ed., section 7.6.3).
+determine and e the fractional order that it does. Each N of the first line gives a gap; the other
+lines allow only those whose fractions come out as measured (Benoit 1898, J. Phys. Theor. Appl. 7,
+57; Born & Wolf 1999, Principles of Optics, 7th ed., section 7.6.3).
 """
 
 import math

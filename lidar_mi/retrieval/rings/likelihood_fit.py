@@ -85,7 +85,7 @@ class RingFit:
     outliers : torch.Tensor
         Fraction of the cells that was masked.
     sensitivity : torch.Tensor, shape (images, 8)
-        Change of v_los with what the model's calibration left uncertain (`RingModel.systematic`).
+        Change of v_los per error of the model's calibration (`RingModel.systematic`).
     systematic : torch.Tensor, shape (8, 8)
         The covariance of that.
     """
@@ -125,8 +125,8 @@ class RingFit:
 def difference(received: SpeedsOfRings, emitted: SpeedsOfRings) -> tuple[torch.Tensor, ...]:
     """v_LOS of received images less that of images of the laser itself, with standard deviations.
 
-    An error of the order at the centre, by a drift of etalon or laser, cancels. So does what the
-    calibration left uncertain, as far as both images respond alike.
+    An error of the order at the centre, by a drift of etalon or laser, cancels. So does an error of
+    the calibration, as far as both images respond equally.
 
     Returns
     -------
@@ -170,7 +170,7 @@ def fit_rings(
         Fitted parameters; all that the model has if not given. The others stay at the model's
         values, the background at 0.
     response : torch.Tensor, shape (height, width), optional
-        Of the pixels to light, 1 on average; pixels of response 0 are left out. For ``annular``.
+        Of the pixels to light, 1 on average; pixels of response 0 are masked. For ``annular``.
     saturation : float, optional
         Electrons from which a pixel is saturated. Images that end in a plateau are refused even
         if it is not given.
@@ -385,6 +385,7 @@ def _start(
     """Parameters from the first harmonic over the order: a linear fit, no guess needed."""
     cells = waves.cells
     fraction = orders(model, cells.r2)[1]
+    # the phase of the first harmonic is the fraction of the order, for any finesse
     turns = torch.stack(
         [
             torch.ones_like(fraction),
@@ -417,14 +418,14 @@ def _start(
 
 
 def _sensitivity(waves: Waves, end: Scored, task: _Task) -> torch.Tensor:
-    """Change of the fitted speed with what was taken as known, (images, 8).
+    """Change of the fitted speed per error of the calibration, (images, 8).
 
     A change d of the instrument moves the fit by -F^-1 J^T W (dmu/dd) d.
     """
     model = task.model
     exact = ring_waves(model, waves.cells, derivatives=True)
     mean, jacobian = mean_and_jacobian(model, exact, end.parameters, [*task.free, *INSTRUMENT])
-    weight = end.kept[0] * waves.cells.count / cell_variance(mean, end.parameters, task.noise)
+    weight = end.used[0] * waves.cells.count / cell_variance(mean, end.parameters, task.noise)
     free, known = jacobian.split([len(task.free), len(INSTRUMENT)], 1)
     information = prior_information(model, task.free, mean.device)
     fisher = torch.diag(information) + fisher_matrix(free, weight)

@@ -36,7 +36,7 @@ factor exp(-a n - b n^2) of the n-th harmonic: the mirrors' reflectivity and the
 PARAMETERS = (*FRAME, *LIGHT, *BACKGROUND, *INSTRUMENT)
 
 NEGLIGIBLE = 1e-7  # harmonics below this fraction of A_0 change velocities by less than 1e-4 m/s
-# Of the aerosol's narrow line; the harmonics left out are nearly orthogonal to a change of speed.
+# Of the aerosol's narrow line; the omitted harmonics are nearly orthogonal to a change of speed.
 _NEGLIGIBLE_AEROSOL = 1e-4
 
 
@@ -74,7 +74,7 @@ class RingModel:
     priors : mapping of (mean, standard deviation)
         Normal distributions of parameters, from other sources than the image.
     systematic : array (8, 8), optional
-        Covariance of what a calibration left uncertain, the same in all images: of the speed at
+        Covariance of the calibration's error, the same in all images: of the speed at
         which the rings are those of order_at_centre (m/s), then of `INSTRUMENT`.
 
     Raises

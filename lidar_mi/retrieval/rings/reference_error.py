@@ -3,7 +3,7 @@
 The laser's own light sets the zero of the speeds. Three things move the zero between its frame and
 the echo's: a drift of the laser's frequency, a drift of the etalon, and defects of the plates where
 laser and echo fill the pupil differently. All of them move the rings as a speed does, so that
-chi-square stays 1. They are stated from what is known of the instrument beside the images.
+chi-square stays 1. They follow from properties of the instrument that no image shows.
 
 A change dd of the mean gap d that the light passes changes its order 2 d / wavelength as a speed of
 

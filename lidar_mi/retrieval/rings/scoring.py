@@ -31,7 +31,7 @@ class Scored(NamedTuple):
     chi_square: torch.Tensor
     freedom: int
     outliers: torch.Tensor
-    kept: list[torch.Tensor]
+    used: list[torch.Tensor]
 
 
 def robust_scoring(
@@ -44,27 +44,27 @@ def robust_scoring(
     number: int,
 ) -> Scored:
     """Fisher scoring, again without cells that are far outside the noise."""
-    kept = [torch.ones_like(part, dtype=torch.bool) for part in means]
+    used = [torch.ones_like(part, dtype=torch.bool) for part in means]
     for _ in range(4):
-        end = _scoring(blocks, means, kept, parameters, model, noise, names, number)
-        left = [
+        end = _scoring(blocks, means, used, parameters, model, noise, names, number)
+        inside = [
             _residual(waves, part, end.parameters, model, noise).abs() <= OUTLIER
             for waves, part in zip(blocks, means, strict=True)
         ]
-        number_of = sum(part.shape[1] for part in left)
-        outside = torch.stack([(~part).sum(1) for part in left]).sum(0)
+        number_of = sum(part.shape[1] for part in inside)
+        outside = torch.stack([(~part).sum(1) for part in inside]).sum(0)
         fraction = outside / number_of
-        # an image with too many keeps them all
+        # in an image with too many outliers none is masked
         few = (fraction <= MOST_OUTLIERS)[:, None]
-        left = [part | ~few for part in left]
-        if all(torch.equal(a, b) for a, b in zip(left, kept, strict=True)):
+        inside = [part | ~few for part in inside]
+        if all(torch.equal(a, b) for a, b in zip(inside, used, strict=True)):
             break
-        kept, parameters = left, end.parameters
+        used, parameters = inside, end.parameters
     # where the rest does not fit either, it is the model that is wrong: no cell is to blame
     wrong = (end.chi_square > POOR) & (end.outliers > 0)
     if wrong.any():
-        kept = [part | wrong[:, None] for part in end.kept]
-        end = _scoring(blocks, means, kept, end.parameters, model, noise, names, number)
+        used = [part | wrong[:, None] for part in end.used]
+        end = _scoring(blocks, means, used, end.parameters, model, noise, names, number)
     return end
 
 
@@ -96,7 +96,7 @@ def _residual(
 def _scoring(
     blocks: Sequence[Waves],
     means: Sequence[torch.Tensor],
-    kept: list[torch.Tensor],
+    used: list[torch.Tensor],
     parameters: torch.Tensor,
     model: RingModel,
     noise: PixelNoise,
@@ -109,6 +109,7 @@ def _scoring(
     """
     columns = [PARAMETERS.index(name) for name in names]
     parameters = parameters.clone()
+    # a background that is not fitted is 0, and the level takes its part of the light
     if "background" not in names:
         place, level = PARAMETERS.index("background"), PARAMETERS.index("level")
         parameters[:, level] += parameters[:, place]
@@ -116,6 +117,7 @@ def _scoring(
     limit = _step_limits(model, names, parameters.device)
     information = prior_information(model, names, parameters.device)
     middle = model.start(parameters.device)[:, columns]
+    # between rings a mean near 0 would give single cells nearly all of the weight
     floor = 1e-3 * means[0].mean(1, keepdim=True)
     freedom = sum(part.shape[1] for part in means) - len(names)
     converged = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
@@ -123,7 +125,7 @@ def _scoring(
         fisher = torch.diag(information).repeat(len(parameters), 1, 1)
         score = information * (middle - parameters[:, columns])
         chi_square = torch.zeros_like(score[:, 0])
-        for waves, part, use in zip(blocks, means, kept, strict=True):
+        for waves, part, use in zip(blocks, means, used, strict=True):
             mean, jacobian = mean_and_jacobian(model, waves, parameters, names)
             variance = cell_variance(mean, parameters, noise, floor)
             weight = use * waves.cells.count / variance
@@ -131,16 +133,17 @@ def _scoring(
             score = score + (jacobian @ (weight * (part - mean))[:, :, None])[:, :, 0]
             chi_square = chi_square + (weight * (part - mean) ** 2).sum(1)
         if converged.all():
-            lost = torch.stack([(~use).sum(1) for use in kept]).sum(0)
+            lost = torch.stack([(~use).sum(1) for use in used]).sum(0)
             return Scored(
                 parameters,
                 fisher,
                 chi_square / (freedom - lost),
                 freedom,
                 lost / (freedom + len(names)),
-                kept,
+                used,
             )
         std = standard_deviations(fisher)
+        # px, K and electrons differ by powers of ten: solved with a unit diagonal
         unit = fisher.diagonal(dim1=1, dim2=2).rsqrt()
         normal = fisher * unit[:, :, None] * unit[:, None, :]
         step = torch.linalg.solve_ex(normal, score * unit)[0] * unit

@@ -1,4 +1,4 @@
-"""Frames of one instrument in a row: a spacing that all of them share."""
+"""Successive frames of one instrument: rings of one spacing."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -89,7 +89,7 @@ def analyse_series(
     """Rings of all frames of one instrument, at one spacing of the orders.
 
     Lines at equal distances look like one line of a shorter spacing, so that a frame in which a
-    moving line crosses the middle between two orders cannot tell. The others can: the spacing of
+    moving line crosses the middle between two orders does not determine it. The spacing of
     most of the frames, or the given one, is that of all.
 
     Parameters
@@ -122,8 +122,8 @@ def analyse_series(
         if again is not None:
             rings[number], refused[number] = replace(again, doubt=""), ""
         elif one is not None:
-            said = f"{one.spacing / common:.3g} times the spacing of the other frames"
-            rings[number] = replace(one, doubt=said)
+            doubt = f"{one.spacing / common:.3g} times the spacing of the other frames"
+            rings[number] = replace(one, doubt=doubt)
     return RingSeries(tuple(rings), tuple(refused))
 
 

@@ -39,6 +39,7 @@ def step_limits(
 
     def allowed(parameters: torch.Tensor, step: torch.Tensor) -> bool:
         reached = parameters + step
+        # beyond these radii the data do not determine a core
         radii = reached[[1, 5]]
         near = step[[2, 3, 6, 7]].abs().max() <= 0.15 * min(sides)
         return bool(

@@ -148,6 +148,7 @@ def fit_near(
             continue
         known = None
         thin = make(blur, stride)
+        # differences of filtered images are less accurate, but enough for a start
         thin = replace(thin, whole=thin.spline)
         for _ in range(_STEPS):
             misfit = thin(theta)
@@ -157,12 +158,14 @@ def fit_near(
                 return None
             far = _displaced(found.parameters - theta, misfit, make)
             theta = found.parameters
+            # blurred images need not be nearer than their own resolution
             if far < _CLOSE * max(1.0, 2 * blur):
                 break
     white, close = make(*_WHITE), False
     for _ in range(_ROUNDS):
         views = [known[0], white.view(1, known[1])] if known else white.views(theta)
         misfit, known = white.misfit(theta, views), None
+        # before an estimate of change the weights are of all residuals, as of white noise
         images = white.at_least(_linear_power(misfit, variance))
         plain = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
         if plain is None:
@@ -172,6 +175,7 @@ def fit_near(
             theta = plain.parameters
             continue
         close = True
+        # near the cores paths are not linear in the step: the only second-order term needed
         beyond = white.curved(misfit, views, theta, plain.parameters)
         misfit = misfit._replace(residual=misfit.residual + beyond)
         corrected = plain.misfit._replace(residual=plain.misfit.residual + beyond)
@@ -220,12 +224,12 @@ def _linear_power(misfit: Misfit, variance: float) -> float:
 
 
 def agrees(start: VortexPairFit, found: VortexPairFit) -> bool:
-    """Whether a fit is where the start, within its errors, said."""
+    """Whether a fit agrees with the start within both errors."""
     off = found.parameters - start.parameters
     spread = found.covariance + start.covariance
     scale = np.sqrt(np.diagonal(spread))
-    reduced = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
-    square = float((off / scale) @ reduced @ (off / scale))
+    inverse = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
+    square = float((off / scale) @ inverse @ (off / scale))
     return square < _REJECTED**2 * len(off)
 
 

@@ -61,7 +61,7 @@ def builder_of(stack: Sequence[torch.Tensor], taken: Acquisition) -> Builder | s
     images = images / contrast
     noise = taken.noise
     if isinstance(noise, torch.Tensor) and not bool((noise > 0).any()):
-        noise = None  # no pixel's noise is known: a fit that took it for 0 would follow it for long
+        noise = None  # no pixel's noise is known: a fit with noise 0 would hardly converge
     if isinstance(noise, torch.Tensor):
         noise = noise.double() * _understated(noise / contrast, images)
     level = _typical(noise, images[0].square())

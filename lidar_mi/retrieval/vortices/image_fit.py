@@ -107,7 +107,7 @@ def fit_vortices(
     start : VortexPairFit, optional
         The pair expected at mid-time, with its covariance. It is where the fit starts, and is not
         weighted in. A fit that is not accepted, or further from it than both errors allow, is
-        replaced by that of a search: `from_start` says which.
+        replaced by that of a search; see `from_start`.
     telescope : (float, float, float), optional
         x, y and z from the images' plane, m, of the telescope whose beams reach its pixels
         obliquely, x < 0. The fit is that of a pair along x; with a telescope its

@@ -150,6 +150,7 @@ class Images:
         torch.mul(-views[0].value, self.linear, out=jacobian[10:13])
         torch.neg(self.linear, out=jacobian[13:16])
         residual = valid * (views[1].whole - gain * views[0].whole - offset)
+        # filtered after the difference: shear and a filter of the images do not commute
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
         slope = jacobian[8:10] / self.dt
@@ -234,7 +235,7 @@ class Images:
         return gain, offset
 
     def _bad(self, place: torch.Tensor) -> torch.Tensor:
-        """Whether the pixels nearest to places (row, column) are to be left out."""
+        """Whether the pixels nearest to places (row, column) are masked."""
         at = [p.round().long().clamp(0, n - 1) for p, n in zip(place, self.bad.shape, strict=True)]
         return self.bad[at[0], at[1]]
 
@@ -298,15 +299,15 @@ class Builder:
     Attributes
     ----------
     pair : torch.Tensor, shape (2, z, y)
-        Of one mean and contrast.
+        Normalised to one mean and contrast.
     bad : torch.Tensor of bool, shape (z, y)
-        Pixels to leave out.
+        Masked pixels.
     z, y : ndarray
         m.
     dt : float
         s.
     level : float, optional
-        Standard deviation of the noise, in the unit of `pair`; left out, from the spectrum.
+        Standard deviation of the noise, in the unit of `pair`; None: from the spectrum.
     map : torch.Tensor, optional
         Of each pixel, in any unit.
     profile : {"lamb_oseen", "burnham_hallock"}
@@ -314,9 +315,9 @@ class Builder:
     telescope : (float, float, float), optional
         m, as `image_fit.fit_vortices` takes it.
     times : PixelTimes, optional
-        Left out: -dt / 2 and dt / 2.
+        None: -dt / 2 and dt / 2.
     of_first : Splines, optional
-        Of the first image, made before the second one was there: its filter is that of both.
+        Of the first image, computed without the second one: its filter is that of both.
     """
 
     pair: torch.Tensor
@@ -430,13 +431,17 @@ class Builder:
         """
         valid, known = misfit.valid, white.variance
         shape = white.variance / white.variance[valid].mean()
+        # the misfit is that behind a filter: divided by what that passes of white noise
         passed = max(images.passed, 1e-6)
         power = (misfit.residual.square() / shape)[valid].mean()
-        moved = flow_variance * float((misfit.slope.square().sum(0) / shape)[valid].mean())
+        by_flow = flow_variance * float((misfit.slope.square().sum(0) / shape)[valid].mean())
         level, least = float(power) / passed, float((known / shape)[valid].mean())
-        fraction = min(1.0, moved / max(float(power), passed * least))
+        # whitening would take the effect of the flow's departure for stationary change
+        fraction = min(1.0, by_flow / max(float(power), passed * least))
+        # gain of both filters together, through which the residuals have passed
         gain = white.spline.gain * (1.0 if images.whitening is None else images.whitening.gain)
         before = images.spline._replace(gain=gain)
+        # places of more noise count less, so that the spectrum is that of one field
         rest = valid * misfit.residual / shape.sqrt() / 2
         # the other image's rest is the same with the other sign
         density = mismatch(before, rest[None], number=2)

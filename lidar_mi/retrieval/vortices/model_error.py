@@ -184,6 +184,7 @@ def model_error(
     if not float(scale) > 0 or not len(used):
         return ModelError()
     distance = lags.distance()[: lags.rows]
+    # in units of the stiffness at lag 0, so that the coefficients are the variances
     found, square = observed.take(used) / scale, distance.take(used).square()
     size = float(found.abs().max())
     if not size > 0:
@@ -259,7 +260,7 @@ class Response:
     inverse : torch.Tensor, shape (p, p)
         H^-1.
     even : torch.Tensor, shape (z, y)
-        Factor by which the forces are multiplied that are correlated; one if left out.
+        Factor by which the forces are multiplied that are correlated; 1 by default.
     """
 
     force: torch.Tensor
@@ -294,6 +295,7 @@ class Response:
             peak = (length / side) ** 2 / wide
             covariance = peak * torch.exp(-coarse.distance().square() / (2 * wide))
             spectrum = torch.fft.rfft2(covariance).real.clamp(min=0)
+            # K of the docstring: the response to a departure correlated over this length
             back = torch.fft.ifft(follow * spectrum, dim=-2)[..., :rows, :]
             expected = torch.fft.irfft(back, n=coarse.sizes[1])[..., :columns]
             spread = torch.einsum("iazy,jazy->ij", expected, force) @ inverse
@@ -301,6 +303,7 @@ class Response:
             moved = torch.stack(
                 [stiff[0] * first + stiff[1] * second, stiff[1] * first + stiff[2] * second], 1
             )
+            # half of the last term: both orders of x and x + h are added below
             cross = coarse.transform(moved) - torch.tensordot(spread.to(waves), waves, 1) / 2
             power = 2 * (cross.conj() * waves).real.sum((0, 1))
             found = coarse.by_lags(power) / side**2

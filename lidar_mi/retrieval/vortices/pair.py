@@ -53,7 +53,7 @@ class VortexPairFit(Tabular):
     from_start : bool
         Whether it was found from an expected pair, without a search.
     turned : ndarray, shape (10,), optional
-        Change of the parameters per rad/s by which the observations turn about y = z = 0 between
+        Change of the parameters per rad/s by which the observations rotate about y = z = 0 between
         the scans, from +y towards +z: by an unknown roll.
     inclined : ndarray, shape (10, 2), optional
         Change of the parameters per slope dy/dx and dz/dx of the pair's axis, if all of the air's
@@ -151,13 +151,13 @@ class VortexPairFit(Tabular):
         rotation_stderr: float = 0.0,
         centre: tuple[float, float] = (0.0, 0.0),
     ) -> "VortexPairFit":
-        """With errors of the wind that all of its observations share, by unknown pointing.
+        """With errors of the wind common to all of its observations, by an unknown pointing error.
 
         The mean wind is fitted, and so takes all of an error of v and w (m/s); what derives from it
         (drift, the wind anywhere, places after some time) has it too. Circulations, radii and
-        separation are as certain as without. Places are as seen by the mean pointing of both scans.
+        separation are as certain as without. Places refer to the mean pointing of both scans.
         A rotation (rad/s, about ``centre``: y, z in m) changes all parameters: a vortex pair cannot
-        turn everywhere, and the fit takes part of it for circulation.
+        rotate everywhere, and the fit attributes part of it to circulation.
 
         Raises
         ------

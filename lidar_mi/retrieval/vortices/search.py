@@ -51,7 +51,7 @@ class Observations(NamedTuple):
 def starting_points(observed: Observations, count: int, profile: Profile) -> torch.Tensor:
     """Parameters (up to `count`, 10) of pairs with the least misfit, best first.
 
-    Vortices rotate in opposite directions and are at least three core radii apart. Of each
+    Vortices rotate in opposite directions; their separation is at least three core radii. Of each
     neighbourhood only the best pair is taken.
     """
     low, high, step = _region(observed)
@@ -62,6 +62,7 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     ]
     place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
     separation = torch.cdist(place, place)
+    # weighted once: all that follows is ordinary least squares
     root = observed.weight.sqrt()
     uniform = torch.linalg.qr(observed.everywhere * root[:, None])[0]
     value = observed.value * root
@@ -78,6 +79,7 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
             across += columns.T @ torch.cat([uniform[rows], value[rows, None]], 1)
         # the vortices' winds without the part that a mean wind and brightness explain
         normal -= across[:, :-1] @ across[:, :-1].T
+        # two vortices are two columns: their gain is in closed form for all pairs at once
         gain, first, second = _explained(normal, across[:, -1])
         gain = torch.where((first > 0) & (second < 0) & (separation > 3 * radius), gain, 0.0)
         for p, q in _peaks(gain, separation, count, 2.5 * step):
@@ -100,9 +102,9 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
 def condensed(observed: Observations) -> Observations:
     """Two observations in place of all of a block, whose sides are the distance of the places.
 
-    Of a wind u that is uniform over a block, observations a . u = d with weights w tell as much as
-    two of L^T u = L^-1 sum w a d, where L L^T = sum w a a^T (sufficient statistics of weighted
-    least squares). Brightness is fitted and subtracted before.
+    Of a wind u that is uniform over a block, observations a . u = d with weights w have the
+    information of two of L^T u = L^-1 sum w a d, where L L^T = sum w a a^T (sufficient statistics
+    of weighted least squares). Brightness is fitted and subtracted before.
     """
     low, high, step = _region(observed)
     root = observed.weight.sqrt()
@@ -123,16 +125,16 @@ def condensed(observed: Observations) -> Observations:
     total, first, mixed = sums[:3]
     # a little stronger along y and z, as the observations of a block may all be along one line
     little = 1e-6 * total
-    left = (first + little).sqrt()
-    lower = mixed / left
-    right = (total - first + little - lower**2).clamp(min=0).sqrt().clamp(min=little.sqrt())
-    one = sums[3] / left
-    two = (sums[4] - lower * one) / right
+    upper = (first + little).sqrt()
+    mixed_root = mixed / upper
+    lower = (total - first + little - mixed_root**2).clamp(min=0).sqrt().clamp(min=little.sqrt())
+    one = sums[3] / upper
+    two = (sums[4] - mixed_root * one) / lower
     y, z = (torch.cat([part, part]) for part in sums[5:] / total)
     return Observations(
         y,
         z,
-        torch.stack([torch.cat([left, torch.zeros_like(left)]), torch.cat([lower, right])]),
+        torch.stack([torch.cat([upper, torch.zeros_like(upper)]), torch.cat([mixed_root, lower])]),
         torch.cat([one, two]),
         torch.ones_like(y),
     )

@@ -136,6 +136,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     valid = torch.as_tensor(usable)
     model = _Vectors(vector_y, vector_z, torch.as_tensor(root), vector, valid, profile)
     limits = step_limits(y, z, profile)
+    # a search needs only its order of magnitude: a quarter of the mean square wind
     flow_variance = float(np.square(value[:, usable]).mean()) / 4
     best = None
     for start in starting_points(_components(model, flow_variance), STARTS, profile):
@@ -144,11 +145,13 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
             best = found
     if best is None:
         return no_fit(profile, "no vortex signature")
+    # without standard errors their size follows from the residuals, robustly
     if not known:
         off = best.misfit.residual[:, valid]
         spread = float(1.4826 * (off - off.median()).abs().median())
         if spread > 0:
             model = replace(model, root=model.root / spread)
+    # weights and model error depend on each other
     for _ in range(3):
         error = model_error_of(best, 1.0)
         best = fit(model, best.parameters, limits, error.variance, 12, TOLERANCE)
@@ -178,6 +181,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
 
 def _components(vectors: _Vectors, flow_variance: float) -> Observations:
     """Vectors as single components, thinned to a few hundred places."""
+    # the search is quadratic in the places and needs no more than a thousand vectors
     step = max(1, round((float(vectors.valid.sum()) / 1000) ** 0.5))
     part = (Ellipsis, slice(step // 2, None, step), slice(step // 2, None, step))
     valid = vectors.valid[part]
