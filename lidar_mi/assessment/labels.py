@@ -1,9 +1,11 @@
 """What figures, tables and reports call methods, sources and quantities."""
 
+from collections.abc import Mapping
+
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.retrieval.method_names import ImageMethod, VolumeMethod
 
-METHOD_NAMES = {
+METHOD_NAMES: Mapping[str, str] = {
     ImageMethod.CC: "cross-correlation",
     ImageMethod.WS: "weight shift",
     ImageMethod.MULTIPASS: "multi-pass correlation",
@@ -13,7 +15,7 @@ METHOD_NAMES = {
 }
 """Methods that winds are retrieved by, as figures and tables call them."""
 
-SOURCE_NAMES = {
+SOURCE_NAMES: Mapping[str, str] = {
     Source.BACKSCATTER: "backscatter",
     Source.NOISY: "backscatter with detector noise",
     Source.EXTINCTION: "extinction",

@@ -16,7 +16,7 @@ from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProces
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
-from lidar_mi.retrieval.vortices.image_fit import begun_fit, fit_vortices
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices, started_fit
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
@@ -141,7 +141,9 @@ class Estimator:
         )
         if expected:
             with _timed(seconds, "vortices_before"):
-                fit = begun_fit(image1, dt, noise, start=expected, times=times, telescope=telescope)
+                fit = started_fit(
+                    image1, dt, noise, start=expected, times=times, telescope=telescope
+                )
         if prepared:
             seconds["wind_before"] = prepared.result()
         with _timed(seconds, "total"):

@@ -233,12 +233,12 @@ def _receiver(lidar, detector, harmonics, delay, modes, pixels=1.0, ratio=False)
     electrons = sun * detector.quantum_efficiency * harmonics[:, 0].real
     dark = detector.dark_current * detector.integration_time * detector.binning**2
     channels = ChannelModel(
-        molecules=harmonics * np.array(lines)[:, None],
-        aerosol=harmonics * laser,
+        molecules=torch.from_numpy(harmonics * np.array(lines)[:, None]),
+        aerosol=torch.from_numpy(harmonics * laser),
         period=lidar.wavelength / (2 * delay),
         temperatures=temperatures,
-        background=electrons + pixels * dark,
-        pixels=pixels,
+        background=torch.from_numpy(electrons + pixels * dark),
+        pixels=torch.as_tensor(pixels),
     )
     if ratio:
         channels = replace(channels, limits=_monotone(channels, lidar.aerosol_fraction))

@@ -3,17 +3,28 @@
 All of them show the slab from the pilot's view: port (+y) on the left, up (+z) at the top.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 
+from lidar_mi.assessment.described import ObservedAir, Progress
 from lidar_mi.assessment.figures.accuracy import error_and_bound, error_by_texture, truth_vectors
-from lidar_mi.assessment.figures.plates import Drawn, frame, image_panel, save_all, sheet
+from lidar_mi.assessment.figures.plates import (
+    Drawn,
+    Plate,
+    frame,
+    image_panel,
+    save_all,
+    sheet,
+    speed_of,
+)
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import deviations
@@ -37,8 +48,8 @@ class Scale:
     z: np.ndarray
 
 
-def _scale(truth) -> Scale:
-    speed = np.hypot(truth.wind["v"], truth.wind["w"])
+def _scale(truth: ObservedAir) -> Scale:
+    speed = speed_of(truth.wind["v"], truth.wind["w"])
     # the few nodes of a core must not determine the scale of all others
     limit = float(speed.quantile(0.999)) or 1.0
     return Scale(limit, truth.wind["y"].values, truth.wind["z"].values)
@@ -46,12 +57,12 @@ def _scale(truth) -> Scale:
 
 def draw_all(
     folder: Path,
-    truth,
-    scans,
+    truth: ObservedAir,
+    scans: Sequence[xr.Dataset],
     found: xr.Dataset,
-    cores: list[Core],
+    cores: Sequence[Core],
     sweep: xr.Dataset,
-    log: Callable,
+    log: Progress,
 ) -> list[Drawn]:
     """Draw every figure of a backscatter run as PNG into ``folder``.
 
@@ -69,7 +80,7 @@ def draw_all(
     # with measured images alone there are no winds from extinction to compare with
     compared = Source.EXTINCTION in sources
     ideal, lidar = (Source.EXTINCTION, Source.BACKSCATTER) if compared else (sources[-1],) * 2
-    plates: tuple = (
+    plates: tuple[tuple[str, str, Plate], ...] = (
         ("fig00_overview", "Image and retrieved wind", overview(truth, scans, found, cores)),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         (
@@ -135,7 +146,7 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
-def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale) -> None:
+def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, scale: Scale) -> None:
     """Vectors at their positions, about 45 across; flagged ones grey, valid ones by speed."""
     every = max(1, round(wind.sizes["y"] / 45))
     step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
@@ -143,7 +154,7 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
     y, z = (np.broadcast_to(thin[f"{a}_vector"], thin["v"].shape).ravel() for a in "yz")
     v, w, flag = (thin[name].values.ravel() for name in ("v", "w", "flag"))
     known = np.isfinite(v) & np.isfinite(w)
-    style = {
+    style: dict[str, Any] = {
         "angles": "xy",
         "scale_units": "xy",
         "scale": scale.limit / (1.8 * step),
@@ -151,7 +162,7 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
     }
     flagged, valid = known & (flag != 0), known & (flag == 0)
     if not valid.any():
-        # what is left of no retrieval are numbers by chance
+        # without a valid vector the others are random numbers
         axes.text(0.5, 0.5, "no valid vector", transform=axes.transAxes, ha="center", va="center")
     elif flagged.any():
         axes.quiver(y[flagged], z[flagged], v[flagged], w[flagged], color="0.75", **style)
@@ -171,7 +182,9 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
     axes.figure.colorbar(arrows, ax=axes, label="speed / m s$^{-1}$", pad=0.02, extend="max")
 
 
-def overview(truth, scans, found: xr.Dataset, cores: list[Core]) -> tuple[Figure, str]:
+def overview(
+    truth: ObservedAir, scans: Sequence[xr.Dataset], found: xr.Dataset, cores: Sequence[Core]
+) -> tuple[Figure, str]:
     """First image of the lidar beside the wind retrieved from two, and a caption; as `draw_all`."""
     scale = _scale(truth)
     figure, axes = sheet(1, 2)
@@ -198,12 +211,12 @@ def overview(truth, scans, found: xr.Dataset, cores: list[Core]) -> tuple[Figure
     )
 
 
-def _crosses(cores: list[Core]) -> str:
+def _crosses(cores: Sequence[Core]) -> str:
     """What of the caption speaks of the vortices, where there are any."""
     return ", red crosses mark the true cores" if cores else ""
 
 
-def _extinction(truth):
+def _extinction(truth: ObservedAir) -> Plate:
     figure, axes = sheet(1, 2)
     fields = [truth.image(k) * 1e3 for k in (0, 1)]
     norm = _bright(fields)
@@ -223,11 +236,13 @@ def _extinction(truth):
     )
 
 
-def _wind_and_truth(truth, found, source, cores, scale):
+def _wind_and_truth(
+    truth: ObservedAir, found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale
+) -> Plate:
     figure, axes = sheet(2, max(2, found.sizes["algorithm"]))
     first = found.sel(source=source).isel(algorithm=0)
     _arrows(axes[0, 0], truth_vectors(first), cores, "true wind", scale)
-    speed = np.hypot(truth.wind["v"], truth.wind["w"])
+    speed = speed_of(truth.wind["v"], truth.wind["w"])
     image_panel(
         axes[0, 1],
         speed,
@@ -246,7 +261,9 @@ def _wind_and_truth(truth, found, source, cores, scale):
     )
 
 
-def _retrieved_into(axes, found, source, cores, scale):
+def _retrieved_into(
+    axes: np.ndarray, found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale
+) -> None:
     methods = [str(method) for method in found["algorithm"].values]
     for axis in axes[len(methods) :]:
         axis.set_axis_off()
@@ -255,7 +272,7 @@ def _retrieved_into(axes, found, source, cores, scale):
         _arrows(axis, wind, cores, f"{METHOD_NAMES[method]}, {source}", scale)
 
 
-def _retrieved(found, source, cores, scale):
+def _retrieved(found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale) -> Plate:
     figure, axes = sheet(1, max(2, found.sizes["algorithm"]))
     _retrieved_into(axes[0], found, source, cores, scale)
     return figure, (
@@ -264,7 +281,7 @@ def _retrieved(found, source, cores, scale):
     )
 
 
-def _deviation_maps(found, source, reference):
+def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Plate:
     methods = [str(m) for m in found["algorithm"].values]
     figure, axes = sheet(len(methods), 2)
     for row, method in zip(axes, methods, strict=True):
@@ -288,14 +305,14 @@ def _deviation_maps(found, source, reference):
             norm=TwoSlopeNorm(0, -limit, limit),
             cmap="RdBu_r",
         )
-        turn = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
+        largest = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
         image_panel(
             row[1],
             error["direction"],
             f"{METHOD_NAMES[method]}: direction",
             "direction / rad",
             extend="both",
-            norm=TwoSlopeNorm(0, -turn, turn),
+            norm=TwoSlopeNorm(0, -largest, largest),
             cmap="PuOr_r",
         )
     against = "the true wind" if reference is None else f"winds from {reference}"
@@ -305,7 +322,7 @@ def _deviation_maps(found, source, reference):
     )
 
 
-def _bright(fields) -> Normalize:
+def _bright(fields: Sequence[xr.DataArray]) -> Normalize:
     """From 0, or from the darkest pixels where none is near 0, to the brightest.
 
     Single bright pixels must not determine the scale.
@@ -321,7 +338,7 @@ def _upper(field: xr.DataArray, fraction: float) -> float:
     return float(np.quantile(values, fraction)) if values.size else 0.0
 
 
-def _backscatter(scans):
+def _backscatter(scans: Sequence[xr.Dataset]) -> Plate:
     figure, axes = sheet(1, 2)
     norm = _bright([scan["Y"] * 1e6 for scan in scans])
     for k, scan in enumerate(scans):
@@ -340,7 +357,7 @@ def _backscatter(scans):
     )
 
 
-def _product(scan, name, label, caption):
+def _product(scan: xr.Dataset, name: str, label: str, caption: str) -> Plate:
     """A product of a scan's first gate, and its standard error."""
     figure, axes = sheet(1, 2)
     first = scan.isel(gate=0)
@@ -365,13 +382,13 @@ def _span(field: xr.DataArray) -> Normalize:
     return Normalize((low + high) / 2 - half, (low + high) / 2 + half)
 
 
-def _image_differences(truth, scans):
+def _image_differences(truth: ObservedAir, scans: Sequence[xr.Dataset]) -> Plate:
     figure, axes = sheet(1, 2)
     differences = []
     for k, scan in enumerate(scans):
         field = truth.image(k).interp(y=scan["y"], z=scan["z"])
         differences.append(scan["Y"] / scan["Y"].mean() - field / field.mean())
-    limit = max(float(np.abs(d).quantile(0.999)) for d in differences)
+    limit = max(float(abs(d).quantile(0.999)) for d in differences)
     for k, difference in enumerate(differences):
         image_panel(
             axes[0, k],

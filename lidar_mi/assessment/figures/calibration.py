@@ -7,7 +7,7 @@ from lidar_mi.retrieval.rings.calibration import Calibration
 
 
 def draw_calibration(found: Calibration) -> Figure:
-    """Mean misfit over the camera, pixels left out, and the drift from frame to frame."""
+    """Mean misfit over the camera, masked pixels, and the drift from frame to frame."""
     figure = Figure(figsize=(12, 5), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.3, 1))
     height, width = found.shape
@@ -16,7 +16,7 @@ def draw_calibration(found: Calibration) -> Figure:
     shown = left.imshow(found.misfit, cmap="RdBu_r", vmin=-4, vmax=4, extent=extent)
     figure.colorbar(shown, ax=left, label="mean misfit / standard deviation")
     y, x = np.nonzero(found.response == 0)
-    left.plot(x, y, ".", color="black", ms=2, label=f"{len(x)} pixels left out")
+    left.plot(x, y, ".", color="black", ms=2, label=f"{len(x)} pixels masked")
     left.plot(*found.centre, "+", color="black", ms=12)
     left.set(
         xlim=(-0.5, width - 0.5),

@@ -1,12 +1,13 @@
 """Figures of a campaign: maps, lines with bands over members, knobs of a sample, compromises."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis as MatplotlibAxis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize, to_hex
 from matplotlib.lines import Line2D
@@ -105,7 +106,7 @@ def draw_requirements(
         lambda v: f"smallest margin {100 * v:+.0f} %",
     )
     across, up = (axis.places(worst[axis.name].values) for axis in (x, y))
-    finer = tuple(_finer(at, axis.logarithmic) for at, axis in ((across, x), (up, y)))
+    finer = _finer(across, x.logarithmic), _finer(up, y.logarithmic)
     handles = []
     for (name, one), colour in zip(margins.items(), COLOURS * 3, strict=False):
         mean = means[name].values
@@ -169,8 +170,8 @@ def draw_lines(
     for (name, (values, points)), colour in zip(groups.items(), COLOURS * 3, strict=False):
         mean = over_members(values).mean
         place = x.places(mean[x.name].values)
-        style = {"color": colour, "label": name or None}
-        axes.plot(place, mean.values, "--" if x.labels else "-", lw=1.3, **style)
+        line = "--" if x.labels else "-"
+        axes.plot(place, mean.values, line, lw=1.3, color=colour, label=name or None)
         if MEMBER in values.dims and x.name != MEMBER:
             low, high = values.quantile([0.16, 0.84], MEMBER).transpose("quantile", x.name).values
             axes.fill_between(place, low, high, color=colour, alpha=0.18, lw=0)
@@ -185,7 +186,7 @@ def draw_lines(
         for k in np.flatnonzero(points.failed.values):
             p = x.places(points.failed[x.name].values)[k]
             axes.plot(p, low, "x", color=FAILED, ms=7, mew=2, clip_on=False)
-            marks.append(_dot(p, low, "failed", FAILED, points, {x.name: k}))
+            marks.append(_dot(p, low, "failed", FAILED, points, {x.name: int(k)}))
     _scale(axes, x, None)
     axes.set_ylabel(label)
     _by_factors(axes, known)
@@ -303,7 +304,12 @@ def _finer(places: np.ndarray, logarithmic: bool) -> np.ndarray:
     return np.exp(inner) if logarithmic else inner
 
 
-def _between(values: np.ndarray, places, finer, logarithmic) -> np.ndarray:
+def _between(
+    values: np.ndarray,
+    places: tuple[np.ndarray, np.ndarray],
+    finer: tuple[np.ndarray, np.ndarray],
+    logarithmic: tuple[bool, bool],
+) -> np.ndarray:
     """Values (y, x) between the points, linear in the scale of each axis."""
     (across, up), (fine_x, fine_y) = (
         [np.log(one) if log else one for one, log in zip(axes, logarithmic, strict=True)]
@@ -320,7 +326,13 @@ def _crosses_zero(values: np.ndarray) -> bool:
 
 
 def _cells(
-    axes, values: xr.DataArray, x: Axis, y: Axis, points: Points, colour, text
+    axes: Axes,
+    values: xr.DataArray,
+    x: Axis,
+    y: Axis,
+    points: Points,
+    colour: Callable[[float], str],
+    text: Callable[[float], str],
 ) -> list[Mark]:
     """Cells of a map around its points, (y, x)."""
     across, up = (axis.places(values[axis.name].values) for axis in (x, y))
@@ -335,8 +347,8 @@ def _cells(
         marks.append(
             Mark(
                 int(points.number.isel(at)),
-                (edges[0][j], edges[0][j + 1]),
-                (edges[1][i], edges[1][i + 1]),
+                (float(edges[0][j]), float(edges[0][j + 1])),
+                (float(edges[1][i]), float(edges[1][i + 1])),
                 words,
                 shown,
                 str(points.link.isel(at).values),
@@ -350,8 +362,11 @@ def _cells(
     return marks
 
 
-def _dot(x: float, y: float, text: str, colour: str, points: Points, at) -> Mark:
-    at = at if isinstance(at, dict) else dict.fromkeys(points.number.dims, at)
+def _dot(
+    x: float, y: float, text: str, colour: str, points: Points, at: int | dict[str, int]
+) -> Mark:
+    if isinstance(at, int):
+        at = {str(dim): at for dim in points.number.dims}
     number, link = int(points.number.isel(at)), str(points.link.isel(at).values)
     return Mark(number, (x, x), (y, y), text, colour, link)
 
@@ -396,7 +411,7 @@ def _by_factors(axes: Axes, values: Sequence[np.ndarray]) -> None:
         _plain_decades(axes.yaxis)
 
 
-def _plain_decades(side) -> None:
+def _plain_decades(side: MatplotlibAxis) -> None:
     low, high = side.get_view_interval()
     few = high > 50 * low > 0
     side.set_major_locator(LogLocator(subs=(1.0,) if few else (1.0, 2.0, 5.0)))

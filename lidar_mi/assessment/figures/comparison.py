@@ -1,12 +1,13 @@
 """The figure of several variants of one experiment side by side."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.plates import Drawn, save_all
 from lidar_mi.assessment.labels import BACKSCATTER
 
@@ -14,7 +15,9 @@ _SPEED = "m s$^{-1}$"
 
 
 def draw_comparison(
-    folder: Path, rows: Mapping[str, tuple[xr.DataArray, xr.Dataset, Sequence]], log: Callable
+    folder: Path,
+    rows: Mapping[str, tuple[xr.DataArray, xr.Dataset, Sequence[tuple[float, float]]]],
+    log: Progress,
 ) -> list[Drawn]:
     """One row per variant: its first image, the w retrieved from the pair, and its error.
 

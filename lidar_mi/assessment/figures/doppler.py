@@ -1,13 +1,14 @@
 """The figures of a Doppler run: the paper's figures 3 and 4, errors by images averaged, bias."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.described import DopplerDescription, Progress, RingImages
+from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
 from lidar_mi.assessment.metrics.names import bound_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.instrument.fringe_camera import ring_radii
@@ -31,12 +32,12 @@ _MARKERS = dict(zip(READERS, "oXs^Dv", strict=True))
 
 def draw_all(
     folder: Path,
-    doppler,
-    exposure,
+    doppler: DopplerDescription,
+    exposure: RingImages,
     samples: xr.Dataset | None,
     found: xr.Dataset,
     metrics: dict[str, float],
-    log: Callable,
+    log: Progress,
 ) -> list[Drawn]:
     """Draw every figure of a Doppler run as PNG into ``folder``.
 
@@ -71,7 +72,7 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
-def _rings(doppler, exposure, samples):
+def _rings(doppler: DopplerDescription, exposure: RingImages, samples: xr.Dataset | None) -> Plate:
     """The paper's figure 3, and the profiles of both."""
     panels = 3 if samples is not None else 2
     figure = Figure(figsize=(5.6 * panels, 4.6), layout="constrained")
@@ -115,7 +116,7 @@ def _rings(doppler, exposure, samples):
     )
 
 
-def _cuts(doppler, exposure):
+def _cuts(doppler: DopplerDescription, exposure: RingImages) -> Plate:
     """The paper's figure 4."""
     figure = Figure(figsize=(12, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -151,7 +152,7 @@ def _cuts(doppler, exposure):
     )
 
 
-def _errors(doppler, metrics):
+def _errors(doppler: DopplerDescription, metrics: Mapping[str, float]) -> Plate:
     settings = doppler.retrieval
     figure = Figure(figsize=(6.2 * len(settings.centre), 8.2), layout="constrained")
     axes = figure.subplots(2, len(settings.centre), sharex=True, sharey="row", squeeze=False)
@@ -205,7 +206,7 @@ def _errors(doppler, metrics):
     )
 
 
-def _bias(doppler, exposure, found):
+def _bias(doppler: DopplerDescription, exposure: RingImages, found: xr.Dataset) -> Plate:
     figure = Figure(figsize=(16, 4.8), layout="constrained")
     *rings, last = figure.subplots(1, 3)
     camera = doppler.camera
@@ -246,7 +247,7 @@ def _bias(doppler, exposure, found):
     )
 
 
-def _speeds(found):
+def _speeds(found: xr.Dataset) -> Plate:
     figure = Figure(figsize=(13, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     case = found.isel(averaged=0, centre=0)

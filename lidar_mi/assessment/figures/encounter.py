@@ -1,14 +1,15 @@
 """Figures of a flight into a wake: the approach, the track, the moments, the rolling."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.described import Progress
+from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
@@ -38,9 +39,9 @@ def draw_all(
     folder: Path,
     series: xr.Dataset,
     track: xr.Dataset | None,
-    seen: xr.Dataset | None,
+    slabs: xr.Dataset | None,
     span: float,
-    log: Callable,
+    log: Progress,
 ) -> list[Drawn]:
     """Draw all figures of a flight.
 
@@ -49,7 +50,7 @@ def draw_all(
     folder : Path
     series : xr.Dataset, dims (flight, time)
     track : xr.Dataset or None, dims (source, slab)
-    seen : xr.Dataset or None
+    slabs : xr.Dataset or None
         Images and vectors of the slabs.
     span : float
         Of the aircraft, m.
@@ -57,20 +58,20 @@ def draw_all(
     """
     plates = [("fig30_roll", "Roll angle and roll rate", _roll(series))]
     if track is not None and track.sizes["slab"]:
-        if seen is not None:
-            overview = _overview(series, track, seen, span)
-            plates.insert(
-                0, ("fig29_encounter", "A slab ahead, and what the pilot feels", overview)
-            )
+        if slabs is not None:
+            overview = _overview(series, track, slabs, span)
+            plates.insert(0, ("fig29_encounter", "A slab ahead, and the roll angle", overview))
         plates.append(
             (
                 "fig31_approach",
                 "The approach from above and from the side",
-                _approach(series, track, seen),
+                _approach(series, track, slabs),
             )
         )
-        if seen is not None:
-            plates.append(("fig32_cockpit", "A slab from the cockpit", _cockpit(track, seen, span)))
+        if slabs is not None:
+            plates.append(
+                ("fig32_cockpit", "A slab from the cockpit", _cockpit(track, slabs, span))
+            )
         if np.isfinite(track["port_y"].values).any():
             plates.append(("fig33_track", "The vortices, estimated and tracked", _track(track)))
     if "feedforward" in series["flight"]:
@@ -84,7 +85,7 @@ def flight_style(mode: str, series: xr.Dataset) -> tuple[str, str, str]:
     return (flight_name(mode, series.attrs.get(CONTROLLER, "")), *FLIGHTS[mode][1:])
 
 
-def _flown(series: xr.Dataset):
+def _flown(series: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     """Flights in the order in which they are drawn, the one with the lidar on top."""
     there = [str(mode) for mode in series["flight"].values]
     return [
@@ -94,14 +95,14 @@ def _flown(series: xr.Dataset):
     ]
 
 
-def _lines(axes, series, name, factor=1.0) -> None:
+def _lines(axes: Axes, series: xr.Dataset, name: str, factor: float = 1.0) -> None:
     for mode, one in _flown(series):
         label, colour, style = flight_style(mode, series)
         axes.plot(one["time"], factor * one[name], color=colour, ls=style, lw=1.8, label=label)
     axes.grid(alpha=0.3)
 
 
-def _roll(series):
+def _roll(series: xr.Dataset) -> Plate:
     figure = Figure(figsize=(10.5, 6.4), layout="compressed")
     angle, rate = figure.subplots(2, 1, sharex=True)
     _lines(angle, series, "roll", np.degrees(1))
@@ -111,13 +112,10 @@ def _roll(series):
     angle.set_ylabel("roll angle / degrees")
     rate.set(ylabel="roll rate / degrees s$^{-1}$", xlabel="time of flight / s")
     angle.legend(fontsize=9, loc="best")
-    return (
-        figure,
-        "Positive: port wing up. Shaded: bank angles that nobody calls out on an approach.",
-    )
+    return (figure, "Positive: port wing up. Shaded: bank angles of a stable approach.")
 
 
-def _approach(series, track, seen):
+def _approach(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset | None) -> Plate:
     figure = Figure(figsize=(11.5, 7.2), layout="compressed")
     above, side = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     one = series.sel(flight="feedforward")
@@ -146,8 +144,8 @@ def _approach(series, track, seen):
         axes.plot(one["x"], one[axis], color="tab:blue", lw=2, label="flight path")
         axes.grid(alpha=0.3)
         axes.margins(x=0.01)
-    if seen is not None and "image_y" in seen:
-        low, high = float(seen["image_y"].min()), float(seen["image_y"].max())
+    if slabs is not None and "image_y" in slabs:
+        low, high = float(slabs["image_y"].min()), float(slabs["image_y"].max())
         above.vlines(
             track["x"],
             low,
@@ -156,21 +154,21 @@ def _approach(series, track, seen):
             lw=0.7,
             alpha=0.5,
             zorder=0,
-            label="slabs seen by the lidar",
+            label="measured slabs",
         )
     above.set_ylabel("y / m (port is up)")
     side.set(ylabel="z / m", xlabel="x along the path / m")
     above.legend(fontsize=8, ncols=3, loc="best")
     return figure, (
-        "Each slab is seen twice. Vortices are shown in its plane at the time when it was seen. "
+        "Each slab is measured twice. Vortices are shown in its plane at the time of measurement. "
         "The path frame is inclined as the path, so that a level wake rises along it on a descent."
     )
 
 
-def _overview(series, track, seen, span):
+def _overview(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset, span: float) -> Plate:
     figure = Figure(figsize=(13.6, 4.9), layout="compressed")
     view, angle = figure.subplots(1, 2, width_ratios=(1.25, 1))
-    ahead = _draw_slab(view, track, seen, span)
+    ahead = _draw_slab(view, track, slabs, span)
     view.set_title(f"backscatter and wind of a slab, {ahead:.1f} s ahead")
     view.legend(loc="lower center", ncols=3, fontsize=8)
     _lines(angle, series, "roll", np.degrees(1))
@@ -182,12 +180,12 @@ def _overview(series, track, seen, span):
     )
 
 
-def _cockpit(track, seen, span):
+def _cockpit(track: xr.Dataset, slabs: xr.Dataset, span: float) -> Plate:
     figure = Figure(figsize=(10.5, 7.0), layout="compressed")
     axes = figure.subplots()
-    ahead = _draw_slab(axes, track, seen, span)
+    ahead = _draw_slab(axes, track, slabs, span)
     axes.legend(loc="lower center", ncols=3, fontsize=9)
-    view = seen.isel(slab=best_slab(track, seen))
+    view = slabs.isel(slab=best_slab(track, slabs))
     return figure, (
         f"Backscatter of the slab at x = {float(view['x']):.0f} m with the wind retrieved from "
         f"both images, delivered {ahead:.1f} s before the wing is there. Circles: cores with the "
@@ -195,9 +193,9 @@ def _cockpit(track, seen, span):
     )
 
 
-def _draw_slab(axes, track, seen, span) -> float:
+def _draw_slab(axes: Axes, track: xr.Dataset, slabs: xr.Dataset, span: float) -> float:
     """Image, wind, vortices and wing; time from the delivery to the wing's arrival, s."""
-    view = seen.isel(slab=best_slab(track, seen))
+    view = slabs.isel(slab=best_slab(track, slabs))
     draw_image(axes, view)
     draw_vectors(axes, view)
     number = int(np.argmin(np.abs(track["x"].values - float(view["x"]))))
@@ -215,7 +213,7 @@ def _draw_slab(axes, track, seen, span) -> float:
     return float(view["x"]) / speed - float(view["delivered"])
 
 
-def best_slab(track: xr.Dataset, seen: xr.Dataset) -> int:
+def best_slab(track: xr.Dataset, slabs: xr.Dataset) -> int:
     """The last slab whose vortices were found on both sides of the path; else the last accepted."""
     found = track.sel(source="estimate")
     both = (found["port_y"] > 0) & (found["starboard_y"] < 0)
@@ -223,11 +221,11 @@ def best_slab(track: xr.Dataset, seen: xr.Dataset) -> int:
         x = track["x"].values[chosen.values]
         if x.size:
             middle = x[x.size // 2]
-            return int(np.argmin(np.abs(seen["x"].values - middle)))
-    return seen.sizes["slab"] - 1
+            return int(np.argmin(np.abs(slabs["x"].values - middle)))
+    return slabs.sizes["slab"] - 1
 
 
-def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None) -> None:
+def draw_image(axes: Axes, view: xr.Dataset, limits: tuple[float, float] | None = None) -> None:
     """Backscatter of a slab in the pilot's view."""
     if "image" not in view:
         return
@@ -247,7 +245,7 @@ def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None
     axes.set_ylim(float(view["image_z"].min()), float(view["image_z"].max()))
 
 
-def draw_vectors(axes, view: xr.Dataset) -> None:
+def draw_vectors(axes: Axes, view: xr.Dataset) -> None:
     """Wind vectors of a slab, those that are valid."""
     if "v" not in view:
         return
@@ -266,7 +264,7 @@ def draw_vectors(axes, view: xr.Dataset) -> None:
     )
 
 
-def draw_vortices(axes, at: xr.Dataset) -> None:
+def draw_vortices(axes: Axes, at: xr.Dataset) -> None:
     """Cores of a slab: true, and as tracked."""
     for side in SIDES:
         label = side == "port"
@@ -294,7 +292,7 @@ def draw_vortices(axes, at: xr.Dataset) -> None:
             axes.add_patch(circle)
 
 
-def _track(track):
+def _track(track: xr.Dataset) -> Plate:
     figure = Figure(figsize=(11.5, 10.0), layout="compressed")
     panels = figure.subplots(len(_ROWS), 2, sharex=True)
     truth, tracked, found = (track.sel(source=s) for s in ("truth", "track", "estimate"))
@@ -338,13 +336,13 @@ def _track(track):
         axes.set_xlabel("x of the slab / m")
     panels[0, 0].legend(fontsize=8, loc="best")
     return figure, (
-        "Parameters in the plane of every slab at the time when it was seen: estimates of single "
+        "Parameters in the plane of every slab at its time of measurement: estimates of single "
         "slabs, the track after each of them, the truth. An estimate is missing where its fit was "
         "not accepted, mostly where a vortex is outside the image."
     )
 
 
-def _fit_limits(axes, truth, found, spread) -> None:
+def _fit_limits(axes: Axes, truth: np.ndarray, found: np.ndarray, spread: np.ndarray) -> None:
     """Values of truth and estimates, without the widest bands."""
     inside = np.isfinite(found)
     values = np.concatenate([truth[inside], found[inside]]) if inside.any() else truth
@@ -354,7 +352,7 @@ def _fit_limits(axes, truth, found, spread) -> None:
         axes.set_ylim(values.min() - margin, values.max() + margin)
 
 
-def _moment(series):
+def _moment(series: xr.Dataset) -> Plate:
     figure = Figure(figsize=(10.5, 6.4), layout="compressed")
     moment, rest = figure.subplots(2, 1, sharex=True)
     one = series.sel(flight="feedforward")
@@ -395,11 +393,11 @@ def _moment(series):
     rest.set_xlabel("time of flight / s")
     return figure, (
         "Flight with the lidar. Predicted: the moment on this wing from the track alone, of slabs "
-        "that were seen up to two seconds before."
+        "measured up to two seconds before."
     )
 
 
-def _commands(series):
+def _commands(series: xr.Dataset) -> Plate:
     figure = Figure(figsize=(10.5, 4.0), layout="compressed")
     axes = figure.subplots()
     _lines(axes, series, "aileron_deflection", np.degrees(1))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -23,31 +24,38 @@ class Frame(NamedTuple):
 
 
 def film(
-    series: xr.Dataset, track: xr.Dataset | None, seen: xr.Dataset | None, span: float
+    series: xr.Dataset, track: xr.Dataset | None, slabs: xr.Dataset | None, span: float
 ) -> Iterator[Frame]:
     """Frames from the first slab to the end of the flight; none without images.
 
     Parameters
     ----------
-    series, track, seen : xr.Dataset
+    series, track, slabs : xr.Dataset
         As of `lidar_mi.assessment.figures.encounter.draw_all`.
     span : float
         Of the aircraft, m.
     """
-    if track is None or seen is None or "image" not in seen:
+    if track is None or slabs is None or "image" not in slabs:
         return
     times = series["time"].values
-    start = float(seen["delivered"].min())
-    limits = tuple(float(q) for q in np.nanquantile(seen["image"], (0.01, 0.995)))
+    start = float(slabs["delivered"].min())
+    low, high = (float(q) for q in np.nanquantile(slabs["image"], (0.01, 0.995)))
     for time in np.linspace(start, float(times[-1]), MOST_FRAMES):
-        yield _frame(series, track, seen, span, float(time), limits)
+        yield _frame(series, track, slabs, span, float(time), (low, high))
 
 
-def _frame(series, track, seen, span, time, limits) -> Frame:
+def _frame(
+    series: xr.Dataset,
+    track: xr.Dataset,
+    slabs: xr.Dataset,
+    span: float,
+    time: float,
+    limits: tuple[float, float],
+) -> Frame:
     figure = Figure(figsize=_SIZE, dpi=_DOTS, layout="constrained")
     view, above, roll = figure.subplots(3, 1, height_ratios=(4.4, 1.5, 1.3))
-    number = int(np.flatnonzero(seen["delivered"].values <= time)[-1])
-    slab = seen.isel(slab=number)
+    number = int(np.flatnonzero(slabs["delivered"].values <= time)[-1])
+    slab = slabs.isel(slab=number)
     at = track.isel(slab=int(np.argmin(np.abs(track["x"].values - float(slab["x"])))))
     one = series.sel(flight="feedforward").sel(time=time, method="nearest")
     draw_image(view, slab, limits)
@@ -70,7 +78,7 @@ def _frame(series, track, seen, span, time, limits) -> Frame:
         )
     view.set(xlabel="y / m (port is left)", ylabel="z / m")
     view.set_title(f"slab {float(slab['x']) - float(one['x']):.0f} m ahead", fontsize=10)
-    _from_above(above, series, track, seen, slab, one, time)
+    _from_above(above, series, track, slabs, slab, one, time)
     _rolled(roll, series, time)
     figure.align_ylabels([above, roll])
     canvas = FigureCanvasAgg(figure)
@@ -82,7 +90,15 @@ def _frame(series, track, seen, span, time, limits) -> Frame:
     return Frame(pixels, f"{time:.1f} s: roll angle {words}", time)
 
 
-def _from_above(axes, series, track, seen, slab, one, time):
+def _from_above(
+    axes: Axes,
+    series: xr.Dataset,
+    track: xr.Dataset,
+    slabs: xr.Dataset,
+    slab: xr.Dataset,
+    one: xr.Dataset,
+    time: float,
+) -> None:
     known = track["delivered"].values <= time
     for side, colour in SIDES.items():
         axes.plot(track["x"], track[f"{side}_y"].sel(source="truth"), color="k", lw=0.9)
@@ -90,7 +106,7 @@ def _from_above(axes, series, track, seen, slab, one, time):
             track["x"][known], track[f"{side}_y"].sel(source="track")[known], color=colour, lw=2
         )
     x, y = float(one["x"]), float(one["y"])
-    low, high = float(seen["image_y"].min()), float(seen["image_y"].max())
+    low, high = float(slabs["image_y"].min()), float(slabs["image_y"].max())
     axes.fill(
         [x, float(slab["x"]), float(slab["x"])], [y, low, high], color="tab:cyan", alpha=0.25, lw=0
     )
@@ -101,7 +117,7 @@ def _from_above(axes, series, track, seen, slab, one, time):
     axes.grid(alpha=0.3)
 
 
-def _rolled(axes, series, time):
+def _rolled(axes: Axes, series: xr.Dataset, time: float) -> None:
     for mode in series["flight"].values:
         label, colour, style = flight_style(str(mode), series)
         one = series.sel(flight=mode)

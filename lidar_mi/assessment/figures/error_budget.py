@@ -1,14 +1,14 @@
 """The figure of the cross-flow wind's error budget."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.digits import whole_percent
-from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.error_budget import (
     CAUSES,
@@ -19,7 +19,7 @@ from lidar_mi.assessment.metrics.error_budget import (
 )
 
 
-def draw_all(folder: Path, budgets: Budgets, log: Callable) -> list[Drawn]:
+def draw_all(folder: Path, budgets: Budgets, log: Progress) -> list[Drawn]:
     """Draw the fractions of all causes as a PNG into ``folder``; nothing if none is known.
 
     Parameters
@@ -34,7 +34,7 @@ def draw_all(folder: Path, budgets: Budgets, log: Callable) -> list[Drawn]:
     return save_all(folder, plates, log)
 
 
-def _bars(budgets: Budgets):
+def _bars(budgets: Budgets) -> Plate:
     used = [c for c in CAUSES if any(c in causes_of(budget) for budget in budgets.values())]
     size = (3.4 + 3.2 * len(budgets), 1.9 + 0.5 * len(used))
     figure = Figure(figsize=size, layout="constrained")

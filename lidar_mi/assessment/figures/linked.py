@@ -46,6 +46,7 @@ def panel(title: str) -> tuple[Figure, Axes]:
 def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     """The axes' figure as an SVG element with marks below its lines; all text is escaped."""
     figure = axes.figure
+    assert isinstance(figure, Figure)  # that of `panel`
     # cells and dots are behind the frame
     figure.patch.set_visible(False)
     axes.patch.set_visible(False)

@@ -7,12 +7,21 @@ from matplotlib.axes import Axes
 from scipy import stats
 
 
-def draw_normalised_errors(axes: Axes, errors: Mapping[str, np.ndarray], **style: str) -> None:
+def draw_normalised_errors(
+    axes: Axes, errors: Mapping[str, np.ndarray], color: str | None = None
+) -> None:
     """Histogram of errors over standard errors, by label; the last bins hold all beyond 5."""
     edges = np.linspace(-5, 5, 51)
     for label, values in errors.items():
         known = values[np.isfinite(values)]
-        axes.hist(np.clip(known, -5, 5), edges, density=True, histtype="step", label=label, **style)
+        axes.hist(
+            np.clip(known, -5, 5),
+            list(edges),
+            density=True,
+            histtype="step",
+            label=label,
+            color=color,
+        )
 
 
 def draw_normal_density(axes: Axes) -> None:

@@ -1,25 +1,34 @@
 """When the beams of a scan are sent, and what wrong poses make of the wind."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 
-from lidar_mi.assessment.figures.plates import Drawn, frame, image_panel, save_all, sheet
+from lidar_mi.assessment.described import Progress
+from lidar_mi.assessment.figures.plates import (
+    Drawn,
+    Plate,
+    frame,
+    image_panel,
+    save_all,
+    sheet,
+    speed_of,
+)
 from lidar_mi.assessment.metrics.pointing import ScanPointing, apparent_wind
 
 # Arrows along the image's width.
 _ARROWS = 21
 
 
-def draw_all(folder: Path, pointing: ScanPointing, log: Callable) -> list[Drawn]:
+def draw_all(folder: Path, pointing: ScanPointing, log: Progress) -> list[Drawn]:
     """Draw the figure of beam times and poses."""
     plates = [("fig24_scan_time", "Times and places of the beams", _scan_time(pointing))]
     return save_all(folder, plates, log)
 
 
-def _scan_time(pointing: ScanPointing):
+def _scan_time(pointing: ScanPointing) -> Plate:
     wrong = bool(np.abs(pointing.errors).max() > 0)
     panels = [_times, _errors, _wind] if pointing.on_nodes() else [_times, _errors]
     panels = panels if wrong else [_times]
@@ -35,17 +44,18 @@ def _scan_time(pointing: ScanPointing):
     return figure, " ".join(caption[panel] for panel in panels)
 
 
-def _times(axes, pointing: ScanPointing) -> None:
+def _times(axes: Axes, pointing: ScanPointing) -> None:
     time, title = 1e3 * pointing.time[0], "time of each beam, first scan"
     if pointing.on_nodes():
         image_panel(axes, _field(time, pointing), title, "t / ms", cmap="viridis")
         return
     frame(axes, pointing.y, pointing.z, title)
-    dots = axes.scatter(*pointing.places[0].T, c=time, s=2, linewidths=0, rasterized=True)
+    y, z = pointing.places[0].T
+    dots = axes.scatter(y, z, c=time, s=2, linewidths=0, rasterized=True)
     axes.figure.colorbar(dots, ax=axes, label="t / ms", pad=0.02)
 
 
-def _errors(axes, pointing: ScanPointing) -> None:
+def _errors(axes: Axes, pointing: ScanPointing) -> None:
     for scan in range(2):
         when = 1e3 * (pointing.time[scan] + scan * pointing.dt)
         for axis, (name, colour) in enumerate((("y", "C0"), ("z", "C1"))):
@@ -60,9 +70,9 @@ def _errors(axes, pointing: ScanPointing) -> None:
     )
 
 
-def _wind(axes, pointing: ScanPointing) -> None:
+def _wind(axes: Axes, pointing: ScanPointing) -> None:
     v, w = (_field(part, pointing) for part in apparent_wind(pointing).T)
-    image_panel(axes, np.hypot(v, w), "apparent wind", "m/s", cmap="magma")
+    image_panel(axes, speed_of(v, w), "apparent wind", "m/s", cmap="magma")
     step = max(1, pointing.y.size // _ARROWS)
     some = slice(step // 2, None, step)
     v, w = v[some, some], w[some, some]

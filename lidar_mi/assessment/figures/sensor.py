@@ -1,17 +1,19 @@
 """The figures of both lidars as one sensor: its scan, its wind, its standard errors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, line_places
 
@@ -19,7 +21,7 @@ _SPEED = "m s$^{-1}$"
 
 
 def draw_all(
-    folder: Path, found: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core], log: Callable
+    folder: Path, found: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core], log: Progress
 ) -> list[Drawn]:
     """Draw the combined sensor's figures as PNG into ``folder``.
 
@@ -41,7 +43,7 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
-def _scan(lines, cores):
+def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
     figure = Figure(figsize=(13.6, 4.6), layout="compressed")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     place = line_places(lines)
@@ -91,7 +93,7 @@ def _scan(lines, cores):
     )
 
 
-def _maps(found, lines, cores):
+def _maps(found: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
     figure = Figure(figsize=(17, 10.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     valid = found["flag"] == 0
@@ -133,12 +135,12 @@ def _maps(found, lines, cores):
     )
 
 
-def _crosses(cores, colour: str) -> str:
+def _crosses(cores: Sequence[Core], colour: str) -> str:
     """What of a caption speaks of the vortices, where there are any."""
     return f"{colour} crosses: true cores." if cores else ""
 
 
-def _uncertainty(found):
+def _uncertainty(found: xr.Dataset) -> Plate:
     figure = Figure(figsize=(17, 4.3), layout="compressed")
     axes = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 1))
     valid = (found["flag"] == 0).transpose("z", "y").values
@@ -179,7 +181,7 @@ def _uncertainty(found):
     )
 
 
-def _colours(values: np.ndarray) -> dict:
+def _colours(values: np.ndarray) -> dict[str, Any]:
     """Symmetric about 0, or the values' own range if all of them have the same sign."""
     known = values[np.isfinite(values)]
     low, high = np.quantile(known, (0.005, 0.995)) if known.size else (0.0, 0.0)

@@ -1,18 +1,21 @@
 """The figures of a run with volumes: the observed volume, the wind, its errors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, by_factors, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, by_factors, save_all
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 
@@ -25,7 +28,7 @@ def draw_all(
     found: xr.Dataset,
     volumes: Sequence[xr.DataArray],
     cores: Sequence[Core],
-    log: Callable,
+    log: Progress,
 ) -> list[Drawn]:
     """Draw the figures of a run with volumes as PNG into ``folder``.
 
@@ -47,7 +50,7 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
-def _volume_section(volumes, cores):
+def _volume_section(volumes: Sequence[xr.DataArray], cores: Sequence[Core]) -> Plate:
     figure = Figure(figsize=(16, 6.4), layout="compressed")
     axes = figure.subplots(2, 2, height_ratios=(3.2, 1))
     values = [1e6 * volume for volume in volumes]
@@ -66,7 +69,7 @@ def _volume_section(volumes, cores):
     )
 
 
-def _cuts(wind, cores):
+def _cuts(wind: xr.Dataset, cores: Sequence[Core]) -> Plate:
     figure = Figure(figsize=(17, 10.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     cut = wind.isel(x=wind.sizes["x"] // 2)
@@ -83,7 +86,7 @@ def _cuts(wind, cores):
     )
 
 
-def _along_x(wind, cores):
+def _along_x(wind: xr.Dataset, cores: Sequence[Core]) -> Plate:
     figure = Figure(figsize=(17, 5.4), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     cut = wind.sel(z=cores[0].z if cores else 0, method="nearest")
@@ -97,7 +100,9 @@ def _along_x(wind, cores):
     )
 
 
-def _row(panels, cut, name, across, up, stretch=1):
+def _row(
+    panels: np.ndarray, cut: xr.Dataset, name: str, across: str, up: str, stretch: float = 1
+) -> None:
     true, value = cut[f"{name}_true"], cut[name].where(cut["flag"] == 0)
     error = value - true
     limit, small = _limit(true), _limit(error)
@@ -113,7 +118,9 @@ def _row(panels, cut, name, across, up, stretch=1):
         bar.locator = MaxNLocator(7 if stretch == 1 else 3)
 
 
-def _map(panel, field, across, up, colours, low, high):
+def _map(
+    panel: Axes, field: xr.DataArray, across: str, up: str, colours: str, low: float, high: float
+) -> QuadMesh:
     mesh = panel.pcolormesh(
         field[across],
         field[up],
@@ -130,7 +137,7 @@ def _map(panel, field, across, up, colours, low, high):
     return mesh
 
 
-def _errors(found):
+def _errors(found: xr.Dataset) -> Plate:
     figure = Figure(figsize=(17, 8.4), layout="compressed")
     axes = figure.subplots(2, 3)
     # an experiment may have a single method

@@ -1,20 +1,25 @@
 """The figure of fitted vortex pairs over their data, with the truth."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.described import Progress
+from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all, speed_of
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
-_STYLE = {Origin.IMAGES: ("tab:orange", "-"), Origin.VECTORS: ("tab:purple", "--")}
+_STYLE: Mapping[str, tuple[str, str]] = {
+    Origin.IMAGES: ("tab:orange", "-"),
+    Origin.VECTORS: ("tab:purple", "--"),
+}
 _SPEED = "m s$^{-1}$"
 
 
@@ -25,7 +30,7 @@ def draw_all(
     truth: xr.Dataset,
     fits: Mapping[str, VortexPairFit],
     cores: Sequence[Core],
-    log: Callable,
+    log: Progress,
 ) -> list[Drawn]:
     """Draw the fits over the first image, the vectors (None: there are none) and the truth."""
     if not fits:
@@ -34,7 +39,13 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
-def _pair(image, vectors, truth, fits, cores):
+def _pair(
+    image: xr.DataArray,
+    vectors: xr.Dataset | None,
+    truth: xr.Dataset,
+    fits: Mapping[str, VortexPairFit],
+    cores: Sequence[Core],
+) -> Plate:
     figure = Figure(figsize=(13.6, 12.4), layout="compressed")
     grid = figure.add_gridspec(3, 2)
     first, fitted, wrong, stated = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
@@ -60,8 +71,8 @@ def _pair(image, vectors, truth, fits, cores):
     limit = float(np.quantile(np.hypot(true["v"], true["w"]), 0.999)) or 1.0
     _arrows(fitted, y, z, model, limit)
     fitted.set_title(f"wind of the pair from the {ORIGIN_NAMES[best]}")
-    error = np.hypot(model["v"] - true["v"], model["w"] - true["w"]).values
-    stderr = np.hypot(model["v_stderr"], model["w_stderr"]).values
+    error = speed_of(model["v"] - true["v"], model["w"] - true["w"]).values
+    stderr = speed_of(model["v_stderr"], model["w_stderr"]).values
     most = float(np.quantile(error, 0.995)) or 1.0
     for axes, values, title in (
         (wrong, error, "its error (speed of the difference to the truth)"),
@@ -86,7 +97,7 @@ def _pair(image, vectors, truth, fits, cores):
     )
 
 
-def _arrows(axes, y, z, model, limit):
+def _arrows(axes: Axes, y: np.ndarray, z: np.ndarray, model: xr.Dataset, limit: float) -> None:
     every = max(1, round(len(y) / 40))
     at = np.ix_(np.arange(every // 2, len(z), every), np.arange(every // 2, len(y), every))
     v, w = model["v"].values[at], model["w"].values[at]
@@ -107,7 +118,7 @@ def _arrows(axes, y, z, model, limit):
     axes.figure.colorbar(arrows, ax=axes, label=f"speed / {_SPEED}", pad=0.02, extend="max")
 
 
-def _mark(axes, fits, cores):
+def _mark(axes: Axes, fits: Mapping[str, VortexPairFit], cores: Sequence[Core]) -> None:
     for name, fit in fits.items():
         colour, style = _STYLE[name]
         for k, vortex in enumerate((fit.port, fit.starboard)):
@@ -135,7 +146,13 @@ def _mark(axes, fits, cores):
         )
 
 
-def _along(axes, vectors, truth, fits, best):
+def _along(
+    axes: Axes,
+    vectors: xr.Dataset | None,
+    truth: xr.Dataset,
+    fits: Mapping[str, VortexPairFit],
+    best: str,
+) -> None:
     y = truth["y"].values
     level = float(fits[best].quantities["centre_z"].value)
     if vectors is not None:

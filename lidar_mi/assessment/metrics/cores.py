@@ -33,7 +33,7 @@ def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
     -------
     list of Core
         Port (positive circulation) first; senses whose circulation at the core radius stays below
-        ``least_circulation`` are left out, so a field without vortices gives an empty list.
+        ``least_circulation`` are omitted, so a field without vortices gives an empty list.
     """
     y, z = wind["y"].values, wind["z"].values
     v, w = (wind[name].transpose("z", "y").values for name in ("v", "w"))
@@ -109,7 +109,15 @@ def ring_averages(
     )
 
 
-def _ring_means(v, w, y, z, cy: float, cz: float, rings: np.ndarray) -> np.ndarray:
+def _ring_means(
+    v: np.ndarray,
+    w: np.ndarray,
+    y: np.ndarray,
+    z: np.ndarray,
+    cy: float,
+    cz: float,
+    rings: np.ndarray,
+) -> np.ndarray:
     """Means of v, w and the tangential velocity on rings around (cy, cz), (3, rings), m/s.
 
     Tangential is positive from +y towards +z.

@@ -1,4 +1,4 @@
-"""Numbers of a flight through a wake: what the pilot felt, what the lidar knew, and when.
+"""Numbers of a flight through a wake: its motion, the lidar's estimates, and their times.
 
 Every function takes data sets of a flight: ``series``, dims (flight, time), with the flights off,
 feedforward and perfect; ``track``, dims (source, slab), with the sources estimate, track and truth.
@@ -24,7 +24,7 @@ _NAMES = {
 }
 
 AFTER = 5
-"""Slabs after which the track is held against the truth."""
+"""Slabs after which the track is compared with the truth."""
 
 # Rolling moments, as a fraction of the controls', and angles (rad) below this are rounding.
 _ROUNDING = 1e-9
@@ -101,23 +101,23 @@ def felt_from(series: xr.Dataset) -> float:
 def measured_in_flight(
     series: xr.Dataset, track: xr.Dataset, slab_depth: float
 ) -> dict[str, float]:
-    """Rows of a requirement table as flown: range from the time from an estimate to its slab.
+    """Rows of a requirement table in flight: range from the time from an estimate to its slab.
 
     The range is what the aircraft flies from the moment at which an estimate is there to its slab;
     errors are those of valid vectors and of lines of sight against the truth; u and lines of sight
-    are left out without a Doppler lidar.
+    are absent without a Doppler lidar.
     """
-    seen = track.where(track["vectors"] > 0, drop=True)
+    measured = track.where(track["vectors"] > 0, drop=True)
     speed = float(series["airspeed"].isel(time=0).mean())
     ahead = _ahead(series, track)
     found = {
         "range": float(np.median(ahead) * speed) if ahead.size else float("nan"),
         "slabs_per_second": _rate(track["delivered"].values),
         "slab_depth": slab_depth,
-        "points_per_slab": float(seen["vectors"].median()) if seen.sizes["slab"] else 0.0,
+        "points_per_slab": float(measured["vectors"].median()) if measured.sizes["slab"] else 0.0,
     }
     for name in ("v_los", "u", "v", "w"):
-        errors = seen[f"error_{name}"].values if f"error_{name}" in seen else np.array([])
+        errors = measured[f"error_{name}"].values if f"error_{name}" in measured else np.array([])
         errors = errors[np.isfinite(errors)]
         if errors.size:
             found[f"error_{name}"] = float(np.sqrt(np.mean(errors**2)))
@@ -142,9 +142,9 @@ def _rate(times: np.ndarray) -> float:
 
 def _ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
     """Time (s) from each estimate to the aircraft's arrival in its plane, where it arrives."""
-    flown = series.sel(flight="feedforward")
+    flight = series.sel(flight="feedforward")
     arrival = np.interp(
-        track["x"].values, flown["x"].values, flown["time"].values, left=np.nan, right=np.nan
+        track["x"].values, flight["x"].values, flight["time"].values, left=np.nan, right=np.nan
     )
     ahead = arrival - track["delivered"].values
     return ahead[np.isfinite(ahead)]
@@ -165,8 +165,8 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
     found["rejected_slabs"] = float(track["rejected"].max()) if track.sizes["slab"] else 0.0
     if usable.size:
         first = int(usable[0])
-        seen = np.flatnonzero(accepted)
-        found["slabs_to_track"] = float((seen <= first).sum())
+        used = np.flatnonzero(accepted)
+        found["slabs_to_track"] = float((used <= first).sum())
         found["lead_time"] = felt_from(series) - float(track["delivered"][first])
     after = np.flatnonzero((track["updates"].values >= AFTER) & (track["usable"].values > 0))
     if after.size:

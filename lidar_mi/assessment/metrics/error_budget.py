@@ -44,7 +44,7 @@ _BOXES = (ImageMethod.CC, ImageMethod.WS)
 
 
 def image_scale(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, float]:
-    """Gain and offset that turn the air's extinction into the rendered images.
+    """Gain and offset from the air's extinction to the rendered images.
 
     By least squares over both images, weighted by 1 / `noise`^2 (standard errors of the rendered
     ones). The offset is the light of a pulse longer than the gate from the air around it.
@@ -72,10 +72,10 @@ def images_without(
 
     Noise is not drawn again: the detector's is its difference to the rendered image, the
     simulation's the difference of the rendered image to the blurred air. So two cases differ by
-    the cause alone and not by chance. The detector's noise is kept although its photons follow the
-    signal: where blur reduces that by 20 %, the noise is in error by 10 %. Light transport beyond
-    the blur (multiple scattering, extinction within the slab: 0.5 % of the signal in the paper's
-    case, nearly uniform) is part of the simulation's noise.
+    the cause alone and not by chance. The detector's noise stays the same although its photons
+    follow the signal: where blur reduces that by 20 %, the noise is in error by 10 %. Light
+    transport beyond the blur (multiple scattering, extinction within the slab: 0.5 % of the signal
+    in the paper's case, nearly uniform) is part of the simulation's noise.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def images_without(
     blurred, sharp : pair
         The air averaged over the beams' width without noise, and without blur; unit of `measured`.
     rendered : pair, optional
-        Without the noise of a detector; left out: there is none.
+        Without the noise of a detector; absent if there is none.
     advected : pair, optional
         As `blurred`, of air advected by the slab's mean wind only.
     timed : mapping of pair, optional
@@ -115,7 +115,9 @@ def _plus_difference(base: Pair, more: Pair, less: Pair) -> list[xr.DataArray]:
     ]
 
 
-def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def chord_wind(
+    truth: xr.Dataset, y: np.ndarray, z: np.ndarray, dt: float, steps: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean wind over dt of the air whose path has its middle at given places.
 
     The displacement between two images is the chord of a curved path. In a solid rotation at the
@@ -254,7 +256,7 @@ def moved_rigidly(
         places.append(np.broadcast_to(place, regions.shape))
     advected = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
 
-    def cut(image):
+    def cut(image: np.ndarray) -> np.ndarray:
         return sliding_window_view(image, (search, search))[::stride, ::stride]
 
     rest = cut(measured[1].values - blurred[1].values)
@@ -339,7 +341,7 @@ def error_budget(
     return metrics
 
 
-def _difference(wind, true) -> np.ndarray:
+def _difference(wind: xr.Dataset, true: xr.Dataset | Mapping[str, np.ndarray]) -> np.ndarray:
     return np.stack([np.asarray(wind[n], float) - np.asarray(true[n], float) for n in ("v", "w")])
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
@@ -51,7 +52,9 @@ def deviations(wind: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
     )
 
 
-def error_statistics(error, stderr=None, where=True) -> dict[str, float]:
+def error_statistics(
+    error: ArrayLike, stderr: ArrayLike | None = None, where: ArrayLike = True
+) -> dict[str, float]:
     """Statistics of errors, and their consistency with the standard errors.
 
     Parameters

@@ -34,9 +34,9 @@ def relative_divergence(wind: xr.Dataset) -> float:
 
 
 def rises(cores: Sequence[Core]) -> bool:
-    """Whether a pair of vortices turns against the lift of an aircraft, and so rises.
+    """Whether a pair of vortices rotates against the lift of an aircraft, and so rises.
 
-    Behind a lifting wing the port vortex (larger y) turns from +y towards +z, and the air between
+    Behind a lifting wing the port vortex (larger y) rotates from +y towards +z, and the air between
     both sinks.
     """
     if len(cores) != 2:

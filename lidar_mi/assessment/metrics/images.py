@@ -18,7 +18,7 @@ def light_metrics(scan: xr.Dataset) -> dict[str, float]:
     Parameters
     ----------
     scan : xr.Dataset
-        As rendered; metrics of missing variables are left out.
+        As rendered; metrics of missing variables are absent.
     """
     first = scan.isel(gate=0)
     metrics = noise_metrics(first)

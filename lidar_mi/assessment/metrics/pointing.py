@@ -42,7 +42,7 @@ class ScanPointing:
 def apparent_wind(pointing: ScanPointing) -> np.ndarray:
     """Wind v, w (n, 2), m/s, that errors of the poses add to that of beams on the same nodes.
 
-    Air that is met ``e`` beside the reported place is put ``e`` too far to the other side:
+    Air at ``e`` from the reported place is displaced by ``e`` to the other side:
     -(e2 - e1) / dt, whatever the method. What both scans have in common adds nothing.
     """
     return -(pointing.errors[1] - pointing.errors[0]) / pointing.dt

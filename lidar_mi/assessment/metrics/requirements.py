@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -115,7 +115,7 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
     ----------
     table : RequirementTable
     measured : mapping
-        The sensor's values, SI, by names of `QUANTITIES`; None, NaN or left out: not known. Names
+        The sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known. Names
         without a row in the table are ignored.
 
     Raises
@@ -135,7 +135,7 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
     return [_judged(row, values.get(row.quantity, math.nan), distance) for row in table.rows]
 
 
-def fulfilled(findings: list[Finding]) -> bool | None:
+def fulfilled(findings: Sequence[Finding]) -> bool | None:
     """Whether all rows pass; None if none fails but some are undetermined."""
     results = {finding.passed for finding in findings}
     if False in results:
@@ -157,7 +157,7 @@ def look_ahead(distance: float, speed: float) -> float:
     return distance / speed if speed else math.inf
 
 
-def as_rows(findings: list[Finding]) -> list[tuple[str, str, str, str, str]]:
+def as_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str, str]]:
     """Findings as text: property, required, measured, margin, verdict."""
     rows = []
     for finding in findings:
@@ -171,7 +171,11 @@ def as_rows(findings: list[Finding]) -> list[tuple[str, str, str, str, str]]:
     return rows
 
 
-def _section(data, place: str) -> Mapping:
+Judged = Sequence[tuple[RequirementTable, Sequence[Finding]]]
+"""Requirement tables with what was found for each."""
+
+
+def _section(data: object, place: str) -> Mapping[str, object]:
     if not isinstance(data, dict) or not data:
         raise InputError(f"{place}: {data!r} is not allowed; expected a section with keys")
     return data
@@ -185,7 +189,7 @@ def _known(name: str, place: str) -> None:
     raise InputError(f"{place}.{name}: unknown row{hint} (allowed: {', '.join(QUANTITIES)})")
 
 
-def _table(place: str, application: str, title: str, phase: str, rows) -> RequirementTable:
+def _table(place: str, application: str, title: str, phase: str, rows: object) -> RequirementTable:
     rows = dict(_section(rows, place))
     speed = _limits(f"{place}.speed", rows.pop("speed")) if "speed" in rows else {}
     if "fraction_of_range" in speed:
@@ -195,7 +199,7 @@ def _table(place: str, application: str, title: str, phase: str, rows) -> Requir
     return RequirementTable(application, title, phase, found, slowest, fastest)
 
 
-def _row(place: str, quantity: str, limits) -> Requirement:
+def _row(place: str, quantity: str, limits: object) -> Requirement:
     _known(quantity, place)
     unit = QUANTITIES[quantity][1]
     place = f"{place}.{quantity}"
@@ -205,7 +209,7 @@ def _row(place: str, quantity: str, limits) -> Requirement:
     return row
 
 
-def _limits(place: str, limits, unit: str = "m/s") -> dict[str, float]:
+def _limits(place: str, limits: object, unit: str = "m/s") -> dict[str, float]:
     """Limits in SI by the names that they have in `Requirement`."""
     found: dict[str, float] = {}
     for limit, value in _section(limits, place).items():

@@ -29,7 +29,7 @@ class ScanSafety:
 
 
 def safety_metrics(safety: ScanSafety | None) -> dict[str, float]:
-    """``safety.hazard_distance`` and so on; infinite distances are left out; None: no limits."""
+    """``safety.hazard_distance`` and so on; infinite distances are absent; None: no limits."""
     if safety is None:
         return {}
     numbers = asdict(safety)

@@ -140,7 +140,7 @@ def sobol_indices(
         few = f"{count} points with a value; {needed} are needed for {len(knobs)} knobs"
         return replace(none, reason=few)
     mean = np.nanmean(table, axis=1)
-    # what is left of the difference of equal numbers is no variance
+    # the rounding error of a difference of equal numbers is no variance
     if not np.ptp(mean) > 1e-12 * np.abs(mean).max():
         return replace(none, reason="it does not vary")
     scaled = (mean - mean.mean()) / mean.std()

@@ -141,24 +141,24 @@ def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) ->
     return metrics
 
 
-def limit_metrics(left: Mapping[str, float]) -> dict[str, float]:
+def limit_metrics(mean_squares: Mapping[str, float]) -> dict[str, float]:
     """Error budget of u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.fraction_u``.
 
     Parameters
     ----------
-    left : mapping of str to float
+    mean_squares : mapping of str to float
         Mean square error of u (m^2 s^-2): with all causes as "", without each of them, and
         "sampling", the remainder without all. Empty: not known.
     """
-    if not left:
+    if not mean_squares:
         return {}
     metrics = {}
-    for cause, square in left.items():
+    for cause, square in mean_squares.items():
         if cause:
-            left_over = square / left[""]
+            remaining = square / mean_squares[""]
             key = f"sensor.error_budget.{cause}"
             metrics[f"{key}.rmse_u"] = math.sqrt(square)
-            metrics[f"{key}.fraction_u"] = left_over if cause == "sampling" else 1 - left_over
+            metrics[f"{key}.fraction_u"] = remaining if cause == "sampling" else 1 - remaining
     return metrics
 
 

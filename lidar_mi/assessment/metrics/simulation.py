@@ -19,7 +19,7 @@ from lidar_mi.assessment.metrics.names import (
 
 
 def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:
-    """Monte Carlo samples of both scans, and their noise beside a detector's.
+    """Monte Carlo samples of both scans, and their noise relative to a detector's.
 
     ``backscatter.samples_per_beam``; behind a detector ``backscatter_noisy.monte_carlo_fraction``,
     their variance over that of its noise in the scan where that is larger, see

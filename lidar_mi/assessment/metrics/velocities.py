@@ -1,6 +1,7 @@
 """Errors of line-of-sight winds: standard deviation and bias, with their standard errors."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
@@ -8,7 +9,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.names import ring_key
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 
-READERS = {
+READERS: Mapping[str, str] = {
     RingMethod.ANNULAR: "all rings, full model",
     RingMethod.PIXELS: "all rings, every pixel",
     RingMethod.CA: "CA, peak in r",
@@ -21,7 +22,7 @@ READERS = {
 PEAK_READERS = (RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG)
 """Methods that use the peak of the innermost ring."""
 
-CENTRES = {RingCentre.FREE: "centre found", RingCentre.KNOWN: "centre known"}
+CENTRES: Mapping[str, str] = {RingCentre.FREE: "centre found", RingCentre.KNOWN: "centre known"}
 
 
 def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
@@ -36,9 +37,9 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
     std             standard deviation about each speed's own mean, pooled over all speeds
     std_stderr      its standard error, std / sqrt(2 degrees of freedom), for normal errors
     expected_std    root mean square of the random standard deviations as stated
-    expected_systematic   of the systematic ones, which all images share
+    expected_systematic   of the systematic ones, common to all images
 
-    Undetermined measures are left out.
+    Undetermined measures are absent.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ class Origin(StrEnum):
     VECTORS = "vectors"
 
 
-ORIGIN_NAMES = {Origin.IMAGES: "images", Origin.VECTORS: "wind vectors"}
+ORIGIN_NAMES: Mapping[str, str] = {Origin.IMAGES: "images", Origin.VECTORS: "wind vectors"}
 """Names of the origins in figures, tables and warnings."""
 
 

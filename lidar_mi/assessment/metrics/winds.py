@@ -109,7 +109,7 @@ def sweep_metrics(sweep: xr.Dataset) -> dict[str, float]:
     ----------
     sweep : xr.Dataset, dim (texture)
         ``rmse_v``, ``rmse_w`` (m s^-1), ``valid_fraction``; NaN, where nothing was retrieved, is
-        left out.
+        omitted.
     """
     metrics: dict[str, float] = {}
     for rms in sweep["texture"].values:

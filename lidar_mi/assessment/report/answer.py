@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
+from lidar_mi.assessment.described import DopplerDescription, ExperimentDescription
 from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import (
@@ -13,7 +14,13 @@ from lidar_mi.assessment.metrics.names import (
     vortex_key,
     wind_key,
 )
-from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, look_ahead
+from lidar_mi.assessment.metrics.requirements import (
+    Finding,
+    Judged,
+    RequirementTable,
+    as_rows,
+    look_ahead,
+)
 from lidar_mi.assessment.metrics.sensor import without_skill
 from lidar_mi.assessment.metrics.velocities import READERS
 from lidar_mi.assessment.metrics.winds import has_no_skill
@@ -22,16 +29,16 @@ from lidar_mi.tables import with_error
 from lidar_mi.units import shown
 
 # Fraction of errors within 1.96 standard errors below which, and within 1 above which, they are
-# said not to hold: four standard errors of these fractions for the eighty independent windows of an
-# image of 219 x 139 pixels, from a fifth of valid vectors on.
+# reported not to hold: four standard errors of these fractions for the eighty independent windows
+# of an image of 219 x 139 pixels, from a fifth of valid vectors on.
 _HOLDS, _ENOUGH = (0.85, 0.89), 0.2
 # Standard errors of a circulation from which its error is named.
 _FAR_OFF = 3.0
 
-Judged = Sequence[tuple[RequirementTable, Sequence[Finding]]]
 
-
-def answer(experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
+def answer(
+    experiment: ExperimentDescription, metrics: Mapping[str, float], judged: Judged = ()
+) -> list[str]:
     """What a run found, the same on the terminal, in the report and in `summary.txt`.
 
     Parameters
@@ -91,17 +98,17 @@ def verdict(
     return f"{_capital(table.phase)}, {table.title}: {'; '.join(reasons)}."
 
 
-def _wind(experiment, metrics: Mapping[str, float]) -> Iterator[str]:
+def _wind(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> Iterator[str]:
     """Errors of the wind from the most complete of the sensors that the run has."""
     if "sensor.vectors" in metrics:
         yield _sensor(experiment, metrics)
     elif f"{Source.BACKSCATTER}.mc_relative_error" in metrics:
         yield _images(experiment, metrics)
     elif experiment.doppler:
-        yield from _rings(experiment, metrics)
+        yield from _rings(experiment.doppler, metrics)
 
 
-def _sensor(experiment, metrics) -> str:
+def _sensor(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
     head = f"Both lidars, {_place(experiment)}"
     if not metrics["sensor.vectors"]:
         return f"{head}: no valid wind vector."
@@ -117,7 +124,7 @@ def _sensor(experiment, metrics) -> str:
     )
 
 
-def _images(experiment, metrics) -> str:
+def _images(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
     components = "uvw" if "true_wind.rms_u" in metrics else "vw"
     far = far_from_cores(metrics, "true_wind.", "rms_")
@@ -138,9 +145,9 @@ def _images(experiment, metrics) -> str:
     )
 
 
-def _rings(experiment, metrics) -> Iterator[str]:
+def _rings(doppler: DopplerDescription, metrics: Mapping[str, float]) -> Iterator[str]:
     """The first method of analysis, for every number of images averaged."""
-    settings = experiment.doppler.retrieval
+    settings = doppler.retrieval
     method, centre = settings.methods[0], settings.centre[0]
     parts = []
     for number in sorted(settings.averaged):
@@ -156,12 +163,12 @@ def _rings(experiment, metrics) -> Iterator[str]:
         parts.append(f"of {images} {std} m/s{limit}, bias {bias} m/s")
     if parts:
         yield (
-            f"Doppler lidar, {experiment.doppler.lidar.range:g} m ahead, {READERS[method]}: "
+            f"Doppler lidar, {doppler.lidar.range:g} m ahead, {READERS[method]}: "
             f"standard deviation of the line-of-sight velocity {'; '.join(parts)}."
         )
 
 
-def _stated(experiment, metrics) -> Iterator[str]:
+def _stated(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> Iterator[str]:
     """Standard errors that do not hold here, of the winds that the answer names."""
     if "sensor.vectors" in metrics:
         yield from _misstated("both lidars", metrics, "sensor.", "uvw")
@@ -173,7 +180,9 @@ def _stated(experiment, metrics) -> Iterator[str]:
             yield from _misstated(METHOD_NAMES[method], metrics, head, "uvw")
 
 
-def _misstated(name: str, metrics, head: str, components: str) -> Iterator[str]:
+def _misstated(
+    name: str, metrics: Mapping[str, float], head: str, components: str
+) -> Iterator[str]:
     known = [one for one in components if f"{head}coverage_95_{one}" in metrics]
     if not known or metrics.get(f"{head}valid_fraction", 1.0) < _ENOUGH:
         return
@@ -183,22 +192,26 @@ def _misstated(name: str, metrics, head: str, components: str) -> Iterator[str]:
     )
     low, high = _HOLDS
     if outer < low:
-        size, seen = "small", f"{whole_percent(outer)} of the errors are within 1.96 of them (95 %)"
+        size, covered = (
+            "small",
+            f"{whole_percent(outer)} of the errors are within 1.96 of them (95 %)",
+        )
     elif inner > high:
-        size, seen = "large", f"{whole_percent(inner)} of the errors are within 1 of them (68 %)"
+        size, covered = "large", f"{whole_percent(inner)} of the errors are within 1 of them (68 %)"
     else:
         return
-    yield f"Standard errors stated by {name} are too {size} here: {seen}."
+    yield f"Standard errors stated by {name} are too {size} here: {covered}."
 
 
-def _vortices(metrics) -> Iterator[str]:
+def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:
     """The fit to the wind vectors, or else to the images, where there is a true pair."""
     sides = ("port", "starboard")
+    known = [vortex_key("truth", f"{side}_circulation_5_15") for side in sides]
     for origin in ("vectors", "images"):
         keys = [vortex_key(origin, f"{side}_circulation_5_15") for side in sides]
-        true = [metrics.get(vortex_key("truth", f"{side}_circulation_5_15")) for side in sides]
-        if any(key not in metrics for key in keys) or any(value is None for value in true):
+        if any(metrics.get(key) is None for key in known) or any(k not in metrics for k in keys):
             continue
+        true = [metrics[key] for key in known]
         found = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
         off = max(
             abs(metrics[key] - one) / metrics.get(f"{key}_stderr", math.inf)
@@ -212,7 +225,7 @@ def _vortices(metrics) -> Iterator[str]:
         return
 
 
-def _place(experiment) -> str:
+def _place(experiment: ExperimentDescription) -> str:
     """Range and look-ahead time of the middle of the slab."""
     scan, speed = experiment.scan, experiment.platform.speed
     distance = scan.range + scan.thickness / 2
@@ -221,7 +234,7 @@ def _place(experiment) -> str:
     return f"{distance:.4g} m ahead ({look_ahead(distance, speed):.2g} s at {shown(speed, 'm/s')})"
 
 
-def _values(metrics, key: str, components: str) -> str:
+def _values(metrics: Mapping[str, float], key: str, components: str) -> str:
     """Numbers of all components, two digits; empty where one is not known."""
     values = [metrics.get(f"{key}{name}") for name in components]
     return "" if None in values else ", ".join(f"{value:#.2g}".rstrip(".") for value in values)

@@ -1,14 +1,16 @@
 """The backscatter lidar's chapter of a report."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
+from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.winds import has_no_skill
-from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.assessment.report.simulation import samples_of
 
 # rows of the table of results: key, name, unit
@@ -30,11 +32,11 @@ _ROWS = (
 
 
 def backscatter_chapter(
-    experiment,
+    experiment: ExperimentDescription,
     metrics: Mapping[str, float],
     cores: Sequence[Core],
     drawn: Sequence[Drawn],
-    vectors: dict | None = None,
+    vectors: dict[str, Any] | None = None,
 ) -> Chapter:
     """Images and cross-flow winds of the backscatter lidar.
 
@@ -47,7 +49,7 @@ def backscatter_chapter(
         From `vector_map.map_data`.
     """
     lead = ["A backscatter lidar scans a wake twice; cross-flow winds follow from the two images."]
-    if experiment.wake.turbine:
+    if experiment.wake and experiment.wake.turbine:
         lead.append("The wake is that of a turbine; most of its wind is u, along the axis.")
     elif cores:
         places = ", ".join(
@@ -78,7 +80,9 @@ def backscatter_chapter(
     )
 
 
-def _tables(experiment, metrics):
+def _tables(
+    experiment: ExperimentDescription, metrics: Mapping[str, float]
+) -> Iterator[NumberTable]:
     sources = [
         *([Source.NOISY] if experiment.detector else []),
         Source.BACKSCATTER,
@@ -102,7 +106,7 @@ def _tables(experiment, metrics):
         yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
 
 
-def _noise(experiment, metrics) -> str:
+def _noise(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
     """The components of the images' noise, in one line."""
     line = (
         "Noise of the first image, relative to a pixel's signal (medians): simulation "

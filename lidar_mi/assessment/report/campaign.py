@@ -1,6 +1,6 @@
 """The report of a campaign: one self-contained HTML file, from its data set alone."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import product
 
@@ -77,11 +77,15 @@ def answer(dataset: xr.Dataset) -> str:
     return _lead(dataset, _axes(dataset), _margins(dataset))
 
 
+Margins = Mapping[tuple[str, str], Mapping[str, numbers.Interval]]
+"""Of each quantity, by application and phase of flight."""
+
+
 def _axes(dataset: xr.Dataset) -> dict[str, Axis]:
     return {name: _axis(dataset, name) for name in numbers.knobs(dataset)}
 
 
-def _margins(dataset: xr.Dataset) -> dict:
+def _margins(dataset: xr.Dataset) -> Margins:
     """Margins over members of all rows, by requirement table."""
     known = numbers.metrics_of(dataset)
     return {
@@ -131,16 +135,16 @@ def _points(dataset: xr.Dataset) -> Points:
 
 
 def _links(dataset: xr.Dataset, folder: xr.DataArray) -> xr.DataArray:
-    """The report of a point, where reports are kept; else its folder."""
-    kept = (dataset["status"] == _DONE) & (dataset.attrs.get("keep") == "everything")
+    """The report of a point, where reports are stored; else its folder."""
+    stored = (dataset["status"] == _DONE) & (dataset.attrs.get("keep") == "everything")
     ends = [
-        f"{one}/run/report.html" if keep else f"{one}/"
-        for one, keep in zip(folder.values.ravel(), kept.values.ravel(), strict=True)
+        f"{one}/run/report.html" if there else f"{one}/"
+        for one, there in zip(folder.values.ravel(), stored.values.ravel(), strict=True)
     ]
     return folder.copy(data=np.array(ends, dtype=object).reshape(folder.shape))
 
 
-def _place(dataset: xr.Dataset, at: Mapping) -> str:
+def _place(dataset: xr.Dataset, at: Mapping[str, int]) -> str:
     """A point's coordinates as text."""
     names = (
         [name for name in dataset.coords if dataset[name].dims == (SAMPLE,)]
@@ -158,9 +162,9 @@ def _place(dataset: xr.Dataset, at: Mapping) -> str:
     return ", ".join(words)
 
 
-def _each(array: xr.DataArray) -> Iterator[dict]:
+def _each(array: xr.DataArray) -> Iterator[dict[str, int]]:
     for index in np.ndindex(*array.shape):
-        yield dict(zip(array.dims, index, strict=True))
+        yield dict(zip(map(str, array.dims), index, strict=True))
 
 
 def _descriptions(dataset: xr.Dataset) -> list[str]:
@@ -182,7 +186,7 @@ def _failures(dataset: xr.Dataset) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Mapping) -> str:
+def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Margins) -> str:
     status = dataset["status"]
     runs, done = status.size, int((status == _DONE).sum())
     failed = int((status == _FAILED).sum())
@@ -219,7 +223,9 @@ def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Mapping) -> st
     return " ".join([text, *missed])
 
 
-def _missed(dataset: xr.Dataset, phase: str, rows: Mapping, every: xr.DataArray) -> list[str]:
+def _missed(
+    dataset: xr.Dataset, phase: str, rows: Mapping[str, numbers.Interval], every: xr.DataArray
+) -> list[str]:
     """Where a row is not met, and which by most: each point if they are few, else the counts."""
     where = [at for at in _each(every) if float(every.isel(at)) == 0]
     if not where:
@@ -249,7 +255,7 @@ def _range(dataset: xr.Dataset, name: str) -> str:
 
 
 def _requirement_rows(
-    margins: Mapping, axes: Mapping[str, Axis]
+    margins: Margins, axes: Mapping[str, Axis]
 ) -> list[tuple[str, str, list[str]]]:
     rows = []
     for (application, phase), quantities in margins.items():
@@ -296,7 +302,9 @@ def _boundary_text(margin: Interval, axes: Mapping[str, Axis]) -> str:
     return "; ".join(texts)
 
 
-def _layout(axes: Mapping[str, Axis], dims) -> tuple[list[Axis], Axis | None, list[str]]:
+def _layout(
+    axes: Mapping[str, Axis], dims: Mapping[Hashable, int]
+) -> tuple[list[Axis], Axis | None, list[str]]:
     """Axes of a panel (one or two), the axis whose labels are lines, dims of the panels."""
     numeric = [axis for name, axis in axes.items() if name in dims and not axis.labels]
     labelled = [axis for name, axis in axes.items() if name in dims and axis.labels]
@@ -310,7 +318,7 @@ def _layout(axes: Mapping[str, Axis], dims) -> tuple[list[Axis], Axis | None, li
     return labelled[:1], labelled[1] if len(labelled) > 1 else None, [a.name for a in labelled[2:]]
 
 
-def _panels(dataset: xr.Dataset, names: Sequence[str]) -> list[tuple[str, dict]]:
+def _panels(dataset: xr.Dataset, names: Sequence[str]) -> list[tuple[str, dict[str, int]]]:
     """Title and selection of every panel."""
     found = []
     for index in product(*(range(dataset.sizes[name]) for name in names)):
@@ -319,7 +327,9 @@ def _panels(dataset: xr.Dataset, names: Sequence[str]) -> list[tuple[str, dict]]
     return found
 
 
-def _sweep_block(dataset, key, values, axes, points) -> Block:
+def _sweep_block(
+    dataset: xr.Dataset, key: str, values: xr.DataArray, axes: Mapping[str, Axis], points: Points
+) -> Block:
     label = label_of(values, key)
     values = values.squeeze([d for d in values.dims if d not in axes and d != MEMBER], drop=True)
     flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
@@ -338,7 +348,7 @@ def _sweep_block(dataset, key, values, axes, points) -> Block:
     for name, where in selections[:_PANELS]:
         here = Points(*(p.isel(where) for p in flat))
         if len(at) == 2:
-            drawn.append(figures.draw_map(name, mean.isel(where), *at, here, label, norm))
+            drawn.append(figures.draw_map(name, mean.isel(where), at[0], at[1], here, label, norm))
             continue
         groups = {"": (values.isel(where), here)}
         if lines:
@@ -369,7 +379,7 @@ def _by_member(values: xr.DataArray) -> str:
     )
 
 
-def _member_panel(dataset, values, label) -> list[str]:
+def _member_panel(dataset: xr.Dataset, values: xr.DataArray, label: str) -> list[str]:
     """A metric of every member of a single point."""
     if MEMBER not in values.dims:
         return []
@@ -389,7 +399,9 @@ def _member_panel(dataset, values, label) -> list[str]:
     return [figures.draw_lines("", {"": (each["value"], points)}, along, label)]
 
 
-def _requirement_maps(dataset, margins, axes, points) -> Iterator[Block]:
+def _requirement_maps(
+    dataset: xr.Dataset, margins: Margins, axes: Mapping[str, Axis], points: Points
+) -> Iterator[Block]:
     for (application, phase), rows in margins.items():
         dims = next(iter(rows.values())).mean.sizes
         at, _, rest = _layout(axes, dims) if axes else ([], None, [])
@@ -410,7 +422,7 @@ def _requirement_maps(dataset, margins, axes, points) -> Iterator[Block]:
             if not any(one.mean.notnull().any() for one in here.values()):
                 continue  # of another phase of flight
             spots = Points(*(p.isel(where) for p in flat))
-            drawn.append(figures.draw_requirements(name, here, *at, spots))
+            drawn.append(figures.draw_requirements(name, here, at[0], at[1], spots))
         known = any(np.isfinite(one.low).any() for one in rows.values())
         text = "Green: all rows are met. Lines: where the margin of a row is 0"
         text += (

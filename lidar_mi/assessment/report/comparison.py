@@ -55,16 +55,16 @@ _RETRIEVALS = (
 _METHODS = dict.fromkeys((*ImageMethod, *VolumeMethod))
 
 
-def flat(settings: Mapping, prefix: str = "") -> dict[str, object]:
+def flat(settings: Mapping[str, object], prefix: str = "") -> dict[str, object]:
     """Nested sections as dotted keys; lists are values."""
-    found = {}
+    found: dict[str, object] = {}
     for key, value in settings.items():
         name = f"{prefix}{key}"
         found |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
     return found
 
 
-def differences(settings: Mapping[str, Mapping[str, object]]) -> dict[str, list]:
+def differences(settings: Mapping[str, Mapping[str, object]]) -> dict[str, list[object]]:
     """Keys in which the variants differ, with each one's value (None: has no such key)."""
     keys = dict.fromkeys(key for one in settings.values() for key in one if key != "name")
     values = {key: [one.get(key) for one in settings.values()] for key in keys}
@@ -73,7 +73,7 @@ def differences(settings: Mapping[str, Mapping[str, object]]) -> dict[str, list]
 
 def page(
     name: str,
-    settings: Mapping[str, Mapping],
+    settings: Mapping[str, Mapping[str, object]],
     metrics: Mapping[str, Mapping[str, float]],
     drawn: Sequence[Drawn],
     answers: Mapping[str, Sequence[str]],
@@ -130,7 +130,9 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
             yield from _row(metrics, ring_key(method, centre, 1, measure), title, unit)
 
 
-def _row(metrics: Mapping[str, Mapping[str, float]], key: str, label: str, unit: str):
+def _row(
+    metrics: Mapping[str, Mapping[str, float]], key: str, label: str, unit: str
+) -> Iterator[tuple[str, str, list[str]]]:
     """A metric of all variants, if any of them has it."""
     values = [one.get(key) for one in metrics.values()]
     if any(value is not None for value in values):
@@ -147,7 +149,7 @@ def _named(source: str, method: str) -> str:
     return f"{title}, with the detector's noise" if source == Source.NOISY else title
 
 
-def setting(value) -> str:
+def setting(value: object) -> str:
     """An experiment's value as text, in the units that people use; a dash: there is none."""
     if value is None:
         return "-"

@@ -2,14 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.described import DopplerDescription, RingMethods
 from lidar_mi.assessment.digits import fixed, three, with_error
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.names import REFERENCE_ERRORS, bound_key, reference_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
-from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 
 
-def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn]) -> Chapter:
+def doppler_chapter(
+    doppler: DopplerDescription, metrics: Mapping[str, float], drawn: Sequence[Drawn]
+) -> Chapter:
     """Rings and line-of-sight winds of the Doppler lidar.
 
     Parameters
@@ -68,7 +71,7 @@ def _abbreviations(methods: Sequence[str]) -> str:
     return "; ".join([*used, "peaks are those of the innermost ring, emitted and received"]) + ". "
 
 
-def _doppler_table(settings, centre, metrics):
+def _doppler_table(settings: RingMethods, centre: str, metrics: Mapping[str, float]) -> NumberTable:
     rows = []
     for method in settings.methods:
         for quantity, label in (("std", "standard deviation"), ("bias", "bias")):
@@ -76,8 +79,10 @@ def _doppler_table(settings, centre, metrics):
             for n in settings.averaged:
                 key = ring_key(method, centre, n, quantity)
                 value, error = metrics.get(key), metrics.get(f"{key}_stderr")
-                known = "-" if value is None else fixed(value)
-                shown.append(known if error is None else with_error(value, error))
+                if value is None:
+                    shown.append("-")
+                else:
+                    shown.append(fixed(value) if error is None else with_error(value, error))
             rows.append((f"{READERS[method]}: {label}", "m/s", shown))
     bounds = [fixed(metrics[bound_key(centre, n)]) for n in settings.averaged]
     rows.append(("bound", "m/s", bounds))

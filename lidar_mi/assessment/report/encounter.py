@@ -1,4 +1,4 @@
-"""The chapter of a flight into a wake: the answer first, then what was seen, predicted and felt."""
+"""The chapter of a flight into a wake: the answer, then measurement, prediction and motion."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ _OF_THE_LIDAR = (
     ("look_ahead", "from an estimate to its slab (median)", "s", 1.0),
     ("slabs", "slabs delivered", "", 1.0),
     ("accepted_slabs", "of them with an accepted fit", "", 1.0),
-    ("rejected_slabs", "fits that the track refused", "", 1.0),
+    ("rejected_slabs", "fits that the track rejected", "", 1.0),
     ("slabs_to_track", "accepted slabs to a usable track", "", 1.0),
     ("prediction_error", "error of the predicted rolling moment (rms)", "%", 100.0),
     (
@@ -52,9 +52,9 @@ _FLIGHT = {
 
 _AUTOPILOT = "the autopilot is the controller of the flights with a preview"
 _FLIGHTS_OWN = "“{0}, no preview” is {0}, the controller of the flights with a preview"
-_DEPARTED = "banked beyond 90 degrees, or out of control; the flight ends with this state"
+_UPSET = "banked beyond 90 degrees, or out of control; the flight ends with this state"
 
-# Roll that is no more than this is not worth an answer, rad.
+# Largest roll of a flight that the wake does not affect, rad.
 _NO_ROLL = math.radians(0.01)
 
 
@@ -65,9 +65,9 @@ def encounter_summary(metrics: Mapping[str, float], controller: str = "") -> lis
         (f"{label} / {unit}" if unit else label, *_values(metrics, modes, key, factor))
         for key, label, unit, factor in _OF_A_FLIGHT
     ]
-    rows.append(("departed", *("yes" if _departed(metrics, m) else "no" for m in modes)))
+    rows.append(("flight lost (upset)", *("yes" if _lost(metrics, m) else "no" for m in modes)))
     heads = ("", *(flight_name(mode, controller) for mode in modes))
-    tables = [Table("flights into the wake", rows, heads, f"departed: {_DEPARTED}")]
+    tables = [Table("flights into the wake", rows, heads, f"flight lost: {_UPSET}")]
     lidar = [
         (f"{label} / {unit}" if unit else label, _shown(metrics.get(f"encounter.{key}"), factor))
         for key, label, unit, factor in _OF_THE_LIDAR
@@ -104,7 +104,7 @@ def encounter_chapter(
         for key, label, unit, factor in _OF_A_FLIGHT
     ]
     flights.append(
-        ("departed", "", ["yes" if _departed(metrics, mode) else "no" for mode in modes])
+        ("flight lost (upset)", "", ["yes" if _lost(metrics, mode) else "no" for mode in modes])
     )
     tables = [("The flights", [flight_name(mode, controller) for mode in modes], flights)]
     lidar = [
@@ -117,9 +117,9 @@ def encounter_chapter(
     numbers = Tables(
         heading="Numbers of the flight",
         legend="All flights meet the same wake. Without control, a pilot levels the wings; "
-        f"{_FLIGHTS_OWN.format(controller) if controller else _AUTOPILOT}, told that there is no "
-        f"wake. Departed: {_DEPARTED}. Rolling moment felt: that of wake and ailerons together. "
-        "Errors are those of the track against the truth, in the slab just seen.",
+        f"{_FLIGHTS_OWN.format(controller) if controller else _AUTOPILOT}, without "
+        f"information on the wake. Flight lost: {_UPSET}. Rolling moment felt: that of wake and "
+        "ailerons together. Errors are those of the track against the truth, in the newest slab.",
         tables=tables,
     )
     return Chapter(
@@ -128,9 +128,9 @@ def encounter_chapter(
 
 
 def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list[str]:
-    """What a reader wants to know first, in sentences.
+    """The answer in sentences.
 
-    How far the aircraft rolls in every flight, how early the lidar sees the wake, what limits it.
+    The roll of the aircraft in every flight, the time of the first detection, the limits.
     """
     off, blind, ours, perfect = (metrics.get(f"encounter.{m}.largest_roll") for m in FLIGHTS)
     if off is None:
@@ -142,14 +142,14 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
             "missed, or lies across the path, where both wings meet the same wind."
         ]
     answer = f"Without control, the wake rolls the aircraft by {_degrees(off)}"
-    if _departed(metrics, "off"):
+    if _lost(metrics, "off"):
         answer = "Without control, the wake upsets the aircraft"
     if blind is not None:
         steers = controller or "the same autopilot"
         answer += f"; with {steers}, but no preview, by {_degrees(blind)}"
     if ours is not None:
         answer += f"; with the lidar by {_degrees(ours)}"
-        if _departed(metrics, "feedforward"):
+        if _lost(metrics, "feedforward"):
             answer += " (the flight is lost)"
     if perfect is not None:
         answer += f"; with perfect preview by {_degrees(perfect)}"
@@ -173,7 +173,7 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
     lead = [answer]
     if "encounter.lead_time" in metrics:
         lead.append(
-            f"A track that can be steered by is there after "
+            f"The track is usable after "
             f"{metrics['encounter.slabs_to_track']:.0f} slabs with both vortices, "
             f"{three(metrics['encounter.lead_time'])} s before the wake is felt. The rolling "
             f"moment predicted from it is wrong by "
@@ -184,16 +184,16 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
 
 
 def _limits(metrics: Mapping[str, float]) -> list[str]:
-    """What leaves a rest, in a sentence."""
+    """Causes of the remaining rolling moment, in a sentence."""
     perfect = metrics.get("encounter.perfect.residual_moment")
     ours = metrics.get("encounter.feedforward.residual_moment")
     if perfect is None or ours is None:
         return []
     return [
         f"The rolling moment felt is {three(ours)} times the wake's with the lidar and "
-        f"{three(perfect)} times with perfect preview (rms). What is left then is beyond the "
-        "rate and the deflection of the ailerons, or planned: the plan is for small roll angles, "
-        "and may bank against the wake before it comes. The difference is the lidar's."
+        f"{three(perfect)} times with perfect preview (rms). The latter is beyond the rate "
+        "and the deflection of the ailerons, or planned: the plan is for small roll angles, and "
+        "may bank against the wake before the encounter. The difference is the lidar's."
     ]
 
 
@@ -206,18 +206,20 @@ def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> Ta
         tables.append((title, ["required", "in flight", "margin", ""], rows))
     return Tables(
         heading="Requirements, as measured in flight",
-        legend="Range: what the aircraft still flies from the moment at which an estimate is there "
-        "to its slab. Errors of v and w are those of valid vectors against the truth; a lidar "
+        legend="Range: distance of the aircraft to the slab when its estimate is delivered. "
+        " Errors of v and w are those of valid vectors against the truth; a lidar "
         "without Doppler measurements has no u.",
         tables=tables,
     )
 
 
-def _values(metrics, modes, key, factor) -> list[str]:
+def _values(
+    metrics: Mapping[str, float], modes: Sequence[str], key: str, factor: float
+) -> list[str]:
     return [_shown(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
 
 
-def _departed(metrics, mode) -> bool:
+def _lost(metrics: Mapping[str, float], mode: str) -> bool:
     return metrics.get(f"encounter.{mode}.departed", 0) > 0
 
 

@@ -12,7 +12,7 @@ from lidar_mi.assessment.metrics.error_budget import (
     causes_of,
     component_rmse,
 )
-from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 
 # A cause with a smaller fraction of the mean square error is not named.
 _LEAST = 0.1
@@ -28,7 +28,7 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
     if f"outside_cores.{causes[0]}.fraction" in budget:
         place, where = "outside_cores.", " beyond two core radii"
     fractions = {cause: budget[f"{place}{cause}.fraction"] for cause in causes}
-    ranked = sorted(causes, key=fractions.get, reverse=True)
+    ranked = sorted(causes, key=lambda cause: fractions[cause], reverse=True)
     parts = [
         f"{CAUSES[c]} ({whole_percent(fractions[c])}" for c in ranked if fractions[c] >= _LEAST
     ][:3]
@@ -80,7 +80,7 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
     return Chapter("Error budget of the cross-flow wind", lead, drawn, numbers)
 
 
-def _table(budget: Mapping[str, float], method: str):
+def _table(budget: Mapping[str, float], method: str) -> NumberTable:
     def values(cause: str) -> list[str]:
         shown = []
         for place in PLACES:

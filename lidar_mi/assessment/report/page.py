@@ -5,11 +5,12 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
 from markupsafe import Markup
 
+from lidar_mi.assessment.described import Encounter, ExperimentDescription, Platform
 from lidar_mi.assessment.digits import percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
@@ -18,13 +19,16 @@ from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.units import shown
 
+NumberTable = tuple[str, Sequence[str], Sequence[tuple[str, str, Sequence[str]]]]
+"""(title, heads, rows), a row being (name, unit, values as text)."""
+
 
 class Tables(NamedTuple):
-    """Tables under one heading: (title, heads, rows), a row being (name, unit, values as text)."""
+    """Tables under one heading."""
 
     heading: str
     legend: str
-    tables: Sequence[tuple[str, Sequence[str], Sequence[tuple[str, str, Sequence[str]]]]]
+    tables: Sequence[NumberTable]
 
 
 class Film(NamedTuple):
@@ -77,12 +81,12 @@ class Chapter(NamedTuple):
     drawn: Sequence[Drawn]
     numbers: Tables
     verdict: Tables | None = None
-    vectors: dict | None = None
+    vectors: dict[str, Any] | None = None
     film: Film | None = None
 
 
 def page(
-    experiment,
+    experiment: ExperimentDescription,
     resolved: str,
     versions: Mapping[str, str],
     metrics: Mapping[str, float],
@@ -145,7 +149,7 @@ def template(name: str) -> jinja2.Template:
     ).get_template(name)
 
 
-def _packed(film: Film) -> dict:
+def _packed(film: Film) -> dict[str, Any]:
     """A film as the template takes it; shown first is the frame in the middle."""
     frames = [
         {"data": base64.b64encode(data).decode(), "caption": text} for data, text in film.frames
@@ -175,7 +179,7 @@ def script(name: str) -> Markup:
 
 
 def simulated(
-    experiment, versions: Mapping[str, str], metrics: Mapping[str, float]
+    experiment: ExperimentDescription, versions: Mapping[str, str], metrics: Mapping[str, float]
 ) -> list[tuple[str, str]]:
     """What was simulated, as (name, text): wake, instruments, seed, versions."""
     rows = []
@@ -203,8 +207,9 @@ def simulated(
             scale = f"outer scale {wake.texture.outer_scale:g} m"
             texture = f"texture of {percent(wake.texture.rms)} rms, {scale}"
         rows.append(("wake", f"{flow}; {texture}"))
-        rows.append(_flight(experiment) if experiment.encounter else _platform(experiment))
-        distance = experiment.encounter.look_ahead if experiment.encounter else scan.range
+        flight = experiment.encounter
+        rows.append(_flight(flight) if flight else _platform(experiment.platform))
+        distance = flight.look_ahead if flight else scan.range
         beam = (
             f"{shown(lidar.wavelength, 'nm')}, {shown(lidar.pulse_energy, 'mJ')}, "
             f"divergence {shown(lidar.divergence_full, 'mrad')}, "
@@ -223,17 +228,17 @@ def simulated(
         methods = ", ".join(METHOD_NAMES[name] for name in chosen.methods)
         rows.append(("winds by", methods))
     if experiment.doppler:
-        lidar = experiment.doppler.lidar
+        other = experiment.doppler.lidar
         beam = (
-            f"{shown(lidar.wavelength, 'nm')}, {shown(lidar.pulse_energy, 'mJ')}, "
-            f"{lidar.range_bin:g} m at {lidar.range:g} m, in air of {lidar.altitude:g} m altitude"
+            f"{shown(other.wavelength, 'nm')}, {shown(other.pulse_energy, 'mJ')}, "
+            f"{other.range_bin:g} m at {other.range:g} m, in air of {other.altitude:g} m altitude"
         )
         rows.append(("Doppler lidar", beam))
     if experiment.sensor:
-        scan = experiment.sensor.directions
+        lines = experiment.sensor.directions
         both = (
-            f"{scan.columns} x {scan.rows} lines of sight of {experiment.sensor.pulses} pulses, v "
-            f"and w by {METHOD_NAMES[experiment.sensor.method]}"
+            f"{lines.columns} x {lines.rows} lines of sight of {experiment.sensor.pulses} pulses, "
+            f"v and w by {METHOD_NAMES[experiment.sensor.method]}"
         )
         rows.append(("both together", both))
     rows.append(("seed", str(experiment.seed)))
@@ -241,13 +246,11 @@ def simulated(
     return rows
 
 
-def _platform(experiment) -> tuple[str, str]:
-    platform = experiment.platform
+def _platform(platform: Platform) -> tuple[str, str]:
     return "platform", f"{shown(platform.speed, 'm/s')}, images {shown(platform.dt, 's')} apart"
 
 
-def _flight(experiment) -> tuple[str, str]:
-    encounter = experiment.encounter
+def _flight(encounter: Encounter) -> tuple[str, str]:
     path, aircraft = encounter.path, encounter.aircraft
     kind = (
         "a rigid aircraft that rolls" if aircraft.model == "roll" else f"JSBSim's {aircraft.model}"

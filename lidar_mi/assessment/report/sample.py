@@ -15,7 +15,7 @@ from lidar_mi.assessment.metrics.pareto import pareto_front
 from lidar_mi.assessment.metrics.sensitivity import SobolIndices, sobol_indices
 from lidar_mi.assessment.report.block import Block, label_of
 
-# Objectives of a Pareto front beside the error: key, whether larger is better.
+# Further objectives of a Pareto front than the error: key, whether larger is better.
 _OBJECTIVES = (
     ("lidar.pulse_energy", False),
     ("scan.range", True),
@@ -55,7 +55,13 @@ def sample_blocks(
             yield from _fronts(key, known, axes, places, points)
 
 
-def _fronts(key, known, axes, places, points) -> Iterator[Block]:
+def _fronts(
+    key: str,
+    known: Mapping[str, xr.DataArray],
+    axes: Mapping[str, Axis],
+    places: Mapping[str, np.ndarray],
+    points: Points,
+) -> Iterator[Block]:
     varied = [(name, larger) for name, larger in _OBJECTIVES if name in axes]
     if not varied:
         return
@@ -130,9 +136,9 @@ def _sensitivity_text(found: SobolIndices) -> str:
     )
     if not found.determined:
         return f"Sobol' indices are undetermined: {found.reason}.{luck}"
-    left = max(0.0, 1 - found.explained)
+    unexplained = max(0.0, 1 - found.explained)
     return (
         f"Sobol' indices with 95 % intervals, from {found.points} points. The knobs explain "
-        f"{percent(found.explained)} of the variance (cross-validated Q²); {percent(left)} is luck "
-        f"or too sharp for so few points.{luck}"
+        f"{percent(found.explained)} of the variance (cross-validated Q²); "
+        f"{percent(unexplained)} is luck or too sharp for so few points.{luck}"
     )

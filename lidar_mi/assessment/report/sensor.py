@@ -1,21 +1,24 @@
 """The combined sensor's chapter of a report: compliance, errors, resources."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
-from lidar_mi.assessment.metrics.requirements import as_rows, fulfilled, look_ahead
+from lidar_mi.assessment.metrics.requirements import Finding, Judged, as_rows, fulfilled, look_ahead
 from lidar_mi.assessment.metrics.sensor import without_skill
-from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
+from lidar_mi.instrument.doppler_scan import PlatformErrors
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 
 
 def sensor_chapter(
-    experiment,
+    experiment: ExperimentDescription,
     metrics: Mapping[str, float],
-    judged: Sequence[tuple],
+    judged: Judged,
     drawn: Sequence[Drawn],
-    vectors: dict | None = None,
+    vectors: dict[str, Any] | None = None,
 ) -> Chapter:
     """Winds of both lidars together, and their compliance with requirements.
 
@@ -64,7 +67,7 @@ def sensor_chapter(
             purpose,
             warning,
             *_limit_of_u(metrics),
-            *_not_stated(experiment.sensor.errors),
+            *(_not_stated(experiment.sensor.errors) if experiment.sensor else []),
             *_costs(metrics),
         ],
         drawn=drawn,
@@ -103,19 +106,19 @@ _CAUSES = {
 }
 
 
-def _but(findings, unskilled) -> str:
+def _but(findings: Sequence[Finding], unskilled: Sequence[str]) -> str:
     """Components of a table whose error is as large as they vary."""
     found = [name for name in unskilled if any(f.quantity == f"error_{name}" for f in findings)]
     return f", but {', '.join(found)} without skill" if found else ""
 
 
-def _limit_of_u(metrics) -> list[str]:
+def _limit_of_u(metrics: Mapping[str, float]) -> list[str]:
     """The error budget of u, in a sentence; empty where it is not known."""
     keys = {c: f"sensor.error_budget.{c}.fraction_u" for c in _CAUSES}
     fractions = {c: metrics[key] for c, key in keys.items() if key in metrics}
     if not fractions:
         return []
-    ranked = sorted(fractions, key=fractions.get, reverse=True)
+    ranked = sorted(fractions, key=lambda cause: fractions[cause], reverse=True)
     parts = [
         f"{_CAUSES[c]} ({percent(min(fractions[c], 1))}" for c in ranked if fractions[c] >= _LEAST
     ]
@@ -127,9 +130,9 @@ def _limit_of_u(metrics) -> list[str]:
     return [f"{text})" + (f"; {' or '.join(little)}: negligible." if little else ".")]
 
 
-def _not_stated(errors) -> list[str]:
+def _not_stated(errors: PlatformErrors) -> list[str]:
     """That the platform has errors which standard errors do not include."""
-    if errors == type(errors)():
+    if errors == PlatformErrors():
         return []
     text = (
         "The platform's attitude, pointing or speed differs from the assumed one (sensor.errors). "
@@ -138,7 +141,7 @@ def _not_stated(errors) -> list[str]:
     return [text]
 
 
-def _costs(metrics) -> list[str]:
+def _costs(metrics: Mapping[str, float]) -> list[str]:
     needed = metrics.get("sensor.doppler.pulses_needed")
     text = (
         f"The Doppler lidar's directions require {_rate(metrics, 'doppler')}, and give "
@@ -168,7 +171,7 @@ def _costs(metrics) -> list[str]:
     return [text, *safety]
 
 
-def _rate(metrics, name: str) -> str:
+def _rate(metrics: Mapping[str, float], name: str) -> str:
     """Pulse rate of all directions of a lidar, its power, and beams needed at the same time."""
     rate, power, beams = (
         metrics[f"sensor.{name}.{key}"] for key in ("pulses_per_second", "average_power", "beams")
@@ -177,7 +180,7 @@ def _rate(metrics, name: str) -> str:
     return f"{three(rate)} pulses per second{at_once}, {three(power)} W of light"
 
 
-def _numbers(metrics):
+def _numbers(metrics: Mapping[str, float]) -> NumberTable:
     rows = []
     for key, label, unit in (
         ("rmse_{}", "rms error", "m/s"),

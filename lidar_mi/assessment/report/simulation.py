@@ -1,10 +1,11 @@
-"""What is said of the simulation's own noise: in the answer, in warnings, beside the number."""
+"""Sentences on the simulation's own noise: in the answer, in warnings, with the number."""
 
 from collections.abc import Callable, Mapping
 
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.campaign import metrics_of
@@ -19,7 +20,7 @@ _NEARLY_ALL = 0.9
 _LEAST_PART = 0.1
 
 
-def simulation_sentence(experiment, metrics: Mapping[str, float]) -> str:
+def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
     """Which part of the wind's error is the simulation's; empty where it is as small as asked for.
 
     Of volumes, whose winds are not retrieved once more, and where no vector is valid, which part of
@@ -57,16 +58,16 @@ def simulation_sentence(experiment, metrics: Mapping[str, float]) -> str:
         f"{whole_percent(part.fraction)} by {METHOD_NAMES[part.method]}" for part in large
     )
     beyond = " beyond two core radii" if large[0].place else ""
-    beside = ""
+    ratio = ""
     if _FRACTION in metrics:
-        beside = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
+        ratio = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
     return (
         f"Of the mean square error of v and w{beyond}, noise of the simulation, not of the lidar, "
-        f"makes {named} ({number}{beside})."
+        f"makes {named} ({number}{ratio})."
     )
 
 
-def simulation_remark(experiment, metrics: Mapping[str, float]) -> str:
+def simulation_remark(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
     """The same as a warning, with what to set; empty where the answer has no such sentence."""
     sentence = simulation_sentence(experiment, metrics)
     if not sentence:
@@ -82,7 +83,7 @@ def simulation_remark(experiment, metrics: Mapping[str, float]) -> str:
     return f"render.samples_per_beam: {text}; expected {expected}{automatic}"
 
 
-def samples_of(experiment, metrics: Mapping[str, float]) -> str:
+def samples_of(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
     """The number of samples of a run's images, and whether it was chosen."""
     asked = experiment.render.samples_per_beam
     number = f"{metrics.get(_SAMPLES, asked):.4g}" if _SAMPLES in metrics else str(asked)
@@ -118,14 +119,14 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
     )
 
 
-def _without_vectors(experiment, metrics: Mapping[str, float]) -> bool:
+def _without_vectors(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> bool:
     """Whether no method has a valid vector from the most complete images."""
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
     methods = experiment.retrieval.methods
     return not any(metrics.get(wind_key(source, m, "valid_fraction")) for m in methods)
 
 
-def _needed(experiment, metrics: Mapping[str, float]) -> float:
+def _needed(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> float:
     """Samples per beam that are enough; 0: not known, as hardly any error is of something else."""
     samples, allowed = metrics[_SAMPLES], experiment.render.monte_carlo_fraction
     if _FRACTION in metrics:

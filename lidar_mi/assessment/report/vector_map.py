@@ -1,6 +1,7 @@
 """Vectors as data for the report's interactive map."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,7 +14,7 @@ _COLUMNS = 55
 
 def map_data(
     wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core], colour: str = ""
-) -> dict:
+) -> dict[str, Any]:
     """Every n-th vector with its truth, standard error and flag, ready for JSON.
 
     Parameters

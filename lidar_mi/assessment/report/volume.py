@@ -1,17 +1,20 @@
 """The chapter of a report on wind in three dimensions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
+from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import fixed, in_row, percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.volume import COMPONENTS
-from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.assessment.report.simulation import samples_of
 
 
-def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Drawn]) -> Chapter:
+def volume_chapter(
+    experiment: ExperimentDescription, metrics: Mapping[str, float], drawn: Sequence[Drawn]
+) -> Chapter:
     """Volumes of the backscatter lidar and the winds retrieved from them.
 
     Parameters
@@ -41,10 +44,12 @@ def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Dra
     return Chapter("Wind in three dimensions", [purpose, noise], drawn, numbers)
 
 
-def _tables(experiment, metrics):
+def _tables(
+    experiment: ExperimentDescription, metrics: Mapping[str, float]
+) -> Iterator[NumberTable]:
     sources = [Source.BACKSCATTER, *([Source.NOISY] if experiment.detector else [])]
     for source in sources:
-        for method in experiment.volume.methods:
+        for method in experiment.volume.methods if experiment.volume else ():
             rows = []
             for key, label, unit in (
                 ("rmse_{}", "rms error", "m/s"),

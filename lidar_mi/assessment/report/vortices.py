@@ -1,8 +1,7 @@
 """The vortices' chapter of a report: the fitted pairs and the truth."""
 
+import math
 from collections.abc import Mapping, Sequence
-
-import numpy as np
 
 from lidar_mi.assessment.digits import fixed, with_error
 from lidar_mi.assessment.figures.plates import Drawn
@@ -93,21 +92,19 @@ def vortex_chapter(
     return Chapter("The vortices", lead, drawn, numbers)
 
 
-def _verdict(metrics, name) -> str | None:
+def _verdict(metrics: Mapping[str, float], name: str) -> str | None:
     """Errors of circulations and positions of a fit, in one sentence."""
-    true, found = (
-        {key: metrics.get(vortex_key(which, key)) for key, _, _ in _ROWS}
-        for which in ("truth", name)
-    )
-    sides = [side for side in ("port", "starboard") if true[f"{side}_circulation_5_15"] is not None]
-    if len(sides) < 2:
+    sides = ("port", "starboard")
+    circulations = [f"{side}_circulation_5_15" for side in sides]
+    if any(metrics.get(vortex_key("truth", key)) is None for key in circulations):
         return None
-    deviations = [
-        abs(found[f"{side}_circulation_5_15"] / true[f"{side}_circulation_5_15"] - 1)
-        for side in sides
-    ]
+
+    def both(key: str) -> tuple[float, float]:
+        return metrics[vortex_key(name, key)], metrics[vortex_key("truth", key)]
+
+    deviations = [abs(found / true - 1) for found, true in map(both, circulations)]
     places = [
-        np.hypot(*(found[f"{side}_{axis}"] - true[f"{side}_{axis}"] for axis in "yz"))
+        math.hypot(*(found - true for found, true in (both(f"{side}_y"), both(f"{side}_z"))))
         for side in sides
     ]
     return (
@@ -117,7 +114,7 @@ def _verdict(metrics, name) -> str | None:
     )
 
 
-def _shown(metrics, key: str) -> str:
+def _shown(metrics: Mapping[str, float], key: str) -> str:
     value, stderr = metrics.get(key), metrics.get(f"{key}_stderr")
     if value is None:
         return "-"

@@ -119,7 +119,7 @@ def fit_channels(
     return ChannelFit(v, std[:, 0], level, warm, dusty, std, chi_square)
 
 
-def _checked(counts, model):
+def _checked(counts: torch.Tensor, model: ChannelModel) -> torch.Tensor:
     counts = torch.as_tensor(counts).double()
     counts = counts[None] if counts.ndim == 1 else counts
     if counts.ndim != 2 or counts.shape[1] != len(model.aerosol) or not len(counts):
@@ -133,10 +133,12 @@ def _checked(counts, model):
     return counts
 
 
-def _start(model, counts, noise, expected):
+def _start(
+    model: ChannelModel, counts: torch.Tensor, noise: PixelNoise, expected: torch.Tensor
+) -> torch.Tensor:
     """The best of evenly spaced speeds, each with its own level."""
     number = STARTS * model.aerosol.shape[1]
-    low, high = model.limits
+    low, high = model.span
     tried = expected.repeat(number, 1)
     tried[:, 0] = low + (high - low) * (torch.arange(number) + 0.5) / number
     shape = mean_and_jacobian(model, tried)[1][:, 1]  # by the level
@@ -159,9 +161,17 @@ def _start(model, counts, noise, expected):
     return parameters
 
 
-def _scoring(model, counts, parameters, noise, indices, known, expected):
+def _scoring(
+    model: ChannelModel,
+    counts: torch.Tensor,
+    parameters: torch.Tensor,
+    noise: PixelNoise,
+    indices: list[int],
+    known: torch.Tensor,
+    expected: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Fisher scoring: weighted least squares, its weights from the mean of the step before."""
-    low, high = model.limits
+    low, high = model.span
     # a step of more than a radian of the highest harmonic leaves the linear range
     longest = torch.full_like(parameters[0], math.inf)
     longest[0] = model.period / (2 * math.pi * (model.aerosol.shape[1] - 1))

@@ -12,8 +12,7 @@ products, so that nothing here is an integral.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -30,20 +29,22 @@ and the fraction of the light that aerosol scatters."""
 class ChannelModel:
     """The properties of a receiver and a line on which the signals depend.
 
+    Arrays and numbers are converted to tensors.
+
     Parameters
     ----------
-    molecules : array (temperatures, channels, K) or (channels, K), complex
+    molecules : tensor (temperatures, channels, K) or (channels, K), complex
         M_n of each channel for each of the ``temperatures``, as fractions of the light.
-    aerosol : array (channels, K), complex
+    aerosol : tensor (channels, K), complex
         P_n.
     period : float
         Speed that moves the line by the period of the transmission, m/s.
     temperatures : array (temperatures,)
         K, ascending, a few nodes: harmonics between them follow the polynomial through all. One
         node, or none given: the temperature is not a parameter.
-    background : float or array (channels,)
+    background : tensor (channels,) or ()
         Electrons of every channel that are not the laser's, known.
-    pixels : float or array (channels,)
+    pixels : tensor (channels,) or ()
         Pixels read out and added in every channel.
     limits : (float, float), optional
         Least and largest speed, m/s, between which the signals are those of one speed; default:
@@ -55,20 +56,22 @@ class ChannelModel:
         Shapes that do not belong together, numbers out of range.
     """
 
-    molecules: np.ndarray
-    aerosol: np.ndarray
+    molecules: torch.Tensor
+    aerosol: torch.Tensor
     period: float
-    temperatures: Sequence[float] = ()
-    background: float | np.ndarray = 0.0
-    pixels: float | np.ndarray = 1.0
+    temperatures: np.ndarray = field(default_factory=lambda: np.empty(0))
+    background: torch.Tensor = field(default_factory=lambda: torch.zeros(()))
+    pixels: torch.Tensor = field(default_factory=lambda: torch.ones(()))
     limits: tuple[float, float] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not (math.isfinite(self.period) and self.period > 0):
             raise InputError(f"period: {self.period!r} m/s is not allowed; expected above 0")
-        limits = self.limits or (-self.period / 2, self.period / 2)
-        if not (all(map(math.isfinite, limits)) and limits[0] < limits[1]):
-            raise InputError(f"limits: {limits} m/s are not allowed; expected two ascending speeds")
+        low, high = self.span
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise InputError(
+                f"limits: {self.span} m/s are not allowed; expected two ascending speeds"
+            )
         temperatures = np.atleast_1d(np.asarray(self.temperatures, float))
         if not temperatures.size:
             temperatures = np.array([np.nan])
@@ -92,20 +95,25 @@ class ChannelModel:
                     f"{name}: expected finite harmonics and a mean transmission above 0"
                 )
         channels = np.ones(len(aerosol))
-        values = {
-            "molecules": torch.from_numpy(molecules),
-            "aerosol": torch.from_numpy(aerosol),
-            "temperatures": temperatures,
-            "background": torch.from_numpy(channels * np.asarray(self.background)),
-            "pixels": torch.from_numpy(channels * np.asarray(self.pixels)),
-            "limits": limits,
-        }
-        if not (torch.isfinite(values["background"]) & (values["background"] >= 0)).all():
+        background = channels * np.asarray(self.background)
+        if not (np.isfinite(background) & (background >= 0)).all():
             raise InputError(f"background: {self.background!r} is not allowed; expected 0 or more")
-        if not (torch.isfinite(values["pixels"]) & (values["pixels"] > 0)).all():
+        pixels = channels * np.asarray(self.pixels)
+        if not (np.isfinite(pixels) & (pixels > 0)).all():
             raise InputError(f"pixels: {self.pixels!r} is not allowed; expected above 0")
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "temperatures", temperatures)
+        for name, array in (
+            ("molecules", molecules),
+            ("aerosol", aerosol),
+            ("background", background),
+            ("pixels", pixels),
+        ):
+            object.__setattr__(self, name, torch.from_numpy(array))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Least and largest speed, m/s: the limits, or half the period to either side."""
+        return self.limits or (-self.period / 2, self.period / 2)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -155,19 +163,20 @@ def mean_and_jacobian(
     turns = torch.polar((1 + n.clamp(max=1)).expand(len(v), -1), v * rate)
     nodes, slopes = model.weights(temperature[:, 0])
 
-    def fractions(waves):
+    def fractions(waves: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the light, of every channel: of molecules at the nodes, of aerosol."""
         clear = torch.einsum("tck,ik->itc", model.molecules, waves).real
         return clear, torch.einsum("ck,ik->ic", model.aerosol, waves).real
 
-    def mixed(clear, dusty, weights):
+    def mixed(clear: torch.Tensor, dusty: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         return (1 - aerosol) * torch.einsum("it,itc->ic", weights, clear) + aerosol * dusty
 
     clear, dusty = fractions(turns)
+    by_speed = fractions(1j * rate * turns)
     shape = mixed(clear, dusty, nodes)
     return level * shape + model.background, torch.stack(
         [
-            level * mixed(*fractions(1j * rate * turns), nodes),
+            level * mixed(*by_speed, nodes),
             shape,
             level * mixed(clear, torch.zeros_like(dusty), slopes),
             level * (dusty - torch.einsum("it,itc->ic", nodes, clear)),

@@ -35,7 +35,7 @@ class Displacement(NamedTuple):
     flag: torch.Tensor
     covariance: torch.Tensor | None = None
     quantities: Mapping[str, Quantity] = MappingProxyType({})
-    attributes: Mapping[str, str] = MappingProxyType({})
+    attributes: Mapping[str, str | float] = MappingProxyType({})
 
     @property
     def dz(self) -> torch.Tensor:

@@ -6,6 +6,7 @@ components on the images' grid, with their covariance.
 """
 
 import enum
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.common_error import ROTATION
 from lidar_mi.retrieval.lines.common_time import at_common_time
 from lidar_mi.retrieval.lines.crossflow import (
+    Crossflow,
     apparent_slopes,
     checked_crossflow,
     window_overlap,
@@ -23,6 +25,7 @@ from lidar_mi.retrieval.lines.crossflow import (
 )
 from lidar_mi.retrieval.lines.grid_lines import (
     CHUNK_NUMBERS,
+    GridLines,
     covariance_of_lines,
     covariance_with_nodes,
     crossflow_weights,
@@ -30,7 +33,12 @@ from lidar_mi.retrieval.lines.grid_lines import (
     lines_on_grid,
     with_slopes,
 )
-from lidar_mi.retrieval.lines.u_prior import correlation, probable_statistics, relative_std
+from lidar_mi.retrieval.lines.u_prior import (
+    Statistics,
+    correlation,
+    probable_statistics,
+    relative_std,
+)
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, error_variables, flag_attributes
 from lidar_mi.retrieval.threads import threads_for
 
@@ -122,8 +130,8 @@ def combine(
         weight: there v and w are assumed to be the mean of the others, with twice their standard
         deviation. Attributes: `lines_used`, `misfit` (of the lines, 1 where errors are as stated),
         and `u_std`, `u_length`, `u_power` and `u_exponent` of largest evidence. With a common error
-        of v and w `v_common_stderr`, `w_common_stderr`, what is left of it, and if it was estimated
-        `v_offset`, `w_offset` (m s-1): what was subtracted from all vectors of the images. `time`
+        of v and w `v_common_stderr`, `w_common_stderr`, its standard error now, and if it was
+        estimated `v_offset`, `w_offset` (m s-1), subtracted from all vectors of the images. `time`
         is that of the wind (s), where vectors have times; the attribute `drift` (m s-1) is as used.
 
     Raises
@@ -166,13 +174,14 @@ def combine(
         window = window_size(crossflow)
     elif not window >= 0:
         raise InputError(f"window: {window} m is not allowed; expected >= 0 m")
-    overlap = [window_overlap(axis, window) for axis in (z, y)]
+    overlap = window_overlap(z, window), window_overlap(y, window)
 
     forward, across = lines.forward.sum(1), lines.direction[:, 1:]
     mean = np.einsum("lk,lkc->lc", lines.weight, field.value[lines.z, lines.y])
     residual = lines.along - (across * mean).sum(1)
     without_image = (lines.weight * ~field.valid[lines.z, lines.y]).sum(1)
     fixed = lines.covariance + np.diag(without_image**2 * (across**2 @ field.prior_std**2))
+    # the mean of u is unknown: a prior so wide that it has no weight
     fixed += _MEAN_STD**2 * np.outer(forward, forward)
     fixed += covariance_of_lines(lines, crossflow_weights(field, lines), *overlap).sum(0)
     # the lines' velocities per m/s of an error that all vectors share
@@ -182,11 +191,12 @@ def combine(
 
     spacing = line_spacing(lines, z, y)
     relative_stds = relative_std(field, lines, z, y, spacing, u_power)
-    given = u_std, u_length, u_exponent
-    found, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, given)
+    known = u_std, u_length, u_exponent
+    found, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, known)
     valid = field.valid
     wind = np.zeros((*valid.shape, 3))
     covariance = np.zeros((*valid.shape, 3, 3))
+    # in chunks of rows: the covariance of nodes and lines would fill the memory
     rows = max(1, int(CHUNK_NUMBERS / (3 * len(residual) * len(y))))
     for start in range(0, len(z), rows):
         chunk = slice(start, start + rows)
@@ -222,8 +232,10 @@ def combine(
     return combined
 
 
-def _with_common(combined: xr.Dataset, field, offset, stderr) -> xr.Dataset:
-    """The data set with the error that the images' vectors share, and what is left of it."""
+def _with_common(
+    combined: xr.Dataset, field: Crossflow, offset: np.ndarray, stderr: np.ndarray
+) -> xr.Dataset:
+    """The data set with the error common to the images' vectors, after its correction."""
     for index, name in enumerate(COMPONENTS[1:]):
         about = {"long_name": f"part of {name}_stderr that all vectors share", "units": "m s-1"}
         combined[f"{name}_common_stderr"] = (), stderr[index], about
@@ -233,7 +245,18 @@ def _with_common(combined: xr.Dataset, field, offset, stderr) -> xr.Dataset:
     return combined
 
 
-def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, shared, z, y):
+def _posterior(
+    rows: slice,
+    field: Crossflow,
+    lines: GridLines,
+    overlap: tuple[np.ndarray, np.ndarray],
+    choices: Sequence[Statistics],
+    relative_stds: Mapping[float, np.ndarray],
+    residual: np.ndarray,
+    shared: np.ndarray,
+    z: np.ndarray,
+    y: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Wind (z, y, 3) and covariance (z, y, 3, 3) at the nodes of some rows."""
     root = field.root[rows]
     across = covariance_with_nodes(rows, lines, crossflow_weights(field, lines), *overlap)
@@ -270,25 +293,28 @@ def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, sh
         inverse += choice.probability * choice.white.T @ choice.white
         if field.common.any() and not field.estimated:
             # an error that the estimate does not allow for (Schmidt 1966)
-            seen = np.concatenate([(gain @ shared)[None], across @ of_lines[:, 1:]])
-            left = np.eye(3)[:, 1:] - np.moveaxis(seen, 0, -2)
-            covariance += choice.probability * (left * field.common**2) @ left.swapaxes(-1, -2)
+            response = np.concatenate([(gain @ shared)[None], across @ of_lines[:, 1:]])
+            effect = np.eye(3)[:, 1:] - np.moveaxis(response, 0, -2)
+            covariance += choice.probability * (effect * field.common**2) @ effect.swapaxes(-1, -2)
+    # mixture of the choices: mean of their covariances, plus the scatter of their means
     covariance[..., 1:, 1:] += known - np.einsum("azyl,bzyl->zyab", across @ inverse, across)
     mean = np.tensordot(probability, wind, 1)
-    apart = wind - mean
-    return mean, covariance + np.einsum("n,nzya,nzyb->zyab", probability, apart, apart)
+    off = wind - mean
+    return mean, covariance + np.einsum("n,nzya,nzyb->zyab", probability, off, off)
 
 
-def _common(field, choices, residual, shared) -> tuple[np.ndarray, np.ndarray]:
-    """The error (2,) that all vectors of the images share, and its standard error, m/s."""
+def _common(
+    field: Crossflow, choices: Sequence[Statistics], residual: np.ndarray, shared: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The error (2,) common to all vectors of the images, and its standard error, m/s."""
     if not field.estimated:
         return np.zeros(2), field.common
     means, squares = [], []
     for choice in choices:
-        seen, data = (choice.white @ part for part in (shared, residual))
-        gain = field.common[:, None] ** 2 * seen.T
+        response, data = (choice.white @ part for part in (shared, residual))
+        gain = field.common[:, None] ** 2 * response.T
         means.append(-gain @ data)
-        squares.append(field.common**2 - (gain @ seen).diagonal() * field.common**2)
+        squares.append(field.common**2 - (gain @ response).diagonal() * field.common**2)
     probability = np.array([choice.probability for choice in choices])
     mean = probability @ means
     return mean, np.sqrt(probability @ (np.array(squares) + (np.array(means) - mean) ** 2))
@@ -305,7 +331,14 @@ def _inside(middles: np.ndarray, z: np.ndarray, y: np.ndarray) -> np.ndarray:
     return (places @ sides[:, :2].T + sides[:, 2] <= 1e-9).all(-1)
 
 
-def _dataset(crossflow, wind, covariance, flag, at, attributes) -> xr.Dataset:
+def _dataset(
+    crossflow: xr.Dataset,
+    wind: np.ndarray,
+    covariance: np.ndarray,
+    flag: np.ndarray,
+    at: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
     names = {
         "u": ("wind along x", "x_wind"),
         "v": ("wind along y", "y_wind"),

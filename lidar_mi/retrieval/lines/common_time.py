@@ -36,15 +36,15 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
 
         c = sum omega^2 (v, w) / sum omega^2 ,   omega = dw/dy - dv/dz .
 
-    Of a vortex its own swirl cancels, and what is left is the flow in which it is: the mean wind
-    and what the others induce. Exact for round vortices of equal strength far from each other and
-    from the edge; of a pair 20 to 47 m apart with cores of 3 m on nodes of 1 to 2 m the descent is
-    right to 1 %. Where vortices drift by different velocities it is their mean.
+    The swirl of a vortex itself cancels. The mean wind and the induction by the others remain.
+    Exact for round vortices of equal strength far from each other and from the edge; of a pair 20
+    to 47 m apart with cores of 3 m on nodes of 1 to 2 m the descent is right to 1 %. Where vortices
+    drift by different velocities it is their mean.
 
-    The standard errors are the larger of two: what the errors of the vectors, correlated as their
-    windows overlap, make of c by its derivatives; and the scatter of the drift within the pattern,
+    The standard errors are the larger of two: the propagated errors of the vectors, correlated as
+    their windows overlap; and the scatter of the drift within the pattern,
     from the difference between vorticity of either sign, which has these errors as well. Noise also
-    gives vorticity to air beside the vortices; what this makes of c is added.
+    gives vorticity to air outside the vortices; its effect on c is added.
 
     Parameters
     ----------
@@ -156,16 +156,16 @@ def at_common_time(
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Vectors and lines of sight as they were at one time, of a pattern that drifts.
 
-    What was seen at x at the time t is at x + c (time - t). Lines of sight start elsewhere. Vectors
-    are read between the nodes by cubic splines; their standard errors, which windows that overlap
-    share, linearly.
+    The pattern at x at the time t is at x + c (time - t). Lines of sight start elsewhere. Vectors
+    are read between the nodes by cubic splines; their standard errors, which
+    correlate as windows overlap, linearly.
 
     Parameters
     ----------
     crossflow : xr.Dataset, dims (z, y)
         With `time`, s, of every vector.
     scan : xr.Dataset, dim line
-        With `time`, s, of every line, from the same zero; left out: 0 for all.
+        With `time`, s, of every line, from the same zero; absent: 0 for all.
     time : float
         s
     drift : (float, float)
@@ -177,7 +177,7 @@ def at_common_time(
     Returns
     -------
     crossflow, scan : xr.Dataset
-        Vectors that come from beyond the images, or from beside flagged ones, are flagged.
+        Vectors that come from beyond the images, or from next to flagged ones, are flagged.
 
     Raises
     ------
@@ -253,14 +253,14 @@ def _vectors(crossflow: xr.Dataset, time: float, drift: tuple[float, float]) -> 
     ends = np.reshape([n - 1 for n in when.shape], (2, 1, 1))
     inside = ((source > -_ROUNDING) & (source < ends + _ROUNDING)).all(0)
     around = map_coordinates(valid.astype(float), source, order=1, mode="nearest")
-    seen = inside & (around > 1 - _ROUNDING)
+    known = inside & (around > 1 - _ROUNDING)
     found = {}
     for name in (name for name in _FIELDS if name in flow):
         filled = nearest_filled(np.where(valid, flow[name].values.astype(float), np.nan))
         order = 3 if name in ("v", "w") else 1
         moved = map_coordinates(filled, source, order=order, mode="nearest")
-        found[name] = flow[name].copy(data=np.where(seen, moved, np.nan))
+        found[name] = flow[name].copy(data=np.where(known, moved, np.nan))
     flag = flow["flag"]
-    found["flag"] = flag.copy(data=np.where(seen, 0, np.maximum(flag.values, 1)))
+    found["flag"] = flag.copy(data=np.where(known, 0, np.maximum(flag.values, 1)))
     found["time"] = flow["time"].copy(data=np.full(when.shape, float(time)))
     return flow.assign(found)

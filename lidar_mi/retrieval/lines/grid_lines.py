@@ -90,7 +90,7 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
     return GridLines(direction, along[used], covariance, row, column, weight, forward), middle
 
 
-def _part(fraction, side):
+def _part(fraction: np.ndarray, side: int) -> np.ndarray:
     return fraction if side else 1 - fraction
 
 
@@ -108,6 +108,7 @@ def covariances_of_lines(
     ``weight`` is (lines, nodes, parts); ``correlations`` are those of the nodes along z and y.
     """
     columns = int(lines.y.max()) + 1
+    # neighbouring lines meet the same nodes: each is computed once
     place, node = np.unique(lines.z * columns + lines.y, return_inverse=True)
     z, y = np.divmod(place, columns)
     count, parts = len(weight), weight.shape[-1]
@@ -132,14 +133,16 @@ def covariances_of_lines(
         yield result
 
 
-def covariance_of_lines(lines: GridLines, weight: np.ndarray, over_z, over_y) -> np.ndarray:
+def covariance_of_lines(
+    lines: GridLines, weight: np.ndarray, over_z: np.ndarray, over_y: np.ndarray
+) -> np.ndarray:
     """As `covariances_of_lines`, for one correlation."""
     (found,) = covariances_of_lines(lines, weight, [(over_z, over_y)])
     return found
 
 
 def covariance_with_nodes(
-    rows: slice, lines: GridLines, weight: np.ndarray, over_z, over_y
+    rows: slice, lines: GridLines, weight: np.ndarray, over_z: np.ndarray, over_y: np.ndarray
 ) -> np.ndarray:
     """Covariance of the sums of `covariance_of_lines` with nodes of rows, (parts, z, y, lines)."""
     along_z = over_z[rows][:, lines.z].swapaxes(0, 1)

@@ -1,6 +1,7 @@
 """Statistics of the wind along x, weighted by the evidence of the lines of sight."""
 
 import itertools
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,8 @@ from scipy import ndimage
 from scipy.linalg import lapack
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.lines.grid_lines import covariances_of_lines
+from lidar_mi.retrieval.lines.crossflow import Crossflow
+from lidar_mi.retrieval.lines.grid_lines import GridLines, covariances_of_lines
 
 # Values of u's standard deviation, m/s, and number of lengths that the evidence is averaged over.
 _STDS = np.geomspace(0.05, 10, 16)
@@ -17,7 +19,7 @@ _LENGTHS = 8
 # Powers of the cross-flow's shear that u's standard deviation may be proportional to.
 _POWERS = (0.0, 0.5, 1.0)
 
-# Exponents of u's correlation: rough as turbulence, and smooth.
+# Exponents of u's correlation: of turbulence, and of a smooth field.
 _EXPONENTS = (1.0, 2.0)
 
 # Number of statistics drawn, in proportion to their probability.
@@ -45,7 +47,14 @@ def correlation(axis: np.ndarray, length: float, exponent: float) -> np.ndarray:
     return np.exp(-((abs(axis[:, None] - axis) / length) ** exponent))
 
 
-def relative_std(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
+def relative_std(
+    field: Crossflow,
+    lines: GridLines,
+    z: np.ndarray,
+    y: np.ndarray,
+    spacing: float,
+    power: float | None,
+) -> dict[float, np.ndarray]:
     """Standard deviation of u at the nodes in units of u_std, (z, y), by the power of the shear."""
     if power is not None and not power >= 0:
         raise InputError(f"u_power: {power} is not allowed; expected >= 0")
@@ -67,6 +76,7 @@ def relative_std(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
         return {0.0: uniform} if power is None else {power: uniform}
     shear = np.sqrt(square / np.where(known_here, known, 1))
     shear = np.where(known_here, shear, shear[known_here].mean())
+    # u may vary where v and w are uniform
     shear = np.maximum(shear, 1e-3 * shear.max())
     found = {}
     for one in _POWERS if power is None else (power,):
@@ -78,16 +88,24 @@ def relative_std(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
 
 
 def probable_statistics(
-    fixed, residual, lines, z, y, spacing, relative_stds, given
+    fixed: np.ndarray,
+    residual: np.ndarray,
+    lines: GridLines,
+    z: np.ndarray,
+    y: np.ndarray,
+    spacing: float,
+    relative_stds: Mapping[float, np.ndarray],
+    known: tuple[float | None, float | None, float | None],
 ) -> tuple[list[Statistics], Statistics]:
     """Statistics of u drawn by their probability, and those of largest evidence.
 
     The prior is uniform in the standard deviation, which does not favour small ones where lines are
     too noisy to determine it (Gelman 2006, Bayesian Analysis 1, 515-533), and uniform in the
     logarithm of the length. The evidence is the likelihood of the lines' velocities. Statistics
-    are drawn at equal steps of the cumulative probability, so that each has the same weight.
+    are drawn at equal steps of the cumulative probability, so that each has the same weight. Those
+    of standard deviation, length and exponent that are ``known`` are not estimated.
     """
-    std, length, exponent = given
+    std, length, exponent = known
     for name, value, unit in (("u_std", std, "m/s"), ("u_length", length, "m")):
         if value is not None and not value > 0:
             raise InputError(f"{name}: {value} {unit} is not allowed; expected more than 0 {unit}")
@@ -118,8 +136,11 @@ def probable_statistics(
     choices = []
     for k, s, often, one in zip(of_shape, of_std, times, white, strict=True):
         (a, size), power = kinds[k]
-        known = float(stds[s]), float(size), float(power), a, float(often) / _DRAWN, one
-        choices.append(Statistics(*known, float(square[k, s]) / len(residual)))
+        misfit = float(square[k, s]) / len(residual)
+        probability_of = float(often) / _DRAWN
+        choices.append(
+            Statistics(float(stds[s]), float(size), float(power), a, probability_of, one, misfit)
+        )
     return [choice for choice in choices if choice.probability], choices[best]
 
 

@@ -42,8 +42,8 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
         if name not in scan:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
     # variables: their coordinates take longer to attach than all checks
-    told = scan.variables
-    own = {"line"} & set(told["platform_velocity"].dims)
+    variables = scan.variables
+    own = {"line"} & set(variables["platform_velocity"].dims)
     for name, dims in (
         ("v_los", {"line"}),
         ("v_los_std", {"line"}),
@@ -52,20 +52,25 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
         ("platform_velocity", {"axis"} | own),
         ("origin", {"line", "axis"}),
     ):
-        if name in told and set(told[name].dims) != dims:
-            raise InputError(f"scan.{name}: dims {told[name].dims} are not {tuple(sorted(dims))}")
+        if name in variables and set(variables[name].dims) != dims:
+            raise InputError(
+                f"scan.{name}: dims {variables[name].dims} are not {tuple(sorted(dims))}"
+            )
     if scan.sizes["axis"] != 3:
         raise InputError(f"scan.axis: {scan.sizes['axis']} components are not x, y, z")
-    direction = told["direction"].transpose("line", "axis").values
+    direction = variables["direction"].transpose("line", "axis").values
     length = np.linalg.norm(direction, axis=1)
     if not (np.abs(length - 1) < 1e-6).all():
         raise InputError("scan.direction: not of length 1; expected unit vectors")
-    if not (told["range"].values > 0).all() or not np.isfinite(told["range"].values).all():
+    if (
+        not (variables["range"].values > 0).all()
+        or not np.isfinite(variables["range"].values).all()
+    ):
         raise InputError("scan.range: not > 0 m everywhere; every line needs its finite range")
-    if not (told["v_los_std"].values[np.isfinite(told["v_los"].values)] > 0).all():
+    if not (variables["v_los_std"].values[np.isfinite(variables["v_los"].values)] > 0).all():
         raise InputError("scan.v_los_std: not > 0 m/s everywhere; every line needs its error")
-    platform = told["platform_velocity"].transpose(..., "axis").values
-    return (direction * platform).sum(1) - told["v_los"].values
+    platform = variables["platform_velocity"].transpose(..., "axis").values
+    return (direction * platform).sum(1) - variables["v_los"].values
 
 
 def shared_covariance(scan: xr.Dataset) -> np.ndarray | None:
@@ -109,8 +114,8 @@ def solve_lines(
     -------
     wind : (n, 3) array, m/s
     covariance : (n, 3, 3) array, (m/s)^2
-        (sum d d^T / s^2)^-1, and what is shared; infinite (and the wind NaN) where the lines lie in
-        one plane.
+        (sum d d^T / s^2)^-1, plus the shared one; infinite (and the wind NaN) where the lines lie
+        in one plane.
     chi_square : (n,) array
         Squared misfit; of k - 3 degrees of freedom if the wind is uniform over the lines.
 
@@ -152,7 +157,7 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     scan : xr.Dataset, dim line
         `v_los`, `v_los_std`, `range`, `direction` (line, axis), `platform_velocity` (axis), as
         from `lidar_mi.instrument.doppler_scan.scan_wind`; also `origin` (line, axis; m) and
-        `v_los_covariance` (line, other_line; m2 s-2) of errors that lines share.
+        `v_los_covariance` (line, other_line; m2 s-2) of errors common to lines.
 
     Returns
     -------
@@ -226,7 +231,7 @@ def _tangents(scan: xr.Dataset) -> np.ndarray:
     return directions[:, 1:] / directions[:, :1]
 
 
-def _vectors(scan, along, lines, method) -> xr.Dataset:
+def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str) -> xr.Dataset:
     directions = scan["direction"].transpose("line", "axis").values[lines]
     values, std = along[lines], scan["v_los_std"].values[lines]
     missing = ~np.isfinite(values).all(1)
@@ -275,7 +280,9 @@ def _vectors(scan, along, lines, method) -> xr.Dataset:
 _LONG = {"u": "wind along x", "v": "wind along y", "w": "wind along z"}
 
 
-def error_variables(dims, covariance: np.ndarray) -> dict:
+def error_variables(
+    dims: str | tuple[str, ...], covariance: np.ndarray
+) -> dict[str, tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]]:
     """Standard errors and correlations of u, v, w from covariances (..., 3, 3), as variables."""
     stderr = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     found = {
@@ -298,7 +305,7 @@ def error_variables(dims, covariance: np.ndarray) -> dict:
     return found
 
 
-def flag_attributes(flags: type[enum.IntFlag]) -> dict:
+def flag_attributes(flags: type[enum.IntFlag]) -> dict[str, str | np.ndarray]:
     """CF attributes of a variable that holds bits of ``flags``."""
     return {
         "long_name": "reasons to reject the vector, 0 = valid",

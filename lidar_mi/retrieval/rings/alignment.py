@@ -5,6 +5,8 @@ until it correlates best with the mean; the shifts give centre, ellipticity and 
 over the curves that follow is sharper.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.signal import find_peaks, peak_widths, savgol_coeffs, savgol_filter
 
@@ -16,7 +18,7 @@ SIGNIFICANT = 8.0  # standard deviations of the smoothed average, the least heig
 PROMINENT = 0.1  # of the tallest ring's height, likewise
 LEAST = 3  # sectors in which a ring must be detected
 ALL_AROUND = 0.5  # of the sectors, in which a ring must be detected to determine its shape
-ALIKE = 0.5  # least correlation of a sector with the mean
+CORRELATED = 0.5  # least correlation of a sector with the mean
 
 
 def aligned(
@@ -92,9 +94,9 @@ def _pieces(sectors: Sectors) -> list[tuple[int, int]]:
     return list(zip(low.tolist(), high.tolist(), strict=True))
 
 
-def _shifts(sectors: Sectors, pieces) -> tuple[np.ndarray, np.ndarray]:
+def _shifts(sectors: Sectors, pieces: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
     """Shift of every piece in every sector, px^2, NaN where it is not known; the pieces' r^2."""
-    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.seen, strict=True)])
+    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.used, strict=True)])
     shift = np.full((len(pieces), SECTORS), np.nan)
     for number, (first, last) in enumerate(pieces):
         size = last - first + 1
@@ -102,27 +104,28 @@ def _shifts(sectors: Sectors, pieces) -> tuple[np.ndarray, np.ndarray]:
             continue
         line = np.linalg.qr(np.column_stack([np.ones(size), np.arange(size)]))[0]
 
-        def straightened(values, line=line):
+        def straightened(values: np.ndarray, line: np.ndarray = line) -> np.ndarray:
             return values - (values @ line) @ line.T
 
         mean = straightened(sectors.profile[first : last + 1])
         reach = max(3, size // 3)
         lags = np.arange(-reach, reach + 1)
-        alike = np.full((len(lags), SECTORS), np.nan)
+        correlation = np.full((len(lags), SECTORS), np.nan)
         for k, lag in enumerate(lags):
             if first + lag < 0 or last + lag >= value.shape[1]:
                 continue
             part = straightened(value[:, first + lag : last + lag + 1])
             size2 = (part**2).sum(1) * (mean @ mean)
-            alike[k] = part @ mean / np.sqrt(np.where(size2 > 0, size2, np.nan))
-        for sector in np.flatnonzero(np.isfinite(alike).sum(0) >= 3):
-            column = alike[:, sector]
+            correlation[k] = part @ mean / np.sqrt(np.where(size2 > 0, size2, np.nan))
+        for sector in np.flatnonzero(np.isfinite(correlation).sum(0) >= 3):
+            column = correlation[:, sector]
             best = int(np.nanargmax(column))
             near = column[max(best - 1, 0) : best + 2]
-            if len(near) == 3 and np.isfinite(near).all() and column[best] > ALIKE:
+            if len(near) == 3 and np.isfinite(near).all() and column[best] > CORRELATED:
                 low, top, high = near
-                bend = low - 2 * top + high
-                shift[number, sector] = lags[best] + (low - high) / (2 * bend if bend else 1.0)
+                curvature = low - 2 * top + high
+                vertex = (low - high) / (2 * curvature if curvature else 1.0)
+                shift[number, sector] = lags[best] + vertex
     middle = np.array([sectors.r2[(a + b) // 2] for a, b in pieces])
     return shift * sectors.step, middle
 
@@ -135,7 +138,7 @@ def _filled(value: np.ndarray, count: np.ndarray) -> np.ndarray:
     return np.interp(place, known, value[known], right=np.nan)
 
 
-def _change(shift, middle, angle, free) -> np.ndarray:
+def _change(shift: np.ndarray, middle: np.ndarray, angle: np.ndarray, free: bool) -> np.ndarray:
     """Six changes of the geometry by least squares; 0 for those that are not determined."""
     known = np.isfinite(shift)
     if (known.sum(1) >= LEAST).sum() < 1:

@@ -7,7 +7,9 @@ order at the centre, for each line of the light (a split line has two or three).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -31,9 +33,11 @@ from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.tables import Table, Tabular, with_error
 
 LAW = 0.02  # orders, largest rms deviation from equal steps of an etalon's pattern
-UNEXPLAINED = 0.2  # of the pattern's power, the most that may be left where noise does not leave it
+UNEXPLAINED = 0.2  # of the pattern's power, the largest residual beyond that of noise
 
-_UNEVEN = "neighbouring parts deviate alike; errors hold for patches of up to 1/10 of the image"
+_UNEVEN = (
+    "deviations of neighbouring parts correlate; errors hold for patches of up to 1/10 of the image"
+)
 
 CREST = 0.3  # of the highest crest, the least height of one that no line may leave unexplained
 
@@ -60,7 +64,7 @@ class Rings(Tabular):
         Fractional order at the centre of each component, 0 to 1 (r^2 over spacing of its
         ring of order 0).
     fraction_covariance : array (lines, lines)
-        Of the errors, which the lines share in part.
+        Of the errors, which are in part common to the lines.
     height : array (lines,)
         Of the components, relative to the highest.
     misfit : float
@@ -68,9 +72,9 @@ class Rings(Tabular):
     roundness : float
         Rms deviation of the crests from the curves fitted: circles, ellipses, tilted circles.
     uneven : bool
-        Whether neighbouring parts of rings deviate alike, as by uneven plates. Standard errors then
-        are from six parts of the image, each known to a third. Patches wider than a tenth of the
-        image, which the fit takes for another centre or spacing, may move it by more.
+        Whether deviations of neighbouring parts of rings correlate, as by uneven plates. Errors
+        then are from six parts of the image, each known to a third. Patches wider than a tenth of
+        the image, which the fit takes for another centre or spacing, may move it by more.
     ellipticity : (float, float)
         Cosine and sine part, over twice the angle, of a ring's radius over its mean; the size is
         half the relative difference of its diameters.
@@ -81,7 +85,7 @@ class Rings(Tabular):
     doubt : str
         How the spacing could be another; empty where the image excludes it.
     r2, profile : arrays
-        What all sectors share, mean over circles, for the image; without their backgrounds.
+        Common part of all sectors, mean over circles, for the image; without their backgrounds.
     """
 
     shape: tuple[int, int]
@@ -119,13 +123,13 @@ class Rings(Tabular):
         split = table[:, 1:] - table[:, :1]
         return split[np.isfinite(split).any(1)]
 
-    def curve(self, radius: float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, radius: np.ndarray | float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y) of a ring of that mean radius, at angles from x toward y."""
         return RingCurves(self.centre, self.ellipticity, self.tilt).curve(radius, angle)
 
     def _shape(self) -> str:
         if not any((*self.ellipticity, *self.tilt)):
-            return "not determined by the part of the rings that is seen: taken for circles"
+            return "not determined by the visible part of the rings: taken for circles"
         return f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"
 
     def tables(self) -> list[Table]:
@@ -167,7 +171,7 @@ class Rings(Tabular):
 
 @checked_arguments
 def analyse_rings(
-    image,
+    image: Any,
     centre: tuple[float, float] | None = None,
     saturation: float | None = None,
     spacing: float | None = None,
@@ -177,7 +181,7 @@ def analyse_rings(
     Parameters
     ----------
     image : array or tensor, shape (height, width)
-        Any scale; the background may slope or bend, and parts of the rings may be hidden.
+        Any scale; the background may be sloped or curved, and parts of the rings may be hidden.
     centre : (float, float), optional
         (x, y) of the rings where it is known, px; fitted if not given.
     saturation : float, optional
@@ -185,7 +189,7 @@ def analyse_rings(
     spacing : float, optional
         Step of r^2 from order to order, px^2, to 2 %, where it is known, as from another image of
         the same instrument. Without it, lines at equal distances are taken for one line of a
-        shorter step, which an image cannot tell from them.
+        shorter step: an image does not distinguish them.
 
     Returns
     -------
@@ -213,29 +217,29 @@ def analyse_rings(
     """
     if spacing is not None and not 0 < spacing < math.inf:
         raise InputError(f"spacing: {spacing:g} px^2 is not allowed; expected above 0")
-    image = checked(image, saturation)
-    if len(image) != 1:
-        raise InputError(f"image: {len(image)} images are not allowed; expected one")
-    image = image[0].double().cpu().numpy()
+    images = checked(image, saturation)
+    if len(images) != 1:
+        raise InputError(f"image: {len(images)} images are not allowed; expected one")
+    values = images[0].double().cpu().numpy()
     free = centre is None
-    centre = ring_centre(image) if free else tuple(map(float, centre))
-    inside(*centre, image.shape)
-    geometry = aligned(image, RingCurves(centre), free)
-    sectors = Sectors(image, geometry)
+    place = ring_centre(values) if centre is None else _pair(centre)
+    inside(*place, values.shape)
+    geometry = aligned(values, RingCurves(place), free)
+    sectors = Sectors(values, geometry)
     hidden = hidden_rings(sectors, _rings_alone(sectors, spacing))
     if hidden is not None:
-        geometry = aligned(image, RingCurves(geometry.centre), free, hidden)
-        sectors = Sectors(image, geometry, hidden)
+        geometry = aligned(values, RingCurves(geometry.centre), free, hidden)
+        sectors = Sectors(values, geometry, hidden)
     pattern, doubt = _pattern(sectors, spacing)
-    fit = fit_all(image, geometry, pattern, free, hidden)
+    fit = fit_all(values, geometry, pattern, free, hidden)
     if spacing is None and repeats(fit.pattern):
         # with a background and a height of every sector the lines are one, of a shorter spacing
         pattern, doubt = _pattern(sectors, fit.pattern.spacing / len(fit.pattern.fraction))
-        fit = fit_all(image, geometry, pattern, free, hidden)
+        fit = fit_all(values, geometry, pattern, free, hidden)
     law = _law(fit)
     return Rings(
-        shape=image.shape,
-        centre=fit.geometry.centre if free else centre,
+        shape=values.shape,
+        centre=fit.geometry.centre if free else place,
         centre_std=_pair(np.sqrt(np.diag(fit.geometry_covariance))[:2]),
         radius=np.sqrt(fit.square),
         radius_std=np.sqrt(np.diag(fit.square_covariance)) / (2 * np.sqrt(fit.square)),
@@ -258,7 +262,7 @@ def analyse_rings(
     )
 
 
-def _pair(values) -> tuple[float, float]:
+def _pair(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
@@ -275,8 +279,8 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     )
     if pattern is None:
         raise wrong
-    left = pattern.unexplained - 2 * noise * pattern.freedom
-    if left > UNEXPLAINED * pattern.power:
+    excess = pattern.unexplained - 2 * noise * pattern.freedom
+    if excess > UNEXPLAINED * pattern.power:
         raise wrong
     off = np.abs((pattern.phase(places) + 0.5) % 1 - 0.5).min(0)
     if (off > max(0.5 * pattern.width, 2 * LAW)).any():

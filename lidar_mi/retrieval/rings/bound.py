@@ -1,4 +1,4 @@
-"""Cramer-Rao bound of what an image of rings tells, from its model's Fisher matrix."""
+"""Cramer-Rao bound of the parameters of an image of rings, from its model's Fisher matrix."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,9 @@ def fisher_matrix(
     return (part * weight[:, None]) @ part.transpose(1, 2)
 
 
-def prior_information(model: RingModel, names: Sequence[str], device="cpu") -> torch.Tensor:
+def prior_information(
+    model: RingModel, names: Sequence[str], device: str | torch.device = "cpu"
+) -> torch.Tensor:
     """1 / variance of the model's priors on these parameters; 0 where it has none."""
     variances = [model.priors[name][1] ** -2 if name in model.priors else 0.0 for name in names]
     return torch.tensor(variances, dtype=torch.float64, device=device)

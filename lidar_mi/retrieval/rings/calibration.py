@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,7 +17,7 @@ _ARRAYS = {
     "systematic": (("systematic", "systematic_2"), "1", "covariance of the instrument"),
     "frame_speed": (("frame",), "m s-1", "drift of the frame, as a speed"),
     "frame_speed_std": (("frame",), "m s-1", "standard error of frame_speed"),
-    "response": (("row", "column"), "1", "response to light, 0 for pixels left out"),
+    "response": (("row", "column"), "1", "response to light, 0 for masked pixels"),
     "misfit": (("block_row", "block_column"), "1", "mean misfit over its standard deviation"),
 }
 """Dimensions, units and names of the arrays in a file."""
@@ -49,7 +50,7 @@ class Calibration(Tabular):
     std : mapping
         Standard errors by name, of `INSTRUMENT` (focal_length relative), x, y and falloff.
     systematic : array (8, 8)
-        Covariance that all later speeds share, see `RingModel.systematic`.
+        Covariance common to all later speeds, see `RingModel.systematic`.
     frame_speed, frame_speed_std : array (frames,)
         Fractional order of every frame as a speed about their mean, m/s: the drift.
     drift : float
@@ -62,7 +63,7 @@ class Calibration(Tabular):
         Mean of the frames less the model, in standard deviations, in blocks of ``block`` pixels.
     block : int
     undetermined : tuple of str
-        Of `INSTRUMENT`, what the frames do not tell beyond the tolerances.
+        Parameters of `INSTRUMENT` that the frames determine no better than the tolerances.
     lines : tuple of float
         Wavelengths of two or more lines, where their frames gave the gap, m.
     gaps : tuple of (float, float)
@@ -128,7 +129,7 @@ class Calibration(Tabular):
             ("change of -ln R of the mirrors", with_error(self.damping, std["damping"])),
             ("change of the roughness term", with_error(self.roughness, std["roughness"])),
             ("fall-off of the light to the corner", with_error(self.falloff, std["falloff"])),
-            ("pixels left out", str(bad)),
+            ("pixels masked", str(bad)),
             ("drift between frames", f"{self.drift:.3g} m/s"),
             ("chi-square", f"{self.chi_square:.4f}"),
         ]
@@ -176,14 +177,15 @@ def calibration_of(data: xr.Dataset) -> Calibration:
         A data set that is none, or not whole.
     """
     try:
-        single = json.loads(data.attrs["calibration"])
+        single: dict[str, Any] = json.loads(data.attrs["calibration"])
         arrays = {name: data[name].transpose(*dims).values for name, (dims, *_) in _ARRAYS.items()}
         for name in ("shape", "centre", "tilt", "undetermined"):
             single[name] = tuple(single[name])
         for name in ("lines", "whole_orders"):
             single[name] = tuple(single.get(name, ()))
         single["gaps"] = tuple((float(gap), float(std)) for gap, std in single.get("gaps", ()))
-        found = Calibration(**single, **arrays)
+        single.update(arrays)
+        found = Calibration(**single)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"calibration: {error} is missing or wrong; expected the file of a calibration"
@@ -224,7 +226,7 @@ def calibrated(model: RingModel, calibration: Calibration) -> RingModel:
             f"{model.order_at_centre:.1f}: another gap"
         )
 
-    def changed(harmonics):
+    def changed(harmonics: np.ndarray) -> np.ndarray:
         n = np.arange(np.shape(harmonics)[-1])
         factor = np.exp(-calibration.damping * n - calibration.roughness * n**2)
         return np.asarray(harmonics) * factor

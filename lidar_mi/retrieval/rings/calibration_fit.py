@@ -5,7 +5,7 @@ them; every frame has its own level of light, background and fractional order at
 and etalon drift). Maximum likelihood times normal priors, by Gauss-Newton steps: after each step
 pixels are put where the improved instrument has them.
 
-What frames of one line cannot tell: the gap (only focal length^2 / gap enters: a gap that is wrong
+Frames of one line do not determine the gap (only focal length^2 / gap enters: a gap that is wrong
 by 1e-3 changes speeds by 1e-3; `calibration_lines` has it from several lines), and defects of the
 plates together with the way in which the light fills the pupil, which differs between laser and
 air.
@@ -41,7 +41,7 @@ TOLERANCES: Mapping[str, float] = {
     "damping": 0.2,
     "roughness": 0.1,
 }
-"""Standard deviations of what is known beforehand of `INSTRUMENT`: a focal length to 5 %, a camera
+"""Standard deviations of the priors on `INSTRUMENT`: a focal length to 5 %, a camera
 mounted to 3 degrees, a lens distorting by 2 %, a focus to 20 px, mirrors to 0.2 of -ln R."""
 
 _STEPS = 25
@@ -118,7 +118,7 @@ def calibrate_rings(
         )
     noise = noise or PixelNoise()
     mean = frames.mean(0, dtype=torch.float64)
-    # those that would lead the start astray; the others once there is a fit
+    # those that would mislead the start; the others are found after a fit
     hot = spots(mean, noise, len(frames))
     whole = torch.where(hot, torch.from_numpy(median_filter(mean.numpy(), 3)), mean)
     centre = gradient_centre(whole)
@@ -135,8 +135,8 @@ def calibrate_rings(
     for name in ("falloff", *LIGHT):
         place = PARAMETERS.index(name)
         first[:, place] = first[:, place].mean()
-    state = _State(model, first, dict.fromkeys(INSTRUMENT, 0.0))
-    state = _fitted(frames, state, noise, given, tolerances)
+    nominal = _State(model, first, dict.fromkeys(INSTRUMENT, 0.0))
+    state = _fitted(frames, nominal, noise, given, tolerances)
     bad = _bad_pixels(mean, state, noise, len(frames), given)
     if bad.any():
         given = torch.where(bad, 0.0, given)
@@ -154,23 +154,32 @@ class _State:
     """The instrument so far: its model, the frames' parameters, departures from the nominal one.
 
     ``model`` has focal length, tilt, distortion and blur in it; damping and roughness are in the
-    frames' parameters. After a fit: covariance of what is shared, parts of the local
-    solution, chi-square and its degrees of freedom.
+    frames' parameters.
     """
 
     model: RingModel
     parameters: torch.Tensor
     departure: Mapping[str, float]
-    names: tuple[str, ...] = ()
-    covariance: torch.Tensor | None = None
-    speed_by_shared: torch.Tensor | None = None
-    speed_variance: torch.Tensor | None = None
-    chi_square: float = math.nan
-    freedom: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit(_State):
+    """The instrument after a fit.
+
+    ``covariance`` is that of what all frames share, by ``names``; ``speed_by_shared`` and
+    ``speed_variance`` are the frames' own speeds' dependence on it and their own variances.
+    """
+
+    names: tuple[str, ...]
+    covariance: torch.Tensor
+    speed_by_shared: torch.Tensor
+    speed_variance: torch.Tensor
+    chi_square: float
+    freedom: int
 
 
 def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
-    """The model with the focal length that the steps of r^2 between rings say, if that is near."""
+    """The model with the focal length of the steps of r^2 between rings, if that is near."""
     try:
         spacing = analyse_rings(mean.numpy()).spacing
     except InputError:
@@ -184,12 +193,19 @@ def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
     return replace(model, focal_length=model.focal_length * factor)
 
 
-def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
-    """Gauss-Newton steps until what is shared no longer changes."""
+def _fitted(
+    frames: torch.Tensor,
+    state: _State,
+    noise: PixelNoise,
+    response: torch.Tensor,
+    tolerances: Mapping[str, float],
+) -> _Fit:
+    """Gauss-Newton steps until the shared parameters no longer change."""
     shared = (*_SHARED, *term_names("light", state.model.light_degree), *INSTRUMENT)
     local = (*_LOCAL, *term_names("background", state.model.background_degree))
     few = len(local)
     for _ in range(_STEPS):
+        # the cells move with the instrument: their positions depend on tilt and distortion
         waves = annular_waves(state.model, state.model.centre, response, derivatives=True)
         means = waves.cells.means(frames)
         mean, jacobian = mean_and_jacobian(state.model, waves, state.parameters, (*local, *shared))
@@ -212,6 +228,7 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
                 information = tolerances[name] ** -2
                 total[k, k] += information
                 rest[k] -= state.departure[name] * information
+        # the prior makes the matrix regular: frames of few rings do not determine all seven
         covariance = torch.linalg.inv(total)
         step = covariance @ rest
         close = bool((step.abs() <= _CLOSE * covariance.diagonal().sqrt()).all())
@@ -219,6 +236,7 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
             name: max(-_LONGEST.get(name, math.inf), min(value, _LONGEST.get(name, math.inf)))
             for name, value in zip(shared, step.tolist(), strict=True)
         }
+        # back substitution, with the speed within the linear range of the waves
         own_step = own_step - by_shared @ step
         limit = state.model.velocity_range / 16
         own_step[:, 0] = own_step[:, 0].clamp(-limit, limit)
@@ -229,8 +247,9 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
             if name in ("falloff", "damping", "roughness", *LIGHT):
                 parameters[:, PARAMETERS.index(name)] += change[name]
         used = int((weight > 0).sum())
+        # every frame has local parameters of its own
         freedom = max(used - len(shared) - few * len(frames), 1)
-        state = _State(
+        state = fit = _Fit(
             _moved(state.model, change),
             parameters,
             {name: state.departure[name] + change[name] for name in INSTRUMENT},
@@ -242,7 +261,7 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
             freedom,
         )
         if close:
-            return state
+            return fit
     raise InputError(
         "frames: the calibration does not converge; expected rings of one narrow line on the "
         "nominal instrument"
@@ -262,7 +281,9 @@ def _moved(model: RingModel, change: Mapping[str, float]) -> RingModel:
     )
 
 
-def _residual(mean: torch.Tensor, state: _State, noise, count: int, response) -> torch.Tensor:
+def _residual(
+    mean: torch.Tensor, state: _State, noise: PixelNoise, count: int, response: torch.Tensor
+) -> torch.Tensor:
     """Mean of the frames less the model, in standard deviations, (height, width).
 
     The model is taken with the mean of the frames' own parameters.
@@ -274,14 +295,22 @@ def _residual(mean: torch.Tensor, state: _State, noise, count: int, response) ->
     return torch.where(response > 0, (mean / used - expected) * (used * count / variance).sqrt(), 0)
 
 
-def _bad_pixels(mean, state: _State, noise, count: int, response) -> torch.Tensor:
+def _bad_pixels(
+    mean: torch.Tensor, state: _State, noise: PixelNoise, count: int, response: torch.Tensor
+) -> torch.Tensor:
     """Further ones that are far from the model and from their neighbours: dust, warm pixels."""
     residual = _residual(mean, state, noise, count, response).numpy()
-    # what is smooth is the model's fault
+    # a smooth residual is an error of the model
     return torch.from_numpy(np.abs(residual - median_filter(residual, 5)) > _BAD)
 
 
-def _calibration(frames, state: _State, noise, response, tolerances) -> Calibration:
+def _calibration(
+    frames: torch.Tensor,
+    state: _Fit,
+    noise: PixelNoise,
+    response: torch.Tensor,
+    tolerances: Mapping[str, float],
+) -> Calibration:
     model, names = state.model, state.names
     count = len(frames)
     poor = state.chi_square > 1 + MISFIT * math.sqrt(2 / state.freedom)
@@ -290,7 +319,7 @@ def _calibration(frames, state: _State, noise, response, tolerances) -> Calibrat
     std = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
     speed = state.parameters[:, 0].numpy()
     own_variance = grown * state.speed_variance.numpy()
-    # the frames' mean speed depends on what is shared: v = v_0 - g . shared
+    # the frames' mean speed depends on the shared parameters: v = v_0 - g . shared
     slope = -state.speed_by_shared.mean(0).numpy()
     zero = float(slope @ covariance @ slope + own_variance.sum() / count**2)
     drift = math.sqrt(max(0.0, speed.var(ddof=1) - own_variance.mean()))
@@ -305,7 +334,7 @@ def _calibration(frames, state: _State, noise, response, tolerances) -> Calibrat
     blocks = residual[:height, :width].reshape(height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
     values = dict(zip(PARAMETERS, state.parameters[0].tolist(), strict=True))
     return Calibration(
-        shape=tuple(model.shape),
+        shape=model.shape,
         pixel=model.pixel,
         wavelength=model.wavelength,
         focal_length=model.focal_length,

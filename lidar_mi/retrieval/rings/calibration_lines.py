@@ -1,8 +1,8 @@
-"""One instrument from frames of several lines: its gap, and all that does not depend on the light.
+"""One instrument from frames of several lines: its gap, and all that does not depend on the line.
 
 Every line is calibrated for itself; the estimates are then combined with their covariances, which
-to first order is the fit of all frames together. What lines share is the geometry. Each has its own
-fractional order, illumination, and finesse (mirrors and plates in units of its wavelength); the
+to first order is the fit of all frames together. The geometry is common to all lines. Each has its
+own fractional order, illumination, and finesse (mirrors and plates in units of its wavelength); the
 fractions give the gap by the method of exact fractions, see `lidar_mi.retrieval.rings.gap`.
 """
 
@@ -21,9 +21,9 @@ from lidar_mi.retrieval.rings.gap import gap_of_covariance
 from lidar_mi.retrieval.rings.model import INSTRUMENT
 
 CHROMATIC = ("focal_length", "blur")
-"""What a lens that is not achromatic has for every line anew."""
+"""Parameters that differ from line to line of a lens that is not achromatic."""
 _GEOMETRY = ("focal_length", "tilt_x", "tilt_y", "distortion", "blur")
-_DETERMINED = 0.1  # of the tolerance: what is known beforehand is 1 % of the information
+_DETERMINED = 0.1  # of the tolerance: the prior is then 1 % of the information
 _UNLIKELY = 1e-6  # probability below which lines have different instruments
 
 
@@ -99,14 +99,13 @@ def combined(
     found = gap_of_covariance(fraction, errors, wavelengths, gap, gap_tolerance)
     first = _moved(lines[0], parts[0], step, covariance)
     groups = tuple(zip(found.group.tolist(), found.group_std.tolist(), strict=True))
-    given = {"lines": tuple(wavelengths), "gaps": groups}
+    first = replace(first, lines=tuple(wavelengths), gaps=groups)
     if len(groups) > 1:
-        return replace(first, **given)
+        return first
     best = int(found.chi_square.argmin())
     order = float(found.order[best, 0] + fraction[0] + mirror_orders[0])
     return replace(
         first,
-        **given,
         whole_orders=tuple(sorted(set(found.order[:, 0].tolist()))),
         focal_length=first.focal_length * math.sqrt(order / first.order_at_centre),
         order_at_centre=order,
@@ -115,10 +114,10 @@ def combined(
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """What one line says of the shared part of the instrument.
+    """Estimate from one line of the shared part of the instrument.
 
-    ``information`` is the inverse of its covariance, ``determined`` that of what its frames tell
-    without what is known beforehand, which all lines have in common.
+    ``information`` is the inverse of its covariance, ``determined`` that of its
+    frames without the prior, which all lines have in common.
     """
 
     places: list[int]  # in `Calibration.systematic`
@@ -128,7 +127,9 @@ class _Geometry:
     known: np.ndarray
 
 
-def _geometry(one: Calibration, shared: Sequence[str], tolerances) -> _Geometry:
+def _geometry(
+    one: Calibration, shared: Sequence[str], tolerances: Mapping[str, float]
+) -> _Geometry:
     value = {
         "focal_length": math.log(one.focal_length),
         "tilt_x": one.tilt[0],
@@ -151,7 +152,9 @@ def _geometry(one: Calibration, shared: Sequence[str], tolerances) -> _Geometry:
     )
 
 
-def _check_same(first: Calibration, other: Calibration, one, two, achromatic: bool) -> None:
+def _check_same(
+    first: Calibration, other: Calibration, one: _Geometry, two: _Geometry, achromatic: bool
+) -> None:
     """Refuse lines whose rings are not of one instrument."""
     known = one.known & two.known
     if not known.any():
@@ -176,7 +179,9 @@ def _per_order(one: Calibration) -> float:
     return speed_of_light / (2 * one.order_at_centre)
 
 
-def _moved(one: Calibration, part: _Geometry, step, covariance) -> Calibration:
+def _moved(
+    one: Calibration, part: _Geometry, step: np.ndarray, covariance: np.ndarray
+) -> Calibration:
     """A calibration after its shared part is moved by a step, with what is correlated to that."""
     gain = one.systematic[:, part.places] @ part.information
     change = dict(zip(("v_los", *INSTRUMENT), gain @ step, strict=True))

@@ -12,7 +12,7 @@ their response to light, and those of response 0 (hot, dead, covered) do not cou
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 
@@ -25,7 +25,8 @@ from lidar_mi.retrieval.threads import mapped
 _AT_ONCE = 8
 
 
-class Cells(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Cells:
     """Groups of pixels, tensors of shape (cells,), float64; pixels, x right, y down.
 
     Attributes
@@ -76,9 +77,11 @@ class Cells(NamedTuple):
         sums = flat.new_zeros((*flat.shape[:-1], len(self.count) + 1))
         parts = (whole.view(-1, whole.shape[-1]).split(_AT_ONCE) for whole in (sums, flat))
 
-        def add(pair):
+        index = self.index
+
+        def add(pair: tuple[torch.Tensor, torch.Tensor]) -> None:
             # half of the time of index_add_
-            pair[0].scatter_add_(-1, self.index.expand_as(pair[1]), pair[1])
+            pair[0].scatter_add_(-1, index.expand_as(pair[1]), pair[1])
 
         mapped(add, zip(*parts, strict=True))
         return sums[..., :-1].double() / self.count
@@ -87,7 +90,7 @@ class Cells(NamedTuple):
 def pixels(
     shape: tuple[int, int],
     centre: tuple[float, float],
-    device="cpu",
+    device: str | torch.device = "cpu",
     *,
     geometry: Geometry | None = None,
     names: tuple[str, ...] = (),
@@ -102,7 +105,7 @@ def annular_sectors(
     centre: tuple[float, float],
     step: float,
     sectors: int = 16,
-    device="cpu",
+    device: str | torch.device = "cpu",
     *,
     geometry: Geometry | None = None,
     response: torch.Tensor | None = None,
@@ -139,7 +142,9 @@ def annular_sectors(
         raise InputError(f"sectors: {sectors!r} is not allowed; expected 1 or more")
     x, y, terms = _positions(shape, centre, device, geometry, names)
     weight = torch.ones_like(x) if response is None else response.to(x).flatten()
-    if len(weight) != len(x) or not ((weight >= 0).all() and weight.any()):
+    if response is not None and (
+        len(weight) != len(x) or not ((weight >= 0).all() and weight.any())
+    ):
         raise InputError(
             f"response: shape {tuple(response.shape)}, {float(weight.min()):g} to "
             f"{float(weight.max()):g} is not allowed; expected {shape[0]} x {shape[1]} px of 0 or "
@@ -155,17 +160,17 @@ def annular_sectors(
     index = torch.where(weight > 0, (used.cumsum(0) - 1)[label], size)
     count = _sums(index, weight, size)
 
-    def mean(values):
+    def mean(values: torch.Tensor) -> torch.Tensor:
         return _sums(index, weight * values, size) / count
 
-    means = [mean(values) for values in (x, y, r2)]
+    mean_x, mean_y, mean_r2 = means = [mean(values) for values in (x, y, r2)]
     inner = index.clamp(max=size - 1)
     off = [values - middle[inner] for values, middle in zip((x, y, r2), means, strict=True)]
     spread = torch.stack([torch.stack([mean(a * b) for a in off], -1) for b in off], -1)
     smooth = (
         torch.stack([mean(values) for values in terms.T], 1) if names else count[:, None][:, :0]
     )
-    return Cells(index, count, centre, *means, spread, smooth)
+    return Cells(index, count, centre, mean_x, mean_y, mean_r2, spread, smooth)
 
 
 def annular_average(
@@ -179,7 +184,8 @@ def annular_average(
     centre, step
         As `annular_sectors`.
     """
-    cells = annular_sectors(tuple(images.shape[-2:]), centre, step, 1, images.device)
+    height, width = images.shape[-2:]
+    cells = annular_sectors((height, width), centre, step, 1, images.device)
     return cells.r2, cells.means(images), cells.count
 
 
@@ -189,7 +195,13 @@ def _sums(index: torch.Tensor, values: torch.Tensor, size: int) -> torch.Tensor:
     return total.index_add_(0, index, values)[:size]
 
 
-def _positions(shape, centre, device, geometry, names):
+def _positions(
+    shape: tuple[int, int],
+    centre: tuple[float, float],
+    device: str | torch.device,
+    geometry: Geometry | None,
+    names: tuple[str, ...],
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Positions of all pixels from the centre in the ideal image, and their smooth terms."""
     rows, columns = (torch.arange(size, dtype=torch.float64, device=device) for size in shape)
     x, y = (part.flatten() for part in torch.broadcast_tensors(columns[None, :], rows[:, None]))

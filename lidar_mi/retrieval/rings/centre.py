@@ -14,7 +14,9 @@ COARSE = 12  # of an image's side, the scale beyond which structure is no ring's
 ROWS = 64  # of an image at once: what they need stays in the cache
 
 
-def gradient_centre(image, response=None) -> tuple[float, float]:
+def gradient_centre(
+    image: np.ndarray | torch.Tensor, response: torch.Tensor | None = None
+) -> tuple[float, float]:
     """Point that the lines along all gradients pass closest by, to about a pixel.
 
     The gradient of rings points to or from their centre at every pixel, so that no ring needs to be
@@ -28,7 +30,7 @@ def gradient_centre(image, response=None) -> tuple[float, float]:
     image : array or tensor, shape (height, width)
         Finite.
     response : tensor, shape (height, width), optional
-        Of the pixels; those of 0 are left out.
+        Of the pixels; those of 0 are masked.
 
     Returns
     -------
@@ -44,11 +46,11 @@ def gradient_centre(image, response=None) -> tuple[float, float]:
     block = max(1, min(image.shape) // 192)
     rows, columns = (size // block for size in image.shape)
 
-    def coarse(part):
+    def coarse(part: torch.Tensor) -> np.ndarray:
         blocks = part[: rows * block, : columns * block].reshape(rows, block, columns, block)
         return gaussian_filter(blocks.mean((1, 3)).cpu().numpy().astype(float), 2.0)
 
-    known = 1.0
+    known: np.ndarray | float = 1.0
     if response is None:
         smooth = coarse(image)
     else:
@@ -67,10 +69,11 @@ def gradient_centre(image, response=None) -> tuple[float, float]:
     if not size[0] > 1e-3 * size[1]:
         raise InputError("image: its gradients have no common centre; expected rings")
     centre = np.linalg.solve(matrix, normal @ across)
-    return tuple(float(v) for v in centre * block + (block - 1) / 2)
+    x, y = centre * block + (block - 1) / 2
+    return float(x), float(y)
 
 
-def ring_centre(image) -> tuple[float, float]:
+def ring_centre(image: np.ndarray) -> tuple[float, float]:
     """Centre of rings on any background, partly hidden or not, to a few pixels.
 
     As `gradient_centre`, but robust: the lines along gradients count by how close to the centre
@@ -92,8 +95,8 @@ def ring_centre(image) -> tuple[float, float]:
     fine = coarse - gaussian_filter(coarse, min(coarse.shape) / COARSE, mode="nearest")
     low, high = np.quantile(fine, (0.01, 0.99))
     fine = fine.clip(low, high)
-    starts = [gradient_centre(image)]
-    starts = [tuple((value - (block - 1) / 2) / block for value in starts[0])]
+    x, y = ((value - (block - 1) / 2) / block for value in gradient_centre(image))
+    starts = [(x, y)]
     starts += [(columns * a, rows * b) for a in (0.25, 0.5, 0.75) for b in (0.25, 0.5, 0.75)]
     found = [
         _robust_centre(gaussian_filter(part, 2.0), start)
@@ -101,15 +104,15 @@ def ring_centre(image) -> tuple[float, float]:
         for start in starts
     ]
 
-    def contrast(place):
+    def contrast(place: tuple[float, float]) -> float:
         _, mean, weight = circular_average(fine, place)
         return float(weight @ (mean - (weight @ mean) / weight.sum()) ** 2)
 
-    best = max(found, key=contrast)
-    return tuple(float(v) * block + (block - 1) / 2 for v in best)
+    x, y = (v * block + (block - 1) / 2 for v in max(found, key=contrast))
+    return x, y
 
 
-def _robust_centre(smooth, start):
+def _robust_centre(smooth: np.ndarray, start: tuple[float, float]) -> tuple[float, float]:
     rim = 5
     slope_y, slope_x = (part[rim:-rim, rim:-rim] for part in np.gradient(smooth))
     y, x = np.mgrid[rim : smooth.shape[0] - rim, rim : smooth.shape[1] - rim]
@@ -127,10 +130,12 @@ def _robust_centre(smooth, start):
             matrix = (normal * weight) @ normal.T
             matrix[np.diag_indices(2)] += 1e-6 * np.trace(matrix)
             centre = np.linalg.solve(matrix, (normal * weight) @ across)
-    return centre
+    return float(centre[0]), float(centre[1])
 
 
-def circular_average(image: np.ndarray, centre: tuple[float, float]) -> tuple:
+def circular_average(
+    image: np.ndarray, centre: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean over circles about ``centre``, 1 px apart: the paper's circular averaging (CA).
 
     Every pixel counts at the two radii next to its own, in proportion.
@@ -138,7 +143,7 @@ def circular_average(image: np.ndarray, centre: tuple[float, float]) -> tuple:
     Returns
     -------
     radius, mean, weight : arrays
-        px; the value's unit; sum of the pixels' weights. Radii of weight 0 are left out.
+        px; the value's unit; sum of the pixels' weights. Radii of weight 0 are omitted.
     """
     height, width = image.shape
     x2 = (np.arange(width) - centre[0]) ** 2
@@ -183,8 +188,8 @@ def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[floa
     # variances do not depend on an offset; sums of squares lose least without one
     image = np.asarray(image, float) - np.mean(image)
 
-    def contrast(*place):
-        _, mean, weight = circular_average(image, place)
+    def contrast(x: float, y: float) -> float:
+        _, mean, weight = circular_average(image, (x, y))
         return float(weight @ mean**2)
 
     x, y = start
@@ -270,5 +275,6 @@ def midpoint_line_centre(
                 f"image: no chord of a ring of {radius:.0f} px about ({start[0]:.0f}, "
                 f"{start[1]:.0f}) px; expected a ring within the image"
             )
-        start = tuple(float(np.nanmean(middle[k, :, k])) for k in range(2))
+        x, y = (float(np.nanmean(middle[k, :, k])) for k in range(2))
+        start = x, y
     return start

@@ -1,13 +1,15 @@
 """Gap of an etalon from lines of known wavelength: the method of exact fractions.
 
 The order at the centre is 2 n gap / wavelength = N + e, with N a whole number that a frame does not
-tell and e the fractional order that it does. Each N of the first line gives a gap; the other lines
-allow only those whose fractions come out as measured (Benoit 1898, J. Phys. Theor. Appl. 7, 57;
-Born & Wolf 1999, Principles of Optics, 7th ed., section 7.6.3).
+determine and e the fractional order that it does. Each N of the first line gives a gap; the other
+lines allow only those whose fractions come out as measured (Benoit 1898, J. Phys. Theor. Appl. 7,
+57; Born & Wolf 1999, Principles of Optics, 7th ed., section 7.6.3).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -83,9 +85,9 @@ class Gap(Tabular):
 
 @checked_arguments
 def gap_from_fractions(
-    fraction,
-    fraction_std,
-    wavelength,
+    fraction: Any,
+    fraction_std: Any,
+    wavelength: Any,
     nominal: float | None = None,
     tolerance: float | None = None,
     refractive_index: float = 1.0,
@@ -135,7 +137,12 @@ def gap_from_fractions(
 
 
 def gap_of_covariance(
-    fraction, covariance, wavelength, nominal, tolerance, refractive_index=1.0
+    fraction: Sequence[float] | np.ndarray,
+    covariance: np.ndarray,
+    wavelength: Sequence[float] | np.ndarray,
+    nominal: float | None,
+    tolerance: float | None,
+    refractive_index: float = 1.0,
 ) -> Gap:
     """As `gap_from_fractions`, of fractions whose errors have a covariance."""
     e, length = np.array(fraction, float), np.array(wavelength, float)
@@ -152,8 +159,8 @@ def gap_of_covariance(
         max(math.ceil((low - reach) * per_gap[0] - e[0]), 0),
         math.floor((high + reach) * per_gap[0] - e[0]) + 1,
     )
-    rough = (first + e[0]) / per_gap[0]
-    order = np.round(rough[:, None] * per_gap - e)
+    coarse = (first + e[0]) / per_gap[0]
+    order = np.round(coarse[:, None] * per_gap - e)
     order[:, 0] = first
     weight = np.linalg.inv(covariance)
     spread = 1 / math.sqrt(float(per_gap @ weight @ per_gap))
@@ -188,7 +195,7 @@ def gap_of_covariance(
     )
 
 
-def _mean(gap, misfit, spread):
+def _mean(gap: np.ndarray, misfit: np.ndarray, spread: float) -> tuple[float, float]:
     """Mean and standard deviation of gaps that are as likely as their misfit allows."""
     weight = np.exp(-(misfit - misfit.min()) / 2)
     weight /= weight.sum()
@@ -196,7 +203,14 @@ def _mean(gap, misfit, spread):
     return mean, math.sqrt(weight @ (gap - mean) ** 2 + spread**2)
 
 
-def _check(e, std, length, nominal, tolerance, refractive_index) -> None:
+def _check(
+    e: np.ndarray,
+    std: np.ndarray,
+    length: np.ndarray,
+    nominal: float | None,
+    tolerance: float | None,
+    refractive_index: float,
+) -> None:
     if not len(e) == len(std) == len(length) >= 2:
         raise InputError(
             f"wavelength: {len(length)} for {len(e)} fractions are not allowed; expected one for "
@@ -211,9 +225,10 @@ def _check(e, std, length, nominal, tolerance, refractive_index) -> None:
             raise InputError(f"{name}: {values[~good][0]:g} is not allowed; expected {expected}")
     if np.ptp(length) < 1e-9 * length.max():
         raise InputError(f"wavelength: {length[0]:g} m twice; expected different lines")
-    if (nominal is None) != (tolerance is None):
-        raise InputError("nominal: one of nominal and tolerance alone; expected both")
-    if nominal is not None and not (0 < nominal <= LARGEST and 0 < tolerance <= LARGEST):
+    if nominal is None or tolerance is None:
+        if nominal is not tolerance:
+            raise InputError("nominal: one of nominal and tolerance alone; expected both")
+    elif not (0 < nominal <= LARGEST and 0 < tolerance <= LARGEST):
         raise InputError(
             f"nominal: {nominal:g} m within {tolerance:g} m is not allowed; expected both above 0 "
             f"and up to {LARGEST:g} m"
@@ -224,7 +239,7 @@ def _check(e, std, length, nominal, tolerance, refractive_index) -> None:
 
 @checked_arguments
 def gap_from_lines(
-    rings: Rings, wavelength, nominal: float | None = None, tolerance: float | None = None
+    rings: Rings, wavelength: Any, nominal: float | None = None, tolerance: float | None = None
 ) -> Gap:
     """Gap of an etalon from rings of two or three lines of known wavelength.
 

@@ -48,7 +48,7 @@ class Geometry:
     tilt: tuple[float, float] = (0.0, 0.0)
     distortion: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not all(abs(angle) < math.pi / 6 for angle in self.tilt):
             raise InputError(f"tilt: {self.tilt} rad is not allowed; expected less than 30 degrees")
         if not abs(self.distortion) < 0.1:

@@ -83,9 +83,9 @@ class RingFit:
     rings : torch.Tensor
         Rings that were detected.
     outliers : torch.Tensor
-        Fraction of the cells that was left out.
+        Fraction of the cells that was masked.
     sensitivity : torch.Tensor, shape (images, 8)
-        Change of v_los with what the model's calibration left uncertain (`RingModel.systematic`).
+        Change of v_los per error of the model's calibration (`RingModel.systematic`).
     systematic : torch.Tensor, shape (8, 8)
         The covariance of that.
     """
@@ -125,8 +125,8 @@ class RingFit:
 def difference(received: SpeedsOfRings, emitted: SpeedsOfRings) -> tuple[torch.Tensor, ...]:
     """v_LOS of received images less that of images of the laser itself, with standard deviations.
 
-    An error of the order at the centre, by a drift of etalon or laser, cancels. So does what the
-    calibration left uncertain, as far as both images respond alike.
+    An error of the order at the centre, by a drift of etalon or laser, cancels. So does an error of
+    the calibration, as far as both images respond equally.
 
     Returns
     -------
@@ -170,7 +170,7 @@ def fit_rings(
         Fitted parameters; all that the model has if not given. The others stay at the model's
         values, the background at 0.
     response : torch.Tensor, shape (height, width), optional
-        Of the pixels to light, 1 on average; pixels of response 0 are left out. For ``annular``.
+        Of the pixels to light, 1 on average; pixels of response 0 are masked. For ``annular``.
     saturation : float, optional
         Electrons from which a pixel is saturated. Images that end in a plateau are refused even
         if it is not given.
@@ -216,7 +216,7 @@ def annular_waves(
     model: RingModel,
     centre: tuple[float, float],
     response: torch.Tensor | None = None,
-    device="cpu",
+    device: str | torch.device = "cpu",
     derivatives: bool = False,
 ) -> Waves:
     """The annular fit's cells about a centre, and the waves of rings over them."""
@@ -268,7 +268,7 @@ class _Task(NamedTuple):
         return self._replace(response=torch.where(bad, 0.0, given))
 
 
-def _fit(images, task: _Task, number: int, method: str) -> RingFit:
+def _fit(images: torch.Tensor, task: _Task, number: int, method: str) -> RingFit:
     """`fit_rings` for some of the images, from the ``number``-th on.
 
     If one is refused, each is fitted alone; what is refused then, without its bright patches.
@@ -286,7 +286,7 @@ def _fit(images, task: _Task, number: int, method: str) -> RingFit:
     return replace(fit, outliers=fit.outliers + bright.double().mean())
 
 
-def _fit_together(images, task: _Task, number: int, method: str) -> RingFit:
+def _fit_together(images: torch.Tensor, task: _Task, number: int, method: str) -> RingFit:
     """Cells are common, about the middle of the centres; an image far from it gets its own."""
     mean = images.mean(0, dtype=torch.float32)
     centre = task.centre or gradient_centre(mean, task.response)
@@ -312,7 +312,7 @@ def _fit_together(images, task: _Task, number: int, method: str) -> RingFit:
     return fit
 
 
-def _without_spots(fit: RingFit, images, task: _Task, number: int) -> RingFit:
+def _without_spots(fit: RingFit, images: torch.Tensor, task: _Task, number: int) -> RingFit:
     """Images that fit poorly again, without their hot and dead pixels, if they have any."""
     for k in (fit.chi_square > POOR).nonzero()[:, 0].tolist():
         bad = spots(images[k].double(), task.noise)
@@ -345,7 +345,9 @@ def _check(fit: RingFit, task: _Task, number: int) -> None:
             )
 
 
-def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit:
+def _fit_about(
+    centre: tuple[float, float], images: torch.Tensor, task: _Task, number: int, method: str
+) -> RingFit:
     """`_fit` with cells about the one centre, unchecked."""
     model, noise = task.model, task.noise
     annular = _waves(model, centre, task.response, images.device)
@@ -377,10 +379,13 @@ def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit
     return RingFit(values, std, chi_square, rings, end.outliers, sensitivity, systematic)
 
 
-def _start(model, waves, means, noise, number) -> torch.Tensor:
+def _start(
+    model: RingModel, waves: Waves, means: torch.Tensor, noise: PixelNoise, number: int
+) -> torch.Tensor:
     """Parameters from the first harmonic over the order: a linear fit, no guess needed."""
     cells = waves.cells
     fraction = orders(model, cells.r2)[1]
+    # the phase of the first harmonic is the fraction of the order, for any finesse
     turns = torch.stack(
         [
             torch.ones_like(fraction),
@@ -412,15 +417,15 @@ def _start(model, waves, means, noise, number) -> torch.Tensor:
     return parameters
 
 
-def _sensitivity(waves, end: Scored, task: _Task) -> torch.Tensor:
-    """Change of the fitted speed with what was taken as known, (images, 8).
+def _sensitivity(waves: Waves, end: Scored, task: _Task) -> torch.Tensor:
+    """Change of the fitted speed per error of the calibration, (images, 8).
 
     A change d of the instrument moves the fit by -F^-1 J^T W (dmu/dd) d.
     """
     model = task.model
     exact = ring_waves(model, waves.cells, derivatives=True)
     mean, jacobian = mean_and_jacobian(model, exact, end.parameters, [*task.free, *INSTRUMENT])
-    weight = end.kept[0] * waves.cells.count / cell_variance(mean, end.parameters, task.noise)
+    weight = end.used[0] * waves.cells.count / cell_variance(mean, end.parameters, task.noise)
     free, known = jacobian.split([len(task.free), len(INSTRUMENT)], 1)
     information = prior_information(model, task.free, mean.device)
     fisher = torch.diag(information) + fisher_matrix(free, weight)
@@ -430,7 +435,9 @@ def _sensitivity(waves, end: Scored, task: _Task) -> torch.Tensor:
     return -torch.cat([torch.ones_like(first[:, :1]), first], 1)
 
 
-def _rings(model, waves, means, end: Scored, noise) -> torch.Tensor:
+def _rings(
+    model: RingModel, waves: Waves, means: torch.Tensor, end: Scored, noise: PixelNoise
+) -> torch.Tensor:
     """Orders whose rings are significant and at least half as strong as fitted."""
     cells, parameters = waves.cells, end.parameters
     v, dx, dy, level, background = (

@@ -267,7 +267,8 @@ def _in_single(waves: Waves) -> Waves:
     """Waves in single precision: half of the time, 0.005 standard errors of a bright frame off."""
     cells = waves.cells
     spread = None if cells.spread is None else cells.spread.float()
-    cells = cells._replace(
+    cells = replace(
+        cells,
         count=cells.count.float(),
         x=cells.x.float(),
         y=cells.y.float(),

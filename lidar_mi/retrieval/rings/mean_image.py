@@ -235,7 +235,7 @@ def parameter_vector(
     background: float = 0.0,
     centre: tuple[float, float] | None = None,
     temperature: float | None = None,
-    device="cpu",
+    device: str | torch.device = "cpu",
 ) -> torch.Tensor:
     """Parameters (1, `PARAMETERS`) of an image with this number of signal electrons.
 
@@ -270,7 +270,7 @@ def parameter_vector(
 def pixel_waves(
     model: RingModel,
     centre: tuple[float, float] | None = None,
-    device="cpu",
+    device: str | torch.device = "cpu",
     derivatives: bool = False,
 ) -> Iterator[Waves]:
     """Waves over every pixel as a cell of its own, in blocks of rows by row."""
@@ -288,7 +288,7 @@ def expected(
     background: float = 0.0,
     centre: tuple[float, float] | None = None,
     temperature: float | None = None,
-    device="cpu",
+    device: str | torch.device = "cpu",
 ) -> torch.Tensor:
     """Mean image, electrons, shape (height, width), float64.
 
@@ -323,7 +323,9 @@ def mean_image(
     return torch.cat(parts).reshape(model.shape)
 
 
-def _light(model, cells, r2, parameters) -> torch.Tensor:
+def _light(
+    model: RingModel, cells: Cells, r2: torch.Tensor, parameters: torch.Tensor
+) -> torch.Tensor:
     falloff = parameters[:, PARAMETERS.index("falloff"), None]
     exponent = r2 * (-falloff / model.half_diagonal**2)
     uneven = [name for name in model.smooth if name in LIGHT]
@@ -332,7 +334,9 @@ def _light(model, cells, r2, parameters) -> torch.Tensor:
     return exponent.exp_()
 
 
-def _smooth(model, cells, parameters, names) -> torch.Tensor:
+def _smooth(
+    model: RingModel, cells: Cells, parameters: torch.Tensor, names: Sequence[str]
+) -> torch.Tensor:
     """Sum of smooth terms times their parameters, (images, cells)."""
     # 0 for the others: less work than to pick the terms of all cells
     amplitudes = parameters.new_zeros(len(parameters), len(model.smooth))
@@ -341,7 +345,7 @@ def _smooth(model, cells, parameters, names) -> torch.Tensor:
     return amplitudes @ cells.terms.T
 
 
-def _by_r2(model, cosine) -> torch.Tensor:
+def _by_r2(model: RingModel, cosine: torch.Tensor) -> torch.Tensor:
     """Derivative of the order by r^2, 1/px^2."""
     return -model.order_at_centre / 2 * (model.pixel / model.focal_length) ** 2 * cosine**3
 

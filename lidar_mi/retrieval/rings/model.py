@@ -4,7 +4,7 @@ The mean image itself is in `lidar_mi.retrieval.rings.mean_image`.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
@@ -36,7 +36,7 @@ factor exp(-a n - b n^2) of the n-th harmonic: the mirrors' reflectivity and the
 PARAMETERS = (*FRAME, *LIGHT, *BACKGROUND, *INSTRUMENT)
 
 NEGLIGIBLE = 1e-7  # harmonics below this fraction of A_0 change velocities by less than 1e-4 m/s
-# Of the aerosol's narrow line; the harmonics left out are nearly orthogonal to a change of speed.
+# Of the aerosol's narrow line; the omitted harmonics are nearly orthogonal to a change of speed.
 _NEGLIGIBLE_AEROSOL = 1e-4
 
 
@@ -72,9 +72,9 @@ class RingModel:
     light_degree, background_degree : int
         Terms of `LIGHT` and `BACKGROUND` up to this degree are unknown, 0 to 8.
     priors : mapping of (mean, standard deviation)
-        Normal distributions of parameters, from what is known beside the image.
+        Normal distributions of parameters, from other sources than the image.
     systematic : array (8, 8), optional
-        Covariance of what a calibration left uncertain, the same in all images: of the speed at
+        Covariance of the calibration's error, the same in all images: of the speed at
         which the rings are those of order_at_centre (m/s), then of `INSTRUMENT`.
 
     Raises
@@ -90,7 +90,7 @@ class RingModel:
     wavelength: float
     order_at_centre: float
     harmonics: np.ndarray
-    temperatures: Sequence[float] = ()
+    temperatures: np.ndarray = field(default_factory=lambda: np.empty(0))
     falloff: float = 0.0
     aerosol_harmonics: np.ndarray | None = None
     tilt: tuple[float, float] = (0.0, 0.0)
@@ -102,7 +102,7 @@ class RingModel:
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     systematic: np.ndarray | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("pixel", "focal_length", "wavelength", "order_at_centre"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -202,8 +202,8 @@ class RingModel:
             self.distortion,
         )
 
-    def start(self, device="cpu") -> torch.Tensor:
-        """Parameters (1, `PARAMETERS`) that are known before an image is seen; level 1."""
+    def start(self, device: str | torch.device = "cpu") -> torch.Tensor:
+        """Prior means (1, `PARAMETERS`); level 1."""
         values = {
             "level": 1.0,
             "temperature": self.middle_temperature,
@@ -243,7 +243,7 @@ class RingModel:
             for name in ("temperature", "aerosol", "damping", "roughness")
         )
         table = torch.as_tensor(self._polynomials, device=device)
-        by = {}
+        by: dict[str, torch.Tensor] = {}
         if len(table) == 1:
             value = table.expand(len(parameters), -1)
         else:
@@ -308,7 +308,7 @@ class PixelNoise:
     speckle_modes: float = math.inf
     excess: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not (math.isfinite(self.read_noise) and self.read_noise >= 0):
             raise InputError(f"read_noise: {self.read_noise!r} is not allowed; expected 0 or more")
         if not self.speckle_modes > 0:

@@ -118,7 +118,7 @@ def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def blur(r2: np.ndarray, step: float, spacing: float) -> np.ndarray:
-    """What averaging over a pixel and an annulus adds to the spread: their variances in order."""
+    """Increase of the spread by averages over a pixel and an annulus: their variances in order."""
     return 2 * np.pi**2 * (r2 / 3 + step**2 / 12) / spacing**2
 
 
@@ -132,22 +132,23 @@ class Profile:
         self.last = float(self.r2[-1])
         q = self.r2 / self.last
         self.background = np.column_stack([np.ones_like(q), np.sqrt(q), q])
-        self._kept: tuple[float, float, float] | None = None
+        self._stored: tuple[float, float, float] | None = None
         self._waves = np.empty((0, len(q)), complex)
 
     def waves(self, pattern: Pattern) -> np.ndarray:
-        """Harmonics of a line at order 0; those of the last pattern are kept."""
+        """Harmonics of a line at order 0; those of the last pattern are stored."""
         shape = pattern.spacing, pattern.loss, pattern.spread
-        if shape != self._kept:
+        if shape != self._stored:
             spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
             self._waves = _harmonics(self.r2 / pattern.spacing, pattern.loss, spread)
-            self._kept = shape
+            self._stored = shape
         return self._waves
 
     def columns(self, pattern: Pattern) -> np.ndarray:
         """Weighted columns of the linear parameters: background, then each line's envelope."""
         q = self.r2 / self.last
         orders = self.last / pattern.spacing
+        # over few orders an envelope cannot be separated from the background
         degree = 0 if orders < 2.2 else 1 if orders < 4 else 2
         lines = [
             wave * q**k
@@ -164,11 +165,11 @@ class Profile:
 
     def matched(self, pattern: Pattern, bins: int = 64) -> tuple[np.ndarray, np.ndarray]:
         """Fractions, and the height that a further line at each of them would have."""
-        left, columns, _ = self.residual(pattern)
+        residual, columns, _ = self.residual(pattern)
         fraction = np.arange(bins) / bins
         shape = _sums(self.waves(pattern), fraction) * self.root
         shape = shape - np.linalg.solve(_squares(columns), columns.T @ shape.T).T @ columns.T
-        return fraction, shape @ left / np.maximum((shape**2).sum(1), 1e-9)
+        return fraction, shape @ residual / np.maximum((shape**2).sum(1), 1e-9)
 
     def fitted(self, pattern: Pattern, free_spacing: bool = True) -> Pattern:
         """The pattern by nonlinear least squares from a start; heights may come out negative."""
@@ -178,7 +179,7 @@ class Profile:
         low = np.array([1 - reach, *pattern.fraction - 0.3, 0.01, 0.0])
         high = np.array([1 + reach, *pattern.fraction + 0.3, 6.0, 4.0])
 
-        def made(x):
+        def made(x: np.ndarray) -> Pattern:
             return replace(
                 pattern,
                 spacing=pattern.spacing * x[0],
@@ -198,20 +199,22 @@ class Profile:
             xtol=1e-6,
         )
         best = made(found.x)
-        left, columns, linear = self.residual(best)
+        residual, columns, linear = self.residual(best)
         wave = columns[:, 3:] @ linear[3:]
+        # power of the pattern alone: the part that a background would explain is not its own
         basis = np.linalg.qr(columns[:, :3])[0]
         wave = wave - basis @ (basis.T @ wave)
         per_line = linear[3:].reshape(lines, -1)
+        # envelopes are compared at 0.3 of the largest r^2, where most images have rings
         middle = 0.3 ** np.arange(per_line.shape[1])
         height = per_line @ middle
         top = np.abs(height).max() or 1.0
         return replace(
             best,
             height=height / top,
-            unexplained=float(left @ left),
+            unexplained=float(residual @ residual),
             power=float(wave @ wave),
-            freedom=max(len(left) - len(linear) - len(found.x), 1),
+            freedom=max(len(residual) - len(linear) - len(found.x), 1),
         )
 
     def _slopes(self, pattern: Pattern, unit: float) -> np.ndarray:
@@ -239,7 +242,7 @@ class Profile:
         return float(np.abs(linear @ 0.3 ** np.arange(linear.shape[1])).max())
 
     def crest(self, pattern: Pattern) -> np.ndarray:
-        """Value at each line less that one width beside it, without the other lines.
+        """Value at each line less that one width to either side, without the other lines.
 
         Mean over the orders.
         """
@@ -252,9 +255,9 @@ class Profile:
             alone = self.value - parts.sum(1) + parts[:, line]
             orders = np.arange(1, self.last / pattern.spacing - 1)
             place = (orders + fraction) * pattern.spacing
-            beside = pattern.width * pattern.spacing
+            width = pattern.width * pattern.spacing
             middle, low, high = (
-                np.interp(place + by, self.r2, alone) for by in (0.0, -beside, beside)
+                np.interp(place + by, self.r2, alone) for by in (0.0, -width, width)
             )
             found.append((middle - (low + high) / 2).mean() if len(place) else np.inf)
         return np.array(found)
@@ -284,9 +287,10 @@ def strongest_period(profile: Profile) -> float:
     basis = np.linalg.qr(columns)[0]
     value = profile.value * profile.root
     value = value - basis @ (basis.T @ value)
+    # a period of fewer than six annuli is not resolved
     number = min(len(q) // 6, 150)
 
-    def strongest(frequencies):
+    def strongest(frequencies: np.ndarray) -> float:
         wave = np.exp(2j * np.pi * frequencies[:, None] * q) * profile.root
         wave = wave - (wave @ basis) @ basis.T
         along, length, mixed = wave @ value, (np.abs(wave) ** 2).sum(1), (wave**2).sum(1)
@@ -294,12 +298,12 @@ def strongest_period(profile: Profile) -> float:
         power = 2 * (length * np.abs(along) ** 2 - (mixed.conj() * along**2).real)
         return frequencies[np.argmax(power / (length**2 - np.abs(mixed) ** 2))]
 
-    rough = strongest(np.arange(1.2, number, 1 / 8))
-    return profile.last / strongest(rough + np.arange(-32, 33) / 256)
+    coarse = strongest(np.arange(1.2, number, 1 / 8))
+    return profile.last / strongest(coarse + np.arange(-32, 33) / 256)
 
 
 def _folded(profile: Profile, period: float, highest: float) -> float:
-    """What waves of a period, up to a frequency in 1/px^2, leave of a profile unexplained."""
+    """Residual power of a profile after a fit of waves of a period, up to a frequency in 1/px^2."""
     q = profile.r2 / profile.last
     wave = np.exp(2j * np.pi * profile.r2[:, None] / period * np.arange(1, 1 + highest * period))
     columns = np.hstack([profile.background, wave.real, wave.imag])
@@ -312,26 +316,28 @@ def _folded(profile: Profile, period: float, highest: float) -> float:
 def lines_at(profile: Profile, spacing: float, noise: float, most: int = LINES) -> Pattern | None:
     """The fewest lines at about one spacing that explain a profile; None if there are none.
 
-    A further line must be higher than its standard error allows, and twice as high as anything
-    that is left unexplained at other orders, which is what a shape that is not Airy's leaves.
+    A further line must be higher than its standard error allows, and twice as high as the
+    residual at other orders, where a shape that is not Airy's appears.
     """
     starts = [_first(profile, spacing, loss) for loss in (0.12, 0.35, 0.9)]
     best = profile.fitted(min(starts, key=lambda p: float((profile.residual(p)[0] ** 2).sum())))
     if best.height[0] <= 0:
         return None
-    chosen, left = best, profile.matched(best)
+    chosen, further = best, profile.matched(best)
     while len(best.fraction) < most:
         expected = noise * (best.freedom + SIGNIFICANT * math.sqrt(2 * best.freedom))
         if best.unexplained < max(expected, FAINT**2 / 4 * best.power):
             break
         # two further lines may be needed before either helps
-        tried = sorted(map(profile.fitted, _starts(best, left, most)), key=lambda p: p.unexplained)
+        tried = sorted(
+            map(profile.fitted, _starts(best, further, most)), key=lambda p: p.unexplained
+        )
         for one in tried:
             if _plausible(one, profile, noise):
                 chosen = one
                 break
         best = next((one for one in tried if len(one.fraction) < most), tried[0])
-        left = profile.matched(best)
+        further = profile.matched(best)
         if best.height.min() <= 0:
             break
     return _sorted(chosen)
@@ -344,9 +350,9 @@ def _first(profile: Profile, spacing: float, loss: float) -> Pattern:
     return Pattern(spacing, fraction[[height.argmax()]], one, loss, 0.0)
 
 
-def _starts(pattern: Pattern, left, most: int) -> list[Pattern]:
-    """Further lines: where most is left, or the highest line split into two or three."""
-    fraction, height = left
+def _starts(pattern: Pattern, further: tuple[np.ndarray, np.ndarray], most: int) -> list[Pattern]:
+    """Further lines: at the highest of `Profile.matched`, or the highest line in two or three."""
+    fraction, height = further
     top = int(pattern.height.argmax())
     others = np.delete(pattern.fraction, top)
     half = max(0.35 * pattern.width, 0.02)
@@ -378,8 +384,8 @@ def _plausible(pattern: Pattern, profile: Profile, noise: float) -> bool:
     # flank must be high, or it mends a shape that is not Airy's
     nearest = np.minimum(distance, np.roll(distance, 1))[np.argsort(np.argsort(fractions))]
     crest = profile.crest(pattern) / top > CREST * pattern.height
-    apart = nearest > 1.2 * pattern.width
-    return bool(np.where(apart, crest, pattern.height > FLANK).all())
+    separate = nearest > 1.2 * pattern.width
+    return bool(np.where(separate, crest, pattern.height > FLANK).all())
 
 
 def _sorted(pattern: Pattern) -> Pattern:
@@ -395,7 +401,7 @@ def find_pattern(
 
     The strongest wave of the profile is a harmonic of the order. Of its multiples the shortest
     wins, unless a longer one explains a fraction MATERIAL more of the pattern's power: lines at
-    equal distances are one line of a shorter spacing, for all that an image can tell.
+    equal distances cannot be distinguished from one line of a shorter spacing.
     """
     if spacing is not None:
         found = lines_at(profile, spacing, noise)
@@ -403,12 +409,12 @@ def find_pattern(
     base = strongest_period(profile)
     tried: dict[int, Pattern] = {}
     multiples = [m for m in range(1, MULTIPLES + 1) if profile.last >= ORDERS * m * base]
-    rest = [_folded(profile, m * base, HARMONICS / base) for m in multiples]
-    for multiple, left in zip(multiples, rest, strict=True):
+    residual = [_folded(profile, m * base, HARMONICS / base) for m in multiples]
+    for multiple, remaining in zip(multiples, residual, strict=True):
         power = max((p.power for p in tried.values()), default=math.inf)
         first = min(tried.values(), key=lambda p: p.unexplained, default=None)
         # no shape of this period explains materially more than what has been tried
-        less = (min(rest[: multiples.index(multiple)], default=math.inf)) - left
+        less = (min(residual[: multiples.index(multiple)], default=math.inf)) - remaining
         if first is not None and less < MATERIAL / DOUBTFUL * power:
             continue
         found = lines_at(profile, multiple * base, noise)
@@ -418,7 +424,7 @@ def find_pattern(
         return None
     power = max(p.power for p in tried.values())
 
-    def gain(short, long):
+    def gain(short: int, long: int) -> float:
         """Of the pattern's power, what the longer spacing explains in addition; 0 for noise."""
         more = tried[short].unexplained - tried[long].unexplained
         if more < 40 * noise or repeats(tried[long]):
@@ -430,13 +436,13 @@ def find_pattern(
         if max(rest.values(), default=0.0) < MATERIAL:
             break
     doubt = [m for m, g in rest.items() if g > MATERIAL / DOUBTFUL]
-    said = ""
+    doubts = ""
     if doubt:
-        said = f"the spacing may be {doubt[0] / chosen:.3g} times as large, with further lines"
+        doubts = f"the spacing may be {doubt[0] / chosen:.3g} times as large, with further lines"
     shorter = [m for m in tried if m < chosen and chosen % m == 0]
-    if not said and shorter and gain(shorter[-1], chosen) < DOUBTFUL * MATERIAL:
-        said = f"the spacing may be {chosen // shorter[-1]} times smaller, with fewer lines"
-    return tried[chosen], said
+    if not doubts and shorter and gain(shorter[-1], chosen) < DOUBTFUL * MATERIAL:
+        doubts = f"the spacing may be {chosen // shorter[-1]} times smaller, with fewer lines"
+    return tried[chosen], doubts
 
 
 def repeats(pattern: Pattern) -> bool:

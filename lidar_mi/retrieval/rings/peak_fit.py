@@ -16,7 +16,7 @@ def peaks(
     Parameters
     ----------
     x, values : arrays (N,)
-        NaN values are left out.
+        NaN values are masked.
     starts : sequence of float
         Approximate positions of the peaks, ascending.
     reach : float
@@ -33,12 +33,12 @@ def peaks(
     InputError
         A peak that is not within 0.7 ``reach`` of its start.
     """
-    starts = np.asarray(starts, float)
+    first_guess = np.asarray(starts, float)
     failed = InputError(
-        f"rings: no peak within {reach:.3g} of {starts[0]:.4g}; expected a ring there"
+        f"rings: no peak within {reach:.3g} of {first_guess[0]:.4g}; expected a ring there"
     )
-    near = (x >= starts[0] - reach) & (x <= starts[-1] + reach) & np.isfinite(values)
-    number = len(starts)
+    near = (x >= first_guess[0] - reach) & (x <= first_guess[-1] + reach) & np.isfinite(values)
+    number = len(first_guess)
     if near.sum() < 5 + 2 * number:
         raise failed
     x, values = x[near], values[near]
@@ -46,35 +46,35 @@ def peaks(
     slopes = np.empty((2 + 2 * number + slope, len(x)))  # of the model, parameter by parameter
     slopes[1] = 1.0
     if slope:
-        slopes[-1] = (x - starts[0]) / reach
+        slopes[-1] = (x - first_guess[0]) / reach
     by_place, bells = slopes[2 : 2 + number], slopes[2 + number : 2 + 2 * number]
 
-    def shapes(parameters):
+    def shapes(parameters: np.ndarray) -> np.ndarray:
         """Distances from the peaks in widths; the Gaussians go to ``bells``."""
         away = (x - parameters[2 : 2 + number, None]) / parameters[0]
         np.exp(-0.5 * away * away, out=bells)
         return away
 
-    def misfit(parameters):
+    def misfit(parameters: np.ndarray) -> np.ndarray:
         shapes(parameters)
         # linear in all but width and places
         return parameters[1] + parameters[2 + number :] @ slopes[2 + number :] - values
 
-    def jacobian(parameters):
+    def jacobian(parameters: np.ndarray) -> np.ndarray:
         away = shapes(parameters)
         heights = parameters[2 + number : 2 + 2 * number, None]
         np.multiply(away * bells, heights / parameters[0], out=by_place)
         slopes[0] = (away * by_place).sum(0)
         return slopes
 
-    guess = (reach / 2, low, *starts, *[high - low] * number, *[0.0] * slope)
+    guess = (reach / 2, low, *first_guess, *[high - low] * number, *[0.0] * slope)
     found, covariance, *_, end = leastsq(
         misfit, guess, Dfun=jacobian, col_deriv=True, full_output=True, maxfev=3000
     )
     if end not in (1, 2, 3, 4) or covariance is None:
         raise failed
     places, heights = found[2 : 2 + number], found[2 + number : 2 + 2 * number]
-    if not (np.all(np.abs(places - starts) < 0.7 * reach) and np.all(heights > 0)):
+    if not (np.all(np.abs(places - first_guess) < 0.7 * reach) and np.all(heights > 0)):
         raise failed
     return places
 

@@ -133,18 +133,17 @@ def ring_radius(
     if method == "ml" and coordinate != "r":
         raise InputError(f"coordinate: {coordinate!r} is not allowed with ml; expected r")
     inside(*centre, image.shape)
-    if average is None and (method == "ca" or not radius):
-        average = circular_average(image, centre)
-    radius = radius or innermost(average)
+    if method == "ca" or not radius:
+        average = average or circular_average(image, centre)
+        r, mean, _ = average
+        radius = radius or innermost(average)
     if method == "ml":
         points = midpoint_points(image, centre, radius, piece * radius).reshape(-1, 2)
         distance = np.hypot(*(points - centre).T)
         if not np.isfinite(distance).any():
             raise InputError("rings: no crest on any midpoint line; expected a ring")
         return float(np.nanmean(distance))
-    if method == "ca":
-        r, mean, _ = average
-    else:
+    if method == "sg":
         cuts = savitzky_golay(radial_cuts(image, centre))
         reached = np.isfinite(cuts).any(0)
         r, mean = np.flatnonzero(reached).astype(float), np.nanmean(cuts[:, reached], 0)

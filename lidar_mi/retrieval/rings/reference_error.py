@@ -3,7 +3,7 @@
 The laser's own light sets the zero of the speeds. Three things move the zero between its frame and
 the echo's: a drift of the laser's frequency, a drift of the etalon, and defects of the plates where
 laser and echo fill the pupil differently. All of them move the rings as a speed does, so that
-chi-square stays 1. They are stated from what is known of the instrument beside the images.
+chi-square stays 1. They follow from properties of the instrument that no image shows.
 
 A change dd of the mean gap d that the light passes changes its order 2 d / wavelength as a speed of
 
@@ -43,7 +43,7 @@ class Filling:
     radius: float = 1.0
     shift: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not (0 < self.radius <= 1 and abs(self.shift) <= 1):
             raise InputError(
                 f"filling: radius {self.radius!r}, shift {self.shift!r} are not allowed; expected "
@@ -98,7 +98,7 @@ class ReferenceUncertainty:
     air: Filling = Filling()
     scrambling: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in (f.name for f in fields(self) if f.name not in ("laser", "air")):
             value, positive = getattr(self, name), name in ("wavelength", "gap")
             if not (math.isfinite(value) and value >= 0 and (value > 0 or not positive)):

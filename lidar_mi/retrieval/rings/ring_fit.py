@@ -5,9 +5,9 @@ its own, both smooth in r: illumination, vignetting and sloping light do not ent
 errors come from the residuals alone, sector by sector, so that nothing needs to be known of the
 camera: the sectors' scores are summed with their neighbours' in a window as wide as their
 correlation (Newey and West 1987, Econometrica 55, 703; Andrews 1991, Econometrica 59, 817), and
-scaled to be exact for white noise. Where neighbouring sectors deviate alike, as by uneven plates,
-the fit takes up much of it. Then errors are by how the fit changes when a block of sectors is left
-out (jackknife: Bell and McCaffrey 2002, Survey Methodology 28, 169), each line of its own.
+scaled to be exact for white noise. Where errors of neighbouring sectors correlate, as by uneven
+plates, the fit absorbs much of them. Then errors follow from the change of the fit without a block
+of sectors (jackknife: Bell and McCaffrey 2002, Survey Methodology 28, 169), each line of its own.
 """
 
 import warnings
@@ -21,7 +21,7 @@ from lidar_mi.retrieval.rings.frames import inside
 from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
 from lidar_mi.retrieval.rings.sectors import SECTORS, Hidden, RingCurves, Sectors
 
-BLOCKS = 6  # of neighbouring sectors, one of which is left out
+BLOCKS = 6  # of neighbouring sectors, one of which is omitted
 OUTLIER = 6.0  # standard deviations of an annulus's cells
 ROUNDS = 6
 HIDDEN = 0.3  # of the usual ring, the height below which a ring is hidden
@@ -48,7 +48,7 @@ class CurveFit:
     roundness : float
         Rms deviation of the crests from the curves, px.
     uneven : bool
-        Whether crests of neighbouring sectors deviate alike.
+        Whether deviations of neighbouring sectors' crests correlate.
     """
 
     geometry: RingCurves
@@ -85,7 +85,7 @@ def fit_all(
         sectors = Sectors(image, geometry, hidden)
         system = _System(sectors, pattern, deviation, free)
         if not system.fitted[2:].any() and any((*geometry.ellipticity, *geometry.tilt)):
-            # what is not fitted is no shape that was found on the way
+            # a shape of an earlier round that is no longer fitted
             geometry = RingCurves(geometry.centre)
             sectors = Sectors(image, geometry, hidden)
             system = _System(sectors, pattern, deviation, free)
@@ -134,8 +134,8 @@ def fit_all(
 def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
     """Where the rings of a pattern are lower than `HIDDEN` of the usual ring, for certain.
 
-    The height of a ring in a sector is by least squares over an order about it, beside a level and
-    a slope.
+    The height of a ring in a sector is by least squares over an order about it, together with a
+    level and a slope.
     """
     if pattern is None:
         return None
@@ -172,7 +172,13 @@ def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
 class _System:
     """Normal equations of one round, sector by sector."""
 
-    def __init__(self, sectors: Sectors, pattern: Pattern, deviation, free: bool):
+    def __init__(
+        self,
+        sectors: Sectors,
+        pattern: Pattern,
+        deviation: dict[tuple[int, int], float],
+        free: bool,
+    ) -> None:
         self.sectors, self.pattern = sectors, pattern
         self.order, self.line, shared = _visible(sectors, pattern)
         shaped = bool((shared >= ALL_AROUND * SECTORS).sum() >= 2)
@@ -181,11 +187,11 @@ class _System:
         self.geometry_slots = int(self.fitted.sum())
         lines = len(pattern.fraction)
         q = sectors.r2
-        bend = self._bends(q)
+        shift = self._ring_shifts(q)
         known = np.array([deviation.get(key, 0.0) for key in self.keys])
         phase = pattern.phase(q)
         for j in range(lines):
-            phase[j] -= known[self.line == j] @ bend[self.line == j]
+            phase[j] -= known[self.line == j] @ shift[self.line == j]
         spread = pattern.spread + blur(q, sectors.step, pattern.spacing)
         wave, slope, by_loss, by_spread = np.stack(
             [airy(of_line, pattern.loss, spread) for of_line in phase], 1
@@ -194,11 +200,12 @@ class _System:
         along_q = (height * slope / pattern.spacing).sum(0)
         total = (height * wave).sum(0)
         # shared by all sectors: rings, further lines' heights, shape
+        # the height of the highest line is that of the sectors, so it is not free a second time
         low = int(pattern.height.argmax())
         others = [j for j in range(lines) if j != low]
         shared = np.vstack(
             [
-                -(height * slope)[self.line] * bend,
+                -(height * slope)[self.line] * shift,
                 wave[others],
                 (height * by_loss).sum(0)[None],
                 (height * by_spread).sum(0)[None],
@@ -210,10 +217,11 @@ class _System:
         smooth = np.stack([np.ones_like(q), np.sqrt(q1), q1, total, q1 * total], -1)
         smooth = np.repeat(smooth[None], SECTORS, 0)
         # about a single ring, a height that changes is hardly another than a shift
-        extent = np.where(sectors.seen > 0, q, 0).max(1)
+        extent = np.where(sectors.used > 0, q, 0).max(1)
         smooth[extent < TWO_RINGS * pattern.spacing, :, 4] = 0
-        root = np.sqrt(sectors.seen)
+        root = np.sqrt(sectors.used)
         keep = np.ones_like(root)
+        # dust is only visible after a first fit without its mask
         for _ in range(2):
             weight = root * keep
             nuisance = smooth * weight[..., None]
@@ -225,44 +233,48 @@ class _System:
             linear = np.stack(
                 [np.linalg.lstsq(a, b, rcond=1e-8)[0] for a, b in zip(nuisance, value, strict=True)]
             )
+            # height of the rings in the sector, by which its shifts change the values
             local = linear[:, 3, None] + linear[:, 4, None] * q1
-            left = sectors.value - np.einsum("sqk,sk->sq", smooth, linear)
-            left = left - local * along_q * sectors.offset
-            keep = keep * _usual(left, weight)
+            residual = sectors.value - np.einsum("sqk,sk->sq", smooth, linear)
+            residual = residual - local * along_q * sectors.offset
+            keep = keep * _usual(residual, weight)
         columns = np.concatenate([moved, np.broadcast_to(shared.T, (SECTORS, *shared.T.shape))], -1)
         columns = columns * (local * root * keep)[..., None]
-        left = left * root * keep
+        residual = residual * root * keep
         self.columns = columns - basis @ (basis.transpose(0, 2, 1) @ columns)
-        self.left = left - (basis @ (basis.transpose(0, 2, 1) @ left[..., None]))[..., 0]
+        # background and height of each sector are eliminated: what is orthogonal to them remains
+        absorbed = basis @ (basis.transpose(0, 2, 1) @ residual[..., None])
+        residual = residual - absorbed[..., 0]
         self.ring_slots = self.geometry_slots + np.arange(len(self.order))
         turned = self.columns.transpose(0, 2, 1)
-        self.matrix, self.score = turned @ self.columns, (turned @ self.left[..., None])[..., 0]
+        self.matrix, self.score = turned @ self.columns, (turned @ residual[..., None])[..., 0]
         whole = self.matrix.sum(0)
+        # px and orders differ by powers of ten: the pseudo-inverse needs a unit diagonal
         size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         self.inverse = np.linalg.pinv(whole / np.outer(size, size), 1e-10, hermitian=True)
         self.inverse /= np.outer(size, size)
         used = keep * root > 0
         cells = used.sum() - 5 * used.any(1).sum() - len(size)
-        self.variance = float((self.left**2).sum() / max(cells, 1))
+        self.variance = float((residual**2).sum() / max(cells, 1))
         self.width = self._width()
 
-    def _bends(self, q):
-        """What each ring's deviation adds to its line's order at every annulus: linear between."""
-        bend = np.zeros((len(self.order), len(q)))
+    def _ring_shifts(self, q: np.ndarray) -> np.ndarray:
+        """Change of a line's order at every annulus per deviation of each ring, linear between."""
+        shift = np.zeros((len(self.order), len(q)))
         for j in range(len(self.pattern.fraction)):
             of_line = np.flatnonzero(self.line == j)
             if not len(of_line):
                 continue
             place = (self.order[of_line] + self.pattern.fraction[j]) * self.pattern.spacing
             for k, ring in enumerate(of_line):
-                bend[ring] = np.interp(q, place, np.eye(len(of_line))[k])
-        return bend
+                shift[ring] = np.interp(q, place, np.eye(len(of_line))[k])
+        return shift
 
-    def solved(self):
+    def solved(self) -> tuple[np.ndarray, np.ndarray]:
         """Step of Gauss and Newton, and its standard errors for white noise."""
         return self.inverse @ self.score.sum(0), np.sqrt(self.variance * np.diag(self.inverse))
 
-    def parts(self, vector):
+    def parts(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Six of the geometry, one of each ring, of each line's height, two of the shape."""
         first, rings = self.geometry_slots, len(self.order)
         geometry = np.zeros(6)
@@ -271,16 +283,17 @@ class _System:
         heights[self.others] = vector[first + rings : len(vector) - 2]
         return geometry, vector[first : first + rings], heights, vector[-2:]
 
-    def covariance(self):
+    def covariance(self) -> np.ndarray:
         """Of all parameters, from the sectors' scores and their neighbours'."""
         return self._of_blocks() if self.width else self._of_neighbours()
 
-    def _of_neighbours(self):
+    def _of_neighbours(self) -> np.ndarray:
         lag = np.abs(np.arange(SECTORS)[:, None] - np.arange(SECTORS))
         lag = np.minimum(lag, SECTORS - lag)
+        # Bartlett's window: positive semidefinite, so that no variance is negative
         window = np.maximum(1 - lag / (1 + self.width), 0.0)
         meat = self.score.T @ window @ self.score
-        # what white noise of variance 1 would give, less what the fit takes from its residuals
+        # expectation for white noise of variance 1, less the part that the fit absorbs
         leverage = self.matrix @ self.inverse
         white = np.einsum("ss,sab->ab", window, self.matrix)
         white = white - np.einsum("st,sab,tcb->ac", window, leverage, self.matrix)
@@ -288,14 +301,15 @@ class _System:
         scale = np.sqrt(np.diag(self.inverse) / np.maximum(expected, 1e-3 * np.diag(self.inverse)))
         return self.inverse @ meat @ self.inverse * np.outer(scale, scale)
 
-    def _of_blocks(self):
-        """Changes of the fit without a block, squared; mean over where blocks begin."""
+    def _of_blocks(self) -> np.ndarray:
+        """Squared changes of the fit without each block; mean over the offsets of the blocks."""
         whole = self.matrix.sum(0)
         size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         outer = np.outer(size, size)
         total = np.zeros_like(whole)
         length = SECTORS // BLOCKS
         for first in range(length):
+            # the result must not depend on where the first block begins
             block = (np.arange(SECTORS) + first) // length % BLOCKS
             for number in range(BLOCKS):
                 matrix = whole - self.matrix[block == number].sum(0)
@@ -304,10 +318,11 @@ class _System:
                 total += np.outer(change, change) / length
         return total
 
-    def _shifts(self):
+    def _shifts(self) -> tuple[np.ndarray, np.ndarray]:
         """Shift of every ring in every sector, orders, NaN where it has none; its information."""
         slots = self.ring_slots
         information = self.matrix[:, slots, slots].T
+        # where a sector has little of a ring, its shift would be noise
         least = 1e-2 * np.median(information[information > 0])
         shift = np.where(information > least, self.score[:, slots].T, np.nan)
         return shift / np.maximum(information, least), information
@@ -323,6 +338,7 @@ class _System:
             return 0.0
         # the harmonics that the geometry takes make neighbours of white noise anticorrelated
         correlation = product / power + (1 + self.geometry_slots) / SECTORS
+        # of white noise the estimate scatters by one over the root of the number of pairs
         if correlation < 2.5 / np.sqrt(both.sum()):
             return 0.0
         rho = min(correlation, 0.9)
@@ -340,7 +356,7 @@ class _System:
 def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
     """Order, line and number of sectors of the rings in enough of them, by their radius."""
     found = []
-    present = (sectors.seen > 0).sum(0)
+    present = (sectors.used > 0).sum(0)
     half = 0.5 * pattern.width * pattern.spacing
     for line, fraction in enumerate(pattern.fraction):
         for order in range(int(sectors.r2[-1] / pattern.spacing) + 1):
@@ -354,9 +370,9 @@ def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
     return np.array([f[1:] for f in found]).T
 
 
-def _usual(left: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _usual(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Cells that are no dust and no reflection: near the median of their annulus."""
-    reduced = np.where(weight > 0, left * weight, np.nan)
+    reduced = np.where(weight > 0, residual * weight, np.nan)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # an annulus without cells
         off = reduced - np.nanmedian(reduced, 0)

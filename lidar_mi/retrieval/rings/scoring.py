@@ -12,12 +12,12 @@ import torch
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.bound import fisher_matrix, prior_information, standard_deviations
-from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, reach
+from lidar_mi.retrieval.rings.mean_image import Waves, mean_and_jacobian, reach
 from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
 
 ITERATIONS = 40
 CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converged
-# Cells beyond so many standard deviations hold hot pixels or dust and are left out, unless more
+# Cells beyond so many standard deviations hold hot pixels or dust and are masked, unless more
 # than this fraction is: then the model is wrong, and chi-square shall say so.
 OUTLIER, MOST_OUTLIERS = 5.0, 0.03
 POOR = 1.2  # chi-square of a fit that something is wrong with
@@ -31,39 +31,40 @@ class Scored(NamedTuple):
     chi_square: torch.Tensor
     freedom: int
     outliers: torch.Tensor
-    kept: list[torch.Tensor]
+    used: list[torch.Tensor]
 
 
 def robust_scoring(
-    blocks,
-    means,
-    parameters,
+    blocks: Sequence[Waves],
+    means: Sequence[torch.Tensor],
+    parameters: torch.Tensor,
     model: RingModel,
     noise: PixelNoise,
     names: Sequence[str],
     number: int,
 ) -> Scored:
     """Fisher scoring, again without cells that are far outside the noise."""
-    kept = [torch.ones_like(part, dtype=torch.bool) for part in means]
+    used = [torch.ones_like(part, dtype=torch.bool) for part in means]
     for _ in range(4):
-        end = _scoring(blocks, means, kept, parameters, model, noise, names, number)
-        left = [
+        end = _scoring(blocks, means, used, parameters, model, noise, names, number)
+        inside = [
             _residual(waves, part, end.parameters, model, noise).abs() <= OUTLIER
             for waves, part in zip(blocks, means, strict=True)
         ]
-        number_of = sum(part.shape[1] for part in left)
-        fraction = sum((~part).sum(1) for part in left) / number_of
-        # an image with too many keeps them all
+        number_of = sum(part.shape[1] for part in inside)
+        outside = torch.stack([(~part).sum(1) for part in inside]).sum(0)
+        fraction = outside / number_of
+        # in an image with too many outliers none is masked
         few = (fraction <= MOST_OUTLIERS)[:, None]
-        left = [part | ~few for part in left]
-        if all(torch.equal(a, b) for a, b in zip(left, kept, strict=True)):
+        inside = [part | ~few for part in inside]
+        if all(torch.equal(a, b) for a, b in zip(inside, used, strict=True)):
             break
-        kept, parameters = left, end.parameters
+        used, parameters = inside, end.parameters
     # where the rest does not fit either, it is the model that is wrong: no cell is to blame
     wrong = (end.chi_square > POOR) & (end.outliers > 0)
     if wrong.any():
-        kept = [part | wrong[:, None] for part in end.kept]
-        end = _scoring(blocks, means, kept, end.parameters, model, noise, names, number)
+        used = [part | wrong[:, None] for part in end.used]
+        end = _scoring(blocks, means, used, end.parameters, model, noise, names, number)
     return end
 
 
@@ -83,7 +84,9 @@ def cell_variance(
     return noise.variance(mean, (mean - background).clamp(min=0))
 
 
-def _residual(waves, means, parameters, model, noise) -> torch.Tensor:
+def _residual(
+    waves: Waves, means: torch.Tensor, parameters: torch.Tensor, model: RingModel, noise: PixelNoise
+) -> torch.Tensor:
     """Misfit of every cell in standard deviations."""
     mean = mean_and_jacobian(model, waves, parameters)[0]
     variance = cell_variance(mean, parameters, noise, 1e-3 * means.mean(1, keepdim=True))
@@ -91,10 +94,10 @@ def _residual(waves, means, parameters, model, noise) -> torch.Tensor:
 
 
 def _scoring(
-    blocks,
-    means,
-    kept,
-    parameters,
+    blocks: Sequence[Waves],
+    means: Sequence[torch.Tensor],
+    used: list[torch.Tensor],
+    parameters: torch.Tensor,
     model: RingModel,
     noise: PixelNoise,
     names: Sequence[str],
@@ -106,6 +109,7 @@ def _scoring(
     """
     columns = [PARAMETERS.index(name) for name in names]
     parameters = parameters.clone()
+    # a background that is not fitted is 0, and the level takes its part of the light
     if "background" not in names:
         place, level = PARAMETERS.index("background"), PARAMETERS.index("level")
         parameters[:, level] += parameters[:, place]
@@ -113,6 +117,7 @@ def _scoring(
     limit = _step_limits(model, names, parameters.device)
     information = prior_information(model, names, parameters.device)
     middle = model.start(parameters.device)[:, columns]
+    # between rings a mean near 0 would give single cells nearly all of the weight
     floor = 1e-3 * means[0].mean(1, keepdim=True)
     freedom = sum(part.shape[1] for part in means) - len(names)
     converged = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
@@ -120,7 +125,7 @@ def _scoring(
         fisher = torch.diag(information).repeat(len(parameters), 1, 1)
         score = information * (middle - parameters[:, columns])
         chi_square = torch.zeros_like(score[:, 0])
-        for waves, part, use in zip(blocks, means, kept, strict=True):
+        for waves, part, use in zip(blocks, means, used, strict=True):
             mean, jacobian = mean_and_jacobian(model, waves, parameters, names)
             variance = cell_variance(mean, parameters, noise, floor)
             weight = use * waves.cells.count / variance
@@ -128,16 +133,17 @@ def _scoring(
             score = score + (jacobian @ (weight * (part - mean))[:, :, None])[:, :, 0]
             chi_square = chi_square + (weight * (part - mean) ** 2).sum(1)
         if converged.all():
-            lost = sum((~use).sum(1) for use in kept)
+            lost = torch.stack([(~use).sum(1) for use in used]).sum(0)
             return Scored(
                 parameters,
                 fisher,
                 chi_square / (freedom - lost),
                 freedom,
                 lost / (freedom + len(names)),
-                kept,
+                used,
             )
         std = standard_deviations(fisher)
+        # px, K and electrons differ by powers of ten: solved with a unit diagonal
         unit = fisher.diagonal(dim1=1, dim2=2).rsqrt()
         normal = fisher * unit[:, :, None] * unit[:, None, :]
         step = torch.linalg.solve_ex(normal, score * unit)[0] * unit
@@ -163,7 +169,7 @@ def _scoring(
     )
 
 
-def _step_limits(model: RingModel, names, device) -> torch.Tensor:
+def _step_limits(model: RingModel, names: Sequence[str], device: torch.device) -> torch.Tensor:
     """Longest steps: one longer than the rings are wide would leave the linear range."""
     widths = {
         "v_los": model.velocity_range / 16,

@@ -30,10 +30,10 @@ class RingCurves:
     def moved(self, by: np.ndarray) -> "RingCurves":
         """With six changes added: of centre, ellipticity and tilt."""
         whole = np.array([*self.centre, *self.ellipticity, *self.tilt]) + by
-        pairs = (tuple(map(float, whole[k : k + 2])) for k in (0, 2, 4))
-        return RingCurves(*pairs)
+        x, y, cosine, sine, right, down = map(float, whole)
+        return RingCurves((x, y), (cosine, sine), (right, down))
 
-    def curve(self, radius, angle) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, radius: np.ndarray | float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y) of rings of these mean radii, at angles from x toward y."""
         cosine, sine = np.cos(angle), np.sin(angle)
         r = radius * (
@@ -91,13 +91,13 @@ class Sectors:
         The annuli's middles.
     count, value, offset : arrays (SECTORS, annuli)
         Number of pixels; their mean; mean of their squared radius less the annulus's middle.
-    seen : array (SECTORS, annuli)
+    used : array (SECTORS, annuli)
         Number of pixels of cells that show rings and are no outliers.
     profile, profile_r2 : arrays (annuli,)
-        What all sectors share (`light.common_light`), and the mean squared radius; interpolated
+        Common part of all sectors (`light.common_light`), and the mean squared radius; interpolated
         where no pixel is.
     profile_count, profile_noise : arrays (annuli,)
-        Number of pixels that the profile is worth, and the variance of one.
+        Effective number of pixels of the profile, and the variance of one.
     """
 
     def __init__(self, image: np.ndarray, geometry: RingCurves, hidden: Hidden | None = None):
@@ -134,8 +134,8 @@ class Sectors:
             light.weight,
             light.noise,
         )
-        self.seen = self.count * light.keep
-        total = self.seen.sum(0)
+        self.used = self.count * light.used
+        total = self.used.sum(0)
         known = np.flatnonzero(total)
-        mean_r2 = (self.seen * (self.r2 + self.offset)).sum(0)[known] / total[known]
+        mean_r2 = (self.used * (self.r2 + self.offset)).sum(0)[known] / total[known]
         self.profile_r2 = np.interp(self.r2, self.r2[known], mean_r2)

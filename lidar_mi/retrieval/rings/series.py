@@ -1,7 +1,9 @@
-"""Frames of one instrument in a row: a spacing that all of them share."""
+"""Successive frames of one instrument: rings of one spacing."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -47,31 +49,35 @@ class RingSeries(Tabular):
         heads = ("frame", "centre x, y / px", "spacing / px^2", "fractional orders", "note")
         return [Table("frames", rows, heads)]
 
-    def columns(self) -> dict[str, list]:
+    def columns(self) -> dict[str, list[Any]]:
         """The same as numbers, one value for each frame; NaN where there is none."""
-        found: dict[str, list] = {"frame": list(range(len(self.rings)))}
+        found: dict[str, list[Any]] = {"frame": list(range(len(self.rings)))}
 
-        def column(name, value):
+        def column(name: str, value: Callable[[Rings], Any]) -> None:
             found[name] = [np.nan if one is None else value(one) for one in self.rings]
 
-        for k, axis in enumerate("xy"):
-            column(f"centre_{axis}", lambda r, k=k: r.centre[k])
-            column(f"centre_{axis}_std", lambda r, k=k: r.centre_std[k])
+        column("centre_x", lambda r: r.centre[0])
+        column("centre_x_std", lambda r: r.centre_std[0])
+        column("centre_y", lambda r: r.centre[1])
+        column("centre_y_std", lambda r: r.centre_std[1])
         column("spacing", lambda r: r.spacing)
         column("spacing_std", lambda r: r.spacing_std)
         lines = max((len(r.fraction) for r in self.rings if r is not None), default=0)
         for k in range(lines):
             for name in ("fraction", "fraction_std", "height"):
-                column(
-                    f"{name}_{k}",
-                    lambda r, k=k, name=name: (*getattr(r, name), *[np.nan] * lines)[k],
-                )
+                column(f"{name}_{k}", partial(_of_line, name, k))
         column("misfit", lambda r: r.misfit)
         found["note"] = [
             reason if rings is None else rings.doubt
             for rings, reason in zip(self.rings, self.refused, strict=True)
         ]
         return found
+
+
+def _of_line(name: str, line: int, rings: Rings) -> float:
+    """Value of one line; NaN where a frame has fewer lines."""
+    values = getattr(rings, name)
+    return values[line] if line < len(values) else np.nan
 
 
 def analyse_series(
@@ -83,7 +89,7 @@ def analyse_series(
     """Rings of all frames of one instrument, at one spacing of the orders.
 
     Lines at equal distances look like one line of a shorter spacing, so that a frame in which a
-    moving line crosses the middle between two orders cannot tell. The others can: the spacing of
+    moving line crosses the middle between two orders does not determine it. The spacing of
     most of the frames, or the given one, is that of all.
 
     Parameters
@@ -96,32 +102,37 @@ def analyse_series(
     -------
     RingSeries
     """
-    kept = list(frames)
+    stored = list(frames)
     rings: list[Rings | None] = []
     refused: list[str] = []
-    for frame in kept:
+    for frame in stored:
         one, reason = _tried(frame, centre, saturation, spacing)
         rings.append(one)
         refused.append(reason)
     known = np.array([one.spacing for one in rings if one is not None])
     if spacing is not None or not len(known):
         return RingSeries(tuple(rings), tuple(refused))
-    alike = np.abs(known[:, None] / known - 1) < SAME
-    common = float(np.median(known[alike[alike.sum(1).argmax()]]))
+    same = np.abs(known[:, None] / known - 1) < SAME
+    common = float(np.median(known[same[same.sum(1).argmax()]]))
     for number, one in enumerate(rings):
         if one is not None and abs(one.spacing / common - 1) < SAME:
             rings[number] = replace(one, doubt="")
             continue
-        again, reason = _tried(kept[number], centre, saturation, common)
+        again, reason = _tried(stored[number], centre, saturation, common)
         if again is not None:
             rings[number], refused[number] = replace(again, doubt=""), ""
         elif one is not None:
-            said = f"{one.spacing / common:.3g} times the spacing of the other frames"
-            rings[number] = replace(one, doubt=said)
+            doubt = f"{one.spacing / common:.3g} times the spacing of the other frames"
+            rings[number] = replace(one, doubt=doubt)
     return RingSeries(tuple(rings), tuple(refused))
 
 
-def _tried(frame, centre, saturation, spacing):
+def _tried(
+    frame: np.ndarray,
+    centre: tuple[float, float] | None,
+    saturation: float | None,
+    spacing: float | None,
+) -> tuple[Rings | None, str]:
     try:
         return analyse_rings(frame, centre, saturation, spacing), ""
     except InputError as error:

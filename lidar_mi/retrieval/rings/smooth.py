@@ -5,7 +5,6 @@ The radius is in half diagonals of the image, from its middle. They describe lig
 the `falloff` about the rings' centre, so it is not among the light's terms.
 """
 
-import math
 from functools import lru_cache
 
 import torch
@@ -48,7 +47,7 @@ def term_values(names: tuple[str, ...], u: torch.Tensor, v: torch.Tensor) -> tor
             factors.append(waves[abs(m) - 1].imag if m < 0 else waves[m - 1].real)
         if n > abs(m):
             factors.append(squares[(n - abs(m)) // 2 - 1])
-        columns.append(math.prod(factors))
+        columns.append(factors[0] if len(factors) == 1 else factors[0] * factors[1])
     # every term's values lie side by side in memory
     return torch.stack(columns).T if columns else u.new_zeros((len(u), 0))
 

@@ -30,8 +30,8 @@ def step_limits(
 ) -> Callable[[torch.Tensor, torch.Tensor], bool]:
     """Limits of a step: its size, and core radii between half a cell and half the region.
 
-    Between two images, ``dt`` apart, no core turns more than once: images do not tell a turn more
-    from one less, and air that is followed round and round takes minutes.
+    Between two images, separated by ``dt``, no core rotates more than once: images do not determine
+    the number of rotations, and following many of them takes minutes.
     """
     sides = float(y[-1] - y[0]), float(z[-1] - z[0])
     cell = max(sides[0] / (len(y) - 1), sides[1] / (len(z) - 1))
@@ -39,6 +39,7 @@ def step_limits(
 
     def allowed(parameters: torch.Tensor, step: torch.Tensor) -> bool:
         reached = parameters + step
+        # beyond these radii the data do not determine a core
         radii = reached[[1, 5]]
         near = step[[2, 3, 6, 7]].abs().max() <= 0.15 * min(sides)
         return bool(
@@ -61,7 +62,17 @@ def no_fit(profile: Profile, reason: str) -> VortexPairFit:
 
 
 def checked_fit(
-    found: Solution, covariance, profile, chi2, match, error, length, z, y, turned, inclined=None
+    found: Solution,
+    covariance: np.ndarray,
+    profile: Profile,
+    chi2: float,
+    match: float,
+    error: float,
+    length: float,
+    z: np.ndarray,
+    y: np.ndarray,
+    turned: np.ndarray,
+    inclined: np.ndarray | None = None,
 ) -> VortexPairFit:
     """The fit, with the reasons for which it is not accepted."""
     theta = found.parameters[:10].cpu().numpy()
@@ -104,7 +115,7 @@ def checked_fit(
     )
 
 
-def check_profile(profile) -> None:
+def check_profile(profile: str) -> None:
     """Raises InputError for an unknown profile."""
     if profile not in PROFILES:
         raise InputError(f"profile: {profile!r} is not one of {', '.join(PROFILES)}")

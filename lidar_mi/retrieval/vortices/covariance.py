@@ -15,7 +15,7 @@ from lidar_mi.retrieval.vortices.robust_fit import Solution
 
 # Width (px) of the Gaussian over which squared residuals are averaged.
 _NEAR = 12.0
-# Side of the blocks (px) whose means are independent, fewer than which say too little, and standard
+# Side of the blocks (px) whose means are independent, the least number of them, and standard
 # errors by which an increase between them is significant.
 _BLOCK, _FEW_BLOCKS, _SIGNIFICANT = 12, 12, 4.0
 # Least curvature of the misfit over that by the slopes, that of images with little in common.
@@ -27,14 +27,15 @@ def model_error_of(
 ) -> ModelError:
     """Departure of the flow from the model, from the residuals of a fit; see `model_error`.
 
-    It is what the fit leaves of the departure. With `before`, what it leaves as found by this
+    It is the departure in the residuals. With `before`, that departure as returned by this
     function, it is the departure itself. With `changes`, residuals (z, y) may correlate for another
     reason, see `of_change`.
 
     Each force then counts by the inverse of its variance in the waves of the departure that was
     found first: by noise A, by the departure A^2 times its spectral density, with A the mean
-    stiffness around. So where images tell much, places count alike. Else those where smoke is
-    steepest would stand for the whole image, and the departure be too large where it grows there.
+    stiffness around. So where the Fisher information is large, all places have equal weight. Else
+    the places of the steepest smoke would represent the whole image, and the departure would be too
+    large where it grows there.
     """
     if changes and before is not None and not before.variances:
         return before
@@ -46,6 +47,7 @@ def model_error_of(
     stiffness = torch.stack(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
+    # residuals lack the part of the departure that the parameters have followed
     follow = (_responses(found), _inverse(found)) if before is not None else None
 
     def of_forces(even: torch.Tensor | float, tested: bool) -> ModelError:
@@ -58,28 +60,30 @@ def model_error_of(
     first = before if changes and before is not None else of_forces(1.0, True)
     if not changes or not first.variances:
         return first
+    # mean of both components, over places that one wave of the departure covers
     information = averaged(stiffness[0] + stiffness[2], misfit.valid, _NEAR / 2) / 2
     again = of_forces(1 / (1 + first.density * information), False)
     return again if again.variances else first
 
 
 def parameter_covariance(
-    found: Solution, left: ModelError, departure: ModelError, excess: float
+    found: Solution, residual_error: ModelError, departure: ModelError, excess: float
 ) -> np.ndarray:
     """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and by the flow's departure.
 
-    The part by noise is multiplied by `excess`: for H of noisy slopes, 1 / `curvature`^2. What is
-    `left` of the departure is in the residuals.
+    The part by noise is multiplied by `excess`: for H of noisy slopes, 1 / `curvature`^2. The part
+    of the departure in the residuals is `residual_error`.
     """
-    spread = _noise_spread(found, left).double() * excess
+    spread = _noise_spread(found, residual_error).double() * excess
     spread = spread + spread_of(_responses(found), departure).double()
+    # the sandwich: its errors hold although the weights are not the inverse covariance
     inverse = _inverse(found)
     covariance = (inverse @ spread @ inverse)[:10, :10]
     attenuation = _attenuation(found)
     covariance = covariance + torch.outer(attenuation, attenuation)
     if not found.converged:
-        left_over = _remaining_step(found)
-        covariance = covariance + torch.outer(left_over, left_over)
+        remaining = _remaining_step(found)
+        covariance = covariance + torch.outer(remaining, remaining)
     return covariance.cpu().numpy()
 
 
@@ -115,6 +119,7 @@ def curvature(found: Solution, spacing: tuple[float, float]) -> float:
         least = torch.stack(_neighbours(weight, axis)).amin(0)
         steep += float((least * change.square()).sum())
     whole = float((weight * found.misfit.slope.square().sum(0)).sum())
+    # below the least curvature the images have no minimum to be certain of
     return max(1 - steep / (4 * whole), _LEAST_CURVATURE) if whole > 0 else 1.0
 
 
@@ -125,6 +130,7 @@ def _neighbours(field: torch.Tensor, axis: int) -> list[torch.Tensor]:
 
 
 def _inverse(found: Solution) -> torch.Tensor:
+    # m^2/s and logarithms differ by powers of ten
     scale = found.normal.diagonal().sqrt()
     inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
     return inverse / scale / scale[:, None]
@@ -140,8 +146,8 @@ def change_by_flow(found: Solution, flow: torch.Tensor) -> np.ndarray:
     """
     misfit = found.misfit
     flow = flow if misfit.slope.ndim == 3 else flow[:, None]
-    seen = (misfit.slope * flow.to(misfit.slope)).sum(0)
-    force = misfit.jacobian.flatten(1) @ (found.weight * seen).flatten()
+    change = (misfit.slope * flow.to(misfit.slope)).sum(0)
+    force = misfit.jacobian.flatten(1) @ (found.weight * change).flatten()
     return (_inverse(found) @ force.double())[:10].cpu().numpy()
 
 
@@ -154,8 +160,8 @@ def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
     """
     misfit, weight = found.misfit, found.weight
     columns = misfit.jacobian.flatten(1)
-    moved = error.variance * misfit.slope.square().sum(0)
-    ratio = (misfit.residual.square() / (misfit.scatter + moved)).where(misfit.valid, 0.0)
+    by_flow = error.variance * misfit.slope.square().sum(0)
+    ratio = (misfit.residual.square() / (misfit.scatter + by_flow)).where(misfit.valid, 0.0)
     if ratio.ndim == 2:
         ratio = averaged(ratio, misfit.valid, _NEAR)
         return (columns * (weight**2 * misfit.variance * ratio).flatten()) @ columns.T
@@ -180,29 +186,30 @@ def _remaining_step(found: Solution) -> torch.Tensor:
 
 def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
     """Whether the remaining step is more than the other standard error of any parameter."""
-    left = _remaining_step(found).cpu().numpy() ** 2
-    return not (left < np.diagonal(covariance) - left).all()
+    square = _remaining_step(found).cpu().numpy() ** 2
+    return not (square < np.diagonal(covariance) - square).all()
 
 
 def _attenuation(found: Solution) -> torch.Tensor:
     """Possible bias of the circulations towards zero, as an error of all parameters (10,).
 
     Structure that has been wound up for long is aligned with the flow: the images change little,
-    and the residual may as well be model error. A pattern that does not move with the air changes
-    less than the air does. The inverse regression (errors in the model, not in the change) would
+    and the residual may as well be model error. Non-advected structure changes less
+    than the air does. The inverse regression (errors in the model, not in the change) would
     make both circulations larger by the unexplained fraction of the change: this is the error
-    stated. What model error leaves unexplained of images counts only as far as it grows with the
-    change, as air is replaced anywhere.
+    stated. The unexplained part of images counts only as far as it grows with the change, as air is
+    replaced anywhere.
     """
     misfit, theta = found.misfit, found.parameters
     explained = (theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]).square()
-    left = misfit.residual.square()
-    if left.ndim == 2:
+    square = misfit.residual.square()
+    if square.ndim == 2:
+        # of images: model error leaves residuals in slow air as well, which are no attenuation
         steep = misfit.slope.square().sum(0)
-        fraction = _increase(left - misfit.scatter, explained, steep, misfit.valid)
+        fraction = _increase(square - misfit.scatter, explained, steep, misfit.valid)
     else:
         power = float((found.weight * explained)[misfit.valid].sum())
-        excess = float((found.weight * (left - misfit.scatter))[misfit.valid].sum())
+        excess = float((found.weight * (square - misfit.scatter))[misfit.valid].sum())
         fraction = max(0.0, excess / power) if power > 0 else 0.0
     attenuation = torch.zeros_like(theta[:10])
     attenuation[0], attenuation[4] = fraction * theta[0], fraction * theta[4]
@@ -210,7 +217,7 @@ def _attenuation(found: Solution) -> torch.Tensor:
 
 
 def _increase(
-    left: torch.Tensor, explained: torch.Tensor, steep: torch.Tensor, valid: torch.Tensor
+    excess: torch.Tensor, explained: torch.Tensor, steep: torch.Tensor, valid: torch.Tensor
 ) -> float:
     """Increase of the misfit per explained change, of means over blocks; 0 if not significant.
 
@@ -218,10 +225,10 @@ def _increase(
     air has more of misfit, change and slopes, and so increases the first; where the model fits
     worse in fast air of little texture, the second is increased.
     """
-    whole = valid.to(left)
+    whole = valid.to(excess)
     sums = torch.nn.functional.avg_pool2d(
-        torch.stack([whole, whole * left, whole * explained, whole * steep])[:, None],
-        min(_BLOCK, *left.shape),
+        torch.stack([whole, whole * excess, whole * explained, whole * steep])[:, None],
+        min(_BLOCK, *excess.shape),
     ).flatten(1)
     full = (sums[0] > 0.5) & (sums[3] > 0)
     if int(full.sum()) < _FEW_BLOCKS:

@@ -11,7 +11,13 @@ from lidar_mi.retrieval.vortices.covariance import model_error_of
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images, Path, View
 from lidar_mi.retrieval.vortices.model_error import ModelError
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, moved, stepped, without_step
+from lidar_mi.retrieval.vortices.robust_fit import (
+    Misfit,
+    Solution,
+    residual_after,
+    stepped,
+    without_step,
+)
 
 # Blur and step between the pixels used (px), and the expected error of displacements (px) that they
 # are for: images of texture 3 px long agree by chance with themselves moved by more.
@@ -28,9 +34,10 @@ _CURVED = 3.0
 # Displacement (px, rms over the image: near a core ten times as much) to which every second pixel
 # of the filtered images is warped, at most so often.
 _CLOSE, _STEPS = 0.05, 4
-# Error, in standard errors of all parameters together, that the last step may leave but for what
-# is corrected near the cores; the unfiltered images are warped at most so often.
-_LEFT, _ROUNDS = 0.1, 4
+# Largest error of the last step by curvature, in standard errors of all parameters together,
+# without the part that is corrected near the cores; the unfiltered images are warped at most so
+# often.
+_CURVATURE_ERROR, _ROUNDS = 0.1, 4
 # Rms normalised difference of fit and start beyond which one of them is wrong.
 _REJECTED = 4.0
 
@@ -39,18 +46,18 @@ Limits = Callable[[torch.Tensor, torch.Tensor], bool]
 """(parameters, step) -> whether such a step may be tried."""
 
 
-class Found(NamedTuple):
-    """A solution, the images it was found in, what is left of them unwhitened, the model error."""
+class NearbyFit(NamedTuple):
+    """A solution, its images, their misfit without the whitening filter, the model error."""
 
     solution: Solution
     images: Images
-    rest: Misfit
+    unwhitened: Misfit
     error: ModelError
 
 
 @dataclass(frozen=True, eq=False)
-class Begun:
-    """A fit near an expected pair before its second image is there; see `begun`.
+class StartedFit:
+    """A fit near an expected pair that lacks its second image; see `start_fit`.
 
     Attributes
     ----------
@@ -75,8 +82,8 @@ class Begun:
     second: Path
 
 
-def begun(start: VortexPairFit, make: Builder, limits: Limits) -> Begun | None:
-    """All of `fit_from` that concerns the expected pair and the first image, that of `make`.
+def start_fit(start: VortexPairFit, make: Builder, limits: Limits) -> StartedFit | None:
+    """The part of `fit_from` that needs the expected pair and the first image, that of `make`.
 
     None if no fit starts there.
     """
@@ -90,20 +97,20 @@ def begun(start: VortexPairFit, make: Builder, limits: Limits) -> Begun | None:
     to_first, to_second = white.paths(theta)
     first, uncertain = white.view(0, to_first), _displacement_error(start, make)
     make = replace(make, of_first=make.splines)
-    return Begun(start, theta, uncertain, make, first, to_second)
+    return StartedFit(start, theta, uncertain, make, first, to_second)
 
 
-def fit_from(of: Begun, make: Builder, limits: Limits, lags: float) -> Found | None:
+def fit_from(started: StartedFit, make: Builder, limits: Limits, lags: float) -> NearbyFit | None:
     """The fit of `image_fit.fit_vortices` near an expected pair; None if there is none.
 
     Steps on blurred images come first if the start is uncertain, on every second pixel. Then the
-    unfiltered images are warped once, and noise and change are estimated as from scratch, with the
-    start's model error if it has one; that of the fit is estimated from what is left. The last step
-    is linear: its residuals are not looked at again.
+    unfiltered images are warped once, and noise and change are estimated as without a start, with
+    the start's model error if it has one; that of the fit is estimated from the residuals. The last
+    step is linear, and so are its residuals.
 
     Parameters
     ----------
-    of : Begun
+    started : StartedFit
     make : Builder
         Of both images.
     limits : callable
@@ -111,9 +118,11 @@ def fit_from(of: Begun, make: Builder, limits: Limits, lags: float) -> Found | N
     lags : float
         Over which the noise correlates, px.
     """
-    known, error = (of.first, of.second), of.start.model_error * make.dt
+    known, error = (started.first, started.second), started.start.model_error * make.dt
     departure = error**2 if np.isfinite(error) else None
-    return fit_near(of.theta, make, limits, lags, of.uncertain, known=known, departure=departure)
+    return fit_near(
+        started.theta, make, limits, lags, started.uncertain, known=known, departure=departure
+    )
 
 
 def fit_near(
@@ -125,97 +134,102 @@ def fit_near(
     estimates: int = 1,
     known: tuple[View, Path] | None = None,
     departure: float | None = None,
-) -> Found | None:
+) -> NearbyFit | None:
     """`fit_from` parameters (16,) whose displacements are uncertain by so many px.
 
     Noise, change and model error are estimated so many times, each with the filter and the weights
     of the time before. The view of the first image and the path to the second may be `known`, and
-    the variance (m^2) of the flow's `departure` from the model, as from the slab before: it is then
+    the variance (m^2) of the flow's `departure` from the model, as of the previous slab: it is then
     estimated for the errors alone.
     """
     variance = (_MODEL_ERROR * (make.spacing[0] * make.spacing[1]) ** 0.5) ** 2
-    for blur, step, least in _LEVELS:
+    for blur, stride, least in _LEVELS:
         if uncertain < least:
             continue
         known = None
-        thin = make(blur, step)
+        thin = make(blur, stride)
+        # differences of filtered images are less accurate, but enough for a start
         thin = replace(thin, whole=thin.spline)
         for _ in range(_STEPS):
             misfit = thin(theta)
-            images = thin.at_least(_left(misfit, variance))
+            images = thin.at_least(_linear_power(misfit, variance))
             found = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
             if found is None:
                 return None
             far = _displaced(found.parameters - theta, misfit, make)
             theta = found.parameters
+            # blurred images need not be nearer than their own resolution
             if far < _CLOSE * max(1.0, 2 * blur):
                 break
     white, close = make(*_WHITE), False
     for _ in range(_ROUNDS):
         views = [known[0], white.view(1, known[1])] if known else white.views(theta)
         misfit, known = white.misfit(theta, views), None
-        images = white.at_least(_left(misfit, variance))
+        # before an estimate of change the weights are of all residuals, as of white noise
+        images = white.at_least(_linear_power(misfit, variance))
         plain = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
         if plain is None:
             return None
         # where air changes, the weights of the estimates below lead elsewhere
-        if not close and _leaves(plain, theta, misfit, make) > _LEFT:
+        if not close and _curvature_error(plain, theta, misfit, make) > _CURVATURE_ERROR:
             theta = plain.parameters
             continue
         close = True
+        # near the cores paths are not linear in the step: the only second-order term needed
         beyond = white.curved(misfit, views, theta, plain.parameters)
         misfit = misfit._replace(residual=misfit.residual + beyond)
-        left = plain.misfit._replace(residual=plain.misfit.residual + beyond)
-        found = plain._replace(misfit=left)
+        corrected = plain.misfit._replace(residual=plain.misfit.residual + beyond)
+        solution = plain._replace(misfit=corrected)
         for _ in range(estimates):
             moves = departure
             if moves is None:
-                moves = model_error_of(found, lags, changes=True).variance
-            images = make.with_change(white, images, found.misfit, moves)
-            if not images.whitening.passed > 0:
+                moves = model_error_of(solution, lags, changes=True).variance
+            images = make.with_change(white, images, solution.misfit, moves)
+            if not images.passed > 0:
                 return None
             found = _near(limits, theta, stepped(theta, images.whitened(misfit), moves))
             if found is None:
                 return None
-        if _leaves(found, theta, misfit, make) < _LEFT:
-            error = model_error_of(found, lags, changes=True)
-            step = found.parameters - theta
-            return Found(found, images, misfit._replace(residual=moved(misfit, step)), error)
-        theta, variance = found.parameters, moves
+            solution = found
+        if _curvature_error(solution, theta, misfit, make) < _CURVATURE_ERROR:
+            error = model_error_of(solution, lags, changes=True)
+            remaining = residual_after(misfit, solution.parameters - theta)
+            return NearbyFit(solution, images, misfit._replace(residual=remaining), error)
+        theta, variance = solution.parameters, moves
     return None
 
 
-def _leaves(found: Solution, theta: torch.Tensor, misfit: Misfit, make: Builder) -> float:
+def _curvature_error(found: Solution, theta: torch.Tensor, misfit: Misfit, make: Builder) -> float:
     """Standard errors that a linear step from theta to a solution may be off by curvature."""
     step = found.parameters - theta
     far = _displaced(step, misfit, make) / _CURVED
     return float(step @ found.normal @ step) ** 0.5 * far
 
 
-def _near(limits, theta: torch.Tensor, found: Solution | None) -> Solution | None:
-    """A solution that a step from theta may reach."""
+def _near(limits: Limits, theta: torch.Tensor, found: Solution | None) -> Solution | None:
+    """The solution if the limits allow the step to it from theta."""
     return found if found and limits(theta, found.parameters - theta) else None
 
 
 def _displaced(step: torch.Tensor, misfit: Misfit, make: Builder) -> float:
     """Rms displacement (px) of the images by a step, along their slopes."""
-    change = moved(misfit, step) - misfit.residual
+    change = residual_after(misfit, step) - misfit.residual
     ratio = 2 * change.square().sum() / misfit.slope.square().sum()
     return float(ratio.sqrt()) / min(make.spacing)
 
 
-def _left(misfit: Misfit, variance: float) -> float:
-    """Mean square of the residuals that a linear step to the minimum would leave."""
+def _linear_power(misfit: Misfit, variance: float) -> float:
+    """Mean square of the residuals after a linear step to the minimum."""
     return float(without_step(misfit, variance)[misfit.valid].square().mean())
 
 
 def agrees(start: VortexPairFit, found: VortexPairFit) -> bool:
-    """Whether a fit is where the start, within its errors, said."""
+    """Whether a fit agrees with the start within both errors."""
     off = found.parameters - start.parameters
     spread = found.covariance + start.covariance
     scale = np.sqrt(np.diagonal(spread))
-    reduced = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
-    square = float((off / scale) @ reduced @ (off / scale))
+    inverse = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
+    square = float((off / scale) @ inverse @ (off / scale))
     return square < _REJECTED**2 * len(off)
 
 

@@ -1,7 +1,8 @@
-"""The images that a pair is fitted to: of one brightness, with noise and what is left out."""
+"""The images that a pair is fitted to: of normalised intensity, with noise and masked pixels."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,51 +17,70 @@ from lidar_mi.retrieval.vortices.model import Profile
 from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
 
 
-def builder_of(
-    stack: Sequence[torch.Tensor],
-    z: np.ndarray,
-    y: np.ndarray,
-    dt: float,
-    noise: float | torch.Tensor | None,
-    profile: Profile,
-    frozen: bool,
-    times: Sequence[np.ndarray] | None,
-    telescope: tuple[float, float, float] | None,
-) -> Builder | str:
+class Acquisition(NamedTuple):
+    """How two images were acquired, and the model that is fitted to them.
+
+    Attributes
+    ----------
+    z, y : ndarray
+        Of the pixels, m.
+    dt : float
+        s.
+    noise : float or torch.Tensor, optional
+        Standard deviation of all pixels or of each (z, y).
+    profile : {"lamb_oseen", "burnham_hallock"}
+    frozen : bool
+        Whether the vortices are at rest during dt.
+    times : sequence of ndarray (z, y), optional
+        From `lidar_mi.retrieval.images.beam_times.checked_times`.
+    telescope : (float, float, float), optional
+        x, y, z, m.
+    """
+
+    z: np.ndarray
+    y: np.ndarray
+    dt: float
+    noise: float | torch.Tensor | None
+    profile: Profile
+    frozen: bool = False
+    times: Sequence[np.ndarray] | None = None
+    telescope: tuple[float, float, float] | None = None
+
+
+def builder_of(stack: Sequence[torch.Tensor], taken: Acquisition) -> Builder | str:
     """Of both images or of the first one; or the reason for which there is no fit."""
     finite = torch.stack([torch.isfinite(image) for image in stack]).all(0)
     if float(finite.double().mean()) < 0.5:
         return f"{float(finite.double().mean()):.0%} of the pixels are finite"
     # in units of image 1's own structure, so that no constant depends on the images' unit
-    images = normalised([image.double() for image in stack])
-    images = torch.stack([filled_in(image) for image in images])
+    images = torch.stack([filled_in(i) for i in normalised([image.double() for image in stack])])
     contrast = images[0][finite].std()
     scale = filled(stack[0].double()).abs().max()
     if not bool(contrast > 1e-9 * scale) or not bool(images[-1][finite].std() > 0):
         return "an image is constant"
     images = images / contrast
+    noise = taken.noise
     if isinstance(noise, torch.Tensor) and not bool((noise > 0).any()):
-        noise = None  # no pixel's noise is known: a fit that took it for 0 would follow it for long
+        noise = None  # no pixel's noise is known: a fit with noise 0 would hardly converge
     if isinstance(noise, torch.Tensor):
         noise = noise.double() * _understated(noise / contrast, images)
     level = _typical(noise, images[0].square())
     if level is not None:
         level /= float(contrast)
-    given = noise if isinstance(noise, torch.Tensor) else None
     make = Builder(
         images,
         near_to(~finite),
-        z,
-        y,
-        dt,
+        taken.z,
+        taken.y,
+        taken.dt,
         level,
-        given,
+        noise if isinstance(noise, torch.Tensor) else None,
         float(contrast),
-        profile,
-        frozen,
-        telescope,
+        taken.profile,
+        taken.frozen,
+        taken.telescope,
     )
-    return make if times is None else replace(make, times=_from_mid_time(times, make))
+    return make if taken.times is None else replace(make, times=_from_mid_time(taken.times, make))
 
 
 def near_to(bad: torch.Tensor) -> torch.Tensor:

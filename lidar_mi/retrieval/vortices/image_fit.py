@@ -35,8 +35,15 @@ from lidar_mi.retrieval.vortices.covariance import (
     model_error_of,
     parameter_covariance,
 )
-from lidar_mi.retrieval.vortices.from_start import Begun, Limits, agrees, begun, fit_from, fit_near
-from lidar_mi.retrieval.vortices.image_builder import builder_of, near_to
+from lidar_mi.retrieval.vortices.from_start import (
+    Limits,
+    StartedFit,
+    agrees,
+    fit_from,
+    fit_near,
+    start_fit,
+)
+from lidar_mi.retrieval.vortices.image_builder import Acquisition, builder_of, near_to
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model import Profile, wind
 from lidar_mi.retrieval.vortices.model_error import ModelError, mean_length
@@ -83,24 +90,24 @@ def fit_vortices(
     ----------
     image1, image2 : DataArray, dims (z, y)
         On one grid, as `lidar_mi.retrieval.wind.pair.retrieve_wind` takes them. NaN pixels
-        are left out, and so are pixels that do not move with the air (`rest.all_at_rest`).
+        are masked, and so are those of non-advected structure (`rest.all_at_rest`).
     dt : float
         s.
     noise : float or DataArray, optional
         Standard deviation of each image's white noise, in image 1's unit, of all pixels or of
-        each. Left out, or 0 in each: from the images' spectra.
+        each. Without it, or 0 in each: from the images' spectra.
     profile : {"lamb_oseen", "burnham_hallock"}
     frozen : bool
         The vortices do not move during dt. Default: they drift with the mean wind and their mutual
         induction.
     times : sequence of two DataArray, optional
-        When each pixel was seen, s from the reference time of its image, as `retrieve_wind` takes
-        them. Air is followed to the time of the pixel that sees it; the pair is that at dt / 2
+        Times of the pixels, s from the reference time of their image, as `retrieve_wind` takes
+        them. Air is followed to the time of the pixel that shows it; the pair is that at dt / 2
         after image 1's reference time.
     start : VortexPairFit, optional
         The pair expected at mid-time, with its covariance. It is where the fit starts, and is not
         weighted in. A fit that is not accepted, or further from it than both errors allow, is
-        replaced by that of a search: `from_start` says which.
+        replaced by that of a search; see `from_start`.
     telescope : (float, float, float), optional
         x, y and z from the images' plane, m, of the telescope whose beams reach its pixels
         obliquely, x < 0. The fit is that of a pair along x; with a telescope its
@@ -141,15 +148,17 @@ def fit_vortices(
     (True, True)
     """
     stack, noise = checked_stack([image1, image2], noise)
-    given = _checked_arguments(stack, dt, noise, profile, frozen, times, start, telescope, device)
+    taken = _checked_acquisition(stack, dt, noise, profile, frozen, times, telescope, device)
+    _check_start(start, profile)
     pixels = [on_device(image, device) for image in stack]
     with threads_for(image1.size):
         if min(image1.shape) >= Windows.search:
             pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).left_out(pixels)
-        return fit_pixels(*pixels, *given)
+        first, second = pixels
+        return fit_pixels(first, second, taken, start)
 
 
-def begun_fit(
+def started_fit(
     image1: xr.DataArray,
     dt: float,
     noise: float | xr.DataArray | None = None,
@@ -161,11 +170,10 @@ def begun_fit(
     telescope: tuple[float, float, float] | None = None,
     device: str | torch.device = "cpu",
 ) -> Callable[[xr.DataArray], VortexPairFit]:
-    """`fit_vortices` near an expected pair, begun before the second image is there.
+    """`fit_vortices` near an expected pair, started before the second image is known.
 
-    What concerns the expected pair and the first image alone is done at once: its filter, its
-    splines, and the paths of the air. It is a quarter of the work. The filter of both images is
-    that of the first one's spectrum.
+    The first image's filter, its splines, and the paths of the air are computed at once: a quarter
+    of the work. The filter of both images is that of the first one's spectrum.
 
     Returns
     -------
@@ -173,74 +181,76 @@ def begun_fit(
         Takes image 2, on the grid of image 1, and gives the fit.
     """
     (image1,), noise = checked_stack([image1], noise)
-    given = _checked_arguments(
-        [image1, image1], dt, noise, profile, frozen, times, start, telescope, device
+    taken = _checked_acquisition(
+        [image1, image1], dt, noise, profile, frozen, times, telescope, device
     )
+    _check_start(start, profile)
     with threads_for(image1.size):
-        *of_images, start, telescope = given
-        make = builder_of([on_device(image1, device)], *of_images, telescope)
-        ready = _begun(make, start)
-    return partial(_with_second, image1, ready, given, device)
+        started = _started(builder_of([on_device(image1, device)], taken), start)
+    return partial(_with_second, image1, started, taken, device)
 
 
 def _with_second(
-    image1: xr.DataArray, ready: Begun | None, given: tuple, device, image2: xr.DataArray
+    image1: xr.DataArray,
+    started: StartedFit | None,
+    taken: Acquisition,
+    device: str | torch.device,
+    image2: xr.DataArray,
 ) -> VortexPairFit:
     pair, _ = checked_stack([image1, image2])
     first, second = (on_device(image, device) for image in pair)
     with threads_for(image1.size):
-        near = ready and _completed(ready, first, second)
-        *others, _, telescope = given
-        return near or fit_pixels(first, second, *others, None, telescope)
+        near = started and _completed(started, first, second)
+        return near or fit_pixels(first, second, taken)
 
 
-def _checked_arguments(
-    stack: Sequence[xr.DataArray], dt, noise, profile, frozen, times, start, telescope, device
-) -> tuple:
-    """What `fit_pixels` takes after both images."""
-    dt = positive("dt", dt)
-    check_profile(profile)
+def _check_start(start: VortexPairFit | None, profile: Profile) -> None:
     if start is not None and start.profile != profile:
         raise InputError(f"start.profile: {start.profile!r} is not {profile!r}, that of the fit")
+
+
+def _checked_acquisition(
+    stack: Sequence[xr.DataArray],
+    dt: float,
+    noise: float | xr.DataArray | None,
+    profile: Profile,
+    frozen: bool,
+    times: Sequence[xr.DataArray] | None,
+    telescope: tuple[float, float, float] | None,
+    device: str | torch.device,
+) -> Acquisition:
+    dt = positive("dt", dt)
+    check_profile(profile)
     if telescope is not None and not (np.isfinite(telescope).all() and telescope[0] < 0):
         raise InputError(
             f"telescope: {telescope} m is not allowed; expected finite x, y and z with x < 0"
         )
     tau = checked_times(times, stack, dt)
-    axes = [stack[0].coords.variables[name].values.astype(float) for name in ("z", "y")]
-    if isinstance(noise, xr.DataArray):
-        noise = on_device(noise, device)
-    return *axes, dt, noise, profile, frozen, tau, start, telescope
+    z, y = (stack[0].coords.variables[name].values.astype(float) for name in ("z", "y"))
+    level = on_device(noise, device) if isinstance(noise, xr.DataArray) else noise
+    return Acquisition(z, y, dt, level, profile, frozen, tau, telescope)
 
 
 def fit_pixels(
     image1: torch.Tensor,
     image2: torch.Tensor,
-    z: np.ndarray,
-    y: np.ndarray,
-    dt: float,
-    noise: float | torch.Tensor | None,
-    profile: Profile,
-    frozen: bool = False,
-    times: Sequence[np.ndarray] | None = None,
+    taken: Acquisition,
     start: VortexPairFit | None = None,
-    telescope: tuple[float, float, float] | None = None,
 ) -> VortexPairFit:
-    """`fit_vortices` on tensors (z, y) and axes in m, with times from `checked_times`."""
-    given = z, y, dt, noise, profile, frozen, times
+    """`fit_vortices` on tensors (z, y)."""
     if start is not None:
-        ready = _begun(builder_of([image1], *given, telescope), start)
-        near = ready and _completed(ready, image1, image2)
-        if near:
-            return near
-    # from nothing in double precision: what rounding changes would decide between solutions
-    make = builder_of([image1, image2], *given, telescope)
+        started = _started(builder_of([image1], taken), start)
+        pair = started and _completed(started, image1, image2)
+        if pair:
+            return pair
+    # a search in double precision: rounding would decide between solutions of equal cost
+    make = builder_of([image1, image2], taken)
     if isinstance(make, str):
-        return no_fit(profile, make)
-    limits = step_limits(y, z, profile, dt)
+        return no_fit(taken.profile, make)
+    limits = step_limits(taken.y, taken.z, taken.profile, taken.dt)
     found, replaced = _searched(make, limits)
     if found is None:
-        return no_fit(profile, "no vortex signature")
+        return no_fit(taken.profile, "no vortex signature")
     # in air that is replaced there are many minima: a few steps may end in another one
     if not replaced:
         near = fit_near(found.parameters, make, limits, _NOISE_LAGS, estimates=2)
@@ -250,8 +260,8 @@ def fit_pixels(
     return _iterated(found, make, limits)
 
 
-def _begun(make: Builder | str, start: VortexPairFit) -> Begun | None:
-    """The fit near an expected pair before image 2 is there; None if there is none.
+def _started(make: Builder | str, start: VortexPairFit) -> StartedFit | None:
+    """The fit near an expected pair without image 2; None if there is none.
 
     `make` is that of image 1, or the reason for which there is none.
     """
@@ -259,21 +269,23 @@ def _begun(make: Builder | str, start: VortexPairFit) -> Begun | None:
         return None
     limits = step_limits(make.y, make.z, make.profile, make.dt)
     # steps need no more: places to 1e-5 m
-    return begun(start, make.single(), limits)
+    return start_fit(start, make.single(), limits)
 
 
-def _completed(ready: Begun, image1: torch.Tensor, image2: torch.Tensor) -> VortexPairFit | None:
+def _completed(
+    started: StartedFit, image1: torch.Tensor, image2: torch.Tensor
+) -> VortexPairFit | None:
     """The fit near the expected pair; None if it is not accepted or does not agree with it."""
-    finite, make = torch.isfinite(image2), ready.make
+    finite, make = torch.isfinite(image2), started.make
     second = filled_in(normalised([image1, image2])[1]) / make.contrast
     if float((finite & ~make.bad).double().mean()) < 0.5 or not bool(second.std() > 0):
         return None
     both = torch.cat([make.pair, second[None].to(make.pair)])
     make = replace(make, pair=both, bad=make.bad | near_to(~finite))
     limits = step_limits(make.y, make.z, make.profile, make.dt)
-    near = fit_from(ready, make, limits, _NOISE_LAGS)
+    near = fit_from(started, make, limits, _NOISE_LAGS)
     pair = near and replace(_checked(make, *near), from_start=True)
-    return pair if pair and pair.success and agrees(ready.start, pair) else None
+    return pair if pair and pair.success and agrees(started.start, pair) else None
 
 
 def _searched(make: Builder, limits: Limits) -> tuple[Solution | None, bool]:
@@ -321,21 +333,21 @@ def _best(images: Images, starts: torch.Tensor, limits: Limits, variance: float)
 def _replaced(misfit: Misfit) -> float:
     """Fraction of the variance of the images that is not the same air, beyond noise."""
     valid = misfit.valid
-    left = (misfit.residual.square() - misfit.scatter)[valid].mean()
+    excess = (misfit.residual.square() - misfit.scatter)[valid].mean()
     # the derivative by the gain is image 1
-    return float(left / misfit.jacobian[10][valid].var())
+    return float(excess / misfit.jacobian[10][valid].var())
 
 
 def _refitted(
     white: Images, parameters: torch.Tensor, variance: float, limits: Limits
 ) -> tuple[Solution, Images]:
-    """The fit to images, and these with the noise that the parameters so far would leave.
+    """The fit to images, and these with noise as large as the residuals of the parameters so far.
 
     With weights of the noise alone, air that changes gives a sum of squares with many minima.
     """
     misfit = white(parameters)
-    left = without_step(misfit, variance)[misfit.valid].square().mean()
-    images = white.at_least(float(left))
+    power = without_step(misfit, variance)[misfit.valid].square().mean()
+    images = white.at_least(float(power))
     return fit(images, parameters, limits, variance, 12, TOLERANCE), images
 
 
@@ -346,7 +358,7 @@ def _iterated(found: Solution, make: Builder, limits: Limits) -> VortexPairFit:
     for _ in range(2):
         error = model_error_of(best, _NOISE_LAGS, changes=True)
         images = make.with_change(white, images, best.misfit, error.variance)
-        if not images.whitening.passed > 0:
+        if not images.passed > 0:
             return no_fit(make.profile, "the images have no structure in common")
         best = fit(images, best.parameters, limits, error.variance, 10, TOLERANCE)
     error = model_error_of(best, _NOISE_LAGS, changes=True)
@@ -379,17 +391,19 @@ def _checked(
         make.z,
         make.y,
         change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
-        None if make.telescope is None else _change_by_slopes(make, best, images),
+        None if make.telescope is None else _change_by_slopes(make, make.telescope, best, images),
     )
 
 
-def _change_by_slopes(make: Builder, best: Solution, images: Images) -> np.ndarray:
+def _change_by_slopes(
+    make: Builder, telescope: tuple[float, float, float], best: Solution, images: Images
+) -> np.ndarray:
     """Change (10, 2) of the parameters per slope dy/dx and dz/dx of the pair's axis.
 
     The swirl (u, v, w) is across the axis, so that u is minus the slopes times (v, w). Air that
     moves along x in oblique beams moves by -(y, z) u / distance in the images.
     """
-    x, y, z = make.telescope
+    x, y, z = telescope
     swirl = wind(best.parameters[:10].to(images.y), images.y, images.z, make.profile)
     swirl = swirl - best.parameters[8:10, None, None].to(swirl)
     beams = torch.stack([images.y - y, images.z - z]) / -x

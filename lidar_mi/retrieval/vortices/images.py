@@ -26,7 +26,7 @@ from lidar_mi.retrieval.images.spline import (
     transform_sizes,
 )
 from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity, wind
-from lidar_mi.retrieval.vortices.pixel_times import PixelTimes, Seen, seen
+from lidar_mi.retrieval.vortices.pixel_times import ImagedAir, PixelTimes, imaged_air
 from lidar_mi.retrieval.vortices.robust_fit import Misfit
 from lidar_mi.retrieval.vortices.search import Observations
 
@@ -34,26 +34,26 @@ from lidar_mi.retrieval.vortices.search import Observations
 _INTERPOLATION = 1e-4
 # Width (px) of the Gaussian over which the misfit is averaged to the variance at a place.
 _LOCAL = 6.0
-# Core radii about the cores within which a change of the pair bends paths.
+# Core radii about the cores within which paths are not linear in a change of the pair.
 _NEAR_CORES = 2.0
 # Gain 1 and offset 0 of image 2 over image 1, no change of either along y and z.
 SAME_BRIGHTNESS = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Path(NamedTuple):
-    """The way of the air at the pixels at mid-time to one image, tensors (..., z, y).
+    """The path of the air at the pixels at mid-time to one image, tensors (..., z, y).
 
     Attributes
     ----------
     steady : torch.Tensor, shape (10,)
         The flow in the frame that moves with the pair.
     middle : torch.Tensor
-        Of the way, in that frame, m.
+        Of the path, in that frame, m.
     place : torch.Tensor
         Its end in the image: row and column.
     time : torch.Tensor
-        It takes, s; negative to the first image.
-    seen : Seen, optional
+        Of its end, s; negative to the first image.
+    imaged : ImagedAir, optional
         Of pixels with times of their own.
     """
 
@@ -61,11 +61,11 @@ class Path(NamedTuple):
     middle: torch.Tensor
     place: torch.Tensor
     time: torch.Tensor
-    seen: Seen | None
+    imaged: ImagedAir | None
 
 
 class View(NamedTuple):
-    """One image where it sees the air that is at the pixels at mid-time, tensors (z, y).
+    """One image where it shows the air that is at the pixels at mid-time, tensors (z, y).
 
     Attributes
     ----------
@@ -125,6 +125,11 @@ class Images:
             ]
         )
 
+    @property
+    def passed(self) -> float:
+        """Fraction of white noise that the filter passes; 0 where all structure may be change."""
+        return (self.whitening or self.spline).passed
+
     def __call__(self, parameters: torch.Tensor) -> Misfit:
         """Residuals and their derivatives for parameters (16,)."""
         return self.misfit(parameters, self.views(parameters))
@@ -145,19 +150,20 @@ class Images:
         torch.mul(-views[0].value, self.linear, out=jacobian[10:13])
         torch.neg(self.linear, out=jacobian[13:16])
         residual = valid * (views[1].whole - gain * views[0].whole - offset)
+        # filtered after the difference: shear and a filter of the images do not commute
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
         slope = jacobian[8:10] / self.dt
         misfit = Misfit(residual, jacobian, slope, valid, self.variance, self.scatter)
-        return misfit if self.whitening is None else self.whitened(misfit)
+        return self.whitened(misfit)
 
     def view(self, number: int, path: "Path") -> "View":
         """Image 0 or 1 at the ends of its path."""
         place, time = path.place, path.time
         (value,), (slope_z,), (slope_y,) = self.spline.only(number).sample(*place[:, None])
         slope = torch.stack([slope_y / self.spacing[0], slope_z / self.spacing[1]])
-        if path.seen is not None:
-            slope = path.seen.along(slope)
+        if path.imaged is not None:
+            slope = path.imaged.along(slope)
         jacobian = path_sensitivity(path.steady, path.middle, slope, time, self.profile)
         torch.mul(slope, time, out=jacobian[8:10])
         whole = value
@@ -176,22 +182,17 @@ class Images:
             began = wind(steady, self.y, self.z, self.profile)[:, None]
             middle, place = advected(steady, self.y[None], self.z[None], time, self.profile, began)
             place = place + moving[:, None, None, None] * time
-            ways = [(middle[:, k], place[:, k], time[k], None) for k in (0, 1)]
-        else:
-            both = [
-                seen(self.times, k, steady, moving, self.y, self.z, self.profile) for k in (0, 1)
+            return [
+                Path(steady, middle[:, k], self._pixels(place[:, k]), time[k], None) for k in (0, 1)
             ]
-            ways = [(one.middle, one.place, one.time, one) for one in both]
-        return [
-            Path(
-                steady,
-                middle,
-                torch.stack([(place[k] - self.first[k]) / self.spacing[k] for k in (1, 0)]),
-                time,
-                then,
-            )
-            for middle, place, time, then in ways
+        both = [
+            imaged_air(self.times, k, steady, moving, self.y, self.z, self.profile) for k in (0, 1)
         ]
+        return [Path(steady, air.middle, self._pixels(air.place), air.time, air) for air in both]
+
+    def _pixels(self, place: torch.Tensor) -> torch.Tensor:
+        """Row and column (2, ...) of places (2, ...) in m."""
+        return torch.stack([(place[k] - self.first[k]) / self.spacing[k] for k in (1, 0)])
 
     def curved(
         self, known: Misfit, views: Sequence["View"], start: torch.Tensor, end: torch.Tensor
@@ -204,16 +205,17 @@ class Images:
         box = self._near_cores(start)
         near = replace(self, y=self.y[box], z=self.z[box])
         then = [view.value[box] for view in views]
-        now = []
-        for number, path in enumerate(near.paths(end)):
-            now += near.spline.only(number).values(*path.place[:, None])
-        change = 0.0
-        for sign, parameters, (first, second) in ((-1, start, then), (1, end, now)):
+        now = [
+            near.spline.only(number).values(*path.place[:, None])[0]
+            for number, path in enumerate(near.paths(end))
+        ]
+        differences = []
+        for parameters, (first, second) in ((start, then), (end, now)):
             gain, offset = near._brightness(parameters)
-            change = change + sign * (second - gain * first - offset)
-        step = (end - start).to(self.y)
+            differences.append(second - gain * first - offset)
+        linear = torch.tensordot((end - start).to(self.y), known.jacobian[:, *box], 1)
         found = torch.zeros_like(known.residual)
-        found[box] = change - torch.tensordot(step, known.jacobian[:, *box], 1)
+        found[box] = differences[1] - differences[0] - linear
         return known.valid * found
 
     def _near_cores(self, parameters: torch.Tensor) -> tuple[slice, slice]:
@@ -233,12 +235,14 @@ class Images:
         return gain, offset
 
     def _bad(self, place: torch.Tensor) -> torch.Tensor:
-        """Whether the pixels nearest to places (row, column) are to be left out."""
+        """Whether the pixels nearest to places (row, column) are masked."""
         at = [p.round().long().clamp(0, n - 1) for p, n in zip(place, self.bad.shape, strict=True)]
         return self.bad[at[0], at[1]]
 
     def whitened(self, misfit: Misfit) -> Misfit:
-        """A misfit of the images without the whitening filter, after it."""
+        """A misfit of the images without the whitening filter, after it if there is one."""
+        if self.whitening is None:
+            return misfit
         jacobian = self.whitening.filtered(misfit.jacobian * misfit.valid)
         residual = self.whitening.filtered(misfit.residual)
         slope = jacobian[8:10] / self.dt
@@ -295,15 +299,15 @@ class Builder:
     Attributes
     ----------
     pair : torch.Tensor, shape (2, z, y)
-        Of one mean and contrast.
+        Normalised to one mean and contrast.
     bad : torch.Tensor of bool, shape (z, y)
-        Pixels to leave out.
+        Masked pixels.
     z, y : ndarray
         m.
     dt : float
         s.
     level : float, optional
-        Standard deviation of the noise, in the unit of `pair`; left out, from the spectrum.
+        Standard deviation of the noise, in the unit of `pair`; None: from the spectrum.
     map : torch.Tensor, optional
         Of each pixel, in any unit.
     profile : {"lamb_oseen", "burnham_hallock"}
@@ -311,9 +315,9 @@ class Builder:
     telescope : (float, float, float), optional
         m, as `image_fit.fit_vortices` takes it.
     times : PixelTimes, optional
-        Left out: -dt / 2 and dt / 2.
+        None: -dt / 2 and dt / 2.
     of_first : Splines, optional
-        Of the first image, made before the second one was there: its filter is that of both.
+        Of the first image, computed without the second one: its filter is that of both.
     """
 
     pair: torch.Tensor
@@ -333,7 +337,10 @@ class Builder:
     @property
     def spacing(self) -> tuple[float, float]:
         """Along y and z, m."""
-        return tuple(float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (self.y, self.z))
+        along_y, along_z = (
+            float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (self.y, self.z)
+        )
+        return along_y, along_z
 
     def single(self) -> "Builder":
         """The same in single precision: places to 1e-5 m, brightness to 1e-6 of the contrast."""
@@ -353,8 +360,8 @@ class Builder:
 
     def _splines(self, images: torch.Tensor, chosen: Filter) -> Splines:
         everything = Filter(torch.ones_like(chosen.gain), 0.0, 1.0, 1.0, 1.0, 0.0)
-        both = filtered_splines(images, [chosen, everything], FilterSettings())
-        return Splines(*both, chosen, self.spectrum)
+        sharp, whole = filtered_splines(images, [chosen, everything], FilterSettings())
+        return Splines(sharp, whole, chosen, self.spectrum)
 
     def filter(self, noise: float | None, mismatch: torch.Tensor | None = None) -> Filter:
         """The filter of both images, as `warping.band_limited` chooses it."""
@@ -377,9 +384,9 @@ class Builder:
         passed = spline.passed
         if blur:
             size = 2 * int(np.ceil(4 * blur)) + 1
-            size = tuple(min(size, 2 * n - 1) for n in self.pair.shape[1:])
-            soft = gaussian_blur2d(self.pair[None], size, (blur, blur), "replicate")[0]
-            spline = band_limited(soft, 0.0)[0]
+            rows, columns = (min(size, 2 * n - 1) for n in self.pair.shape[1:])
+            soft = gaussian_blur2d(self.pair[None], (rows, columns), (blur, blur), "replicate")[0]
+            spline = band_limited(list(soft), 0.0)[0]
             spline = spline._replace(coefficients=spline.coefficients.to(self.pair))
             passed = 1 / (4 * np.pi * blur**2)
         places = [
@@ -424,13 +431,17 @@ class Builder:
         """
         valid, known = misfit.valid, white.variance
         shape = white.variance / white.variance[valid].mean()
-        passed = max((images.whitening or images.spline).passed, 1e-6)
+        # the misfit is that behind a filter: divided by what that passes of white noise
+        passed = max(images.passed, 1e-6)
         power = (misfit.residual.square() / shape)[valid].mean()
-        moved = flow_variance * float((misfit.slope.square().sum(0) / shape)[valid].mean())
+        by_flow = flow_variance * float((misfit.slope.square().sum(0) / shape)[valid].mean())
         level, least = float(power) / passed, float((known / shape)[valid].mean())
-        fraction = min(1.0, moved / max(float(power), passed * least))
+        # whitening would take the effect of the flow's departure for stationary change
+        fraction = min(1.0, by_flow / max(float(power), passed * least))
+        # gain of both filters together, through which the residuals have passed
         gain = white.spline.gain * (1.0 if images.whitening is None else images.whitening.gain)
         before = images.spline._replace(gain=gain)
+        # places of more noise count less, so that the spectrum is that of one field
         rest = valid * misfit.residual / shape.sqrt() / 2
         # the other image's rest is the same with the other sign
         density = mismatch(before, rest[None], number=2)

@@ -69,8 +69,8 @@ def smoothed(
         Smoothed state and covariance P' of the next step.
     """
     state, covariance = filtered
-    ahead = transition @ covariance
-    gain = cho_solve(cho_factor(ahead @ transition.T + noise), ahead).T
+    cross = transition @ covariance
+    gain = cho_solve(cho_factor(cross @ transition.T + noise), cross).T
     remains = np.eye(len(state)) - gain @ transition
     after = remains @ covariance @ remains.T + gain @ (noise + later[1]) @ gain.T
     return state + gain @ (later[0] - predicted), (after + after.T) / 2

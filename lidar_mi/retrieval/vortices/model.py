@@ -3,7 +3,8 @@
 Frame: y to port, z up. A vortex with positive circulation rotates from +y towards +z.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import reduce
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -88,8 +89,8 @@ class Rotation(NamedTuple):
         From its axis, m, and their squares' sum.
     unit, omega : torch.Tensor
         Angular velocity per circulation, m^-2, and itself, s^-1.
-    bend : torch.Tensor
-        Derivative of `omega` by half of `square`.
+    omega_slope : torch.Tensor
+        Derivative of `omega` by half of `square`, m^-2 s^-1.
     """
 
     dy: torch.Tensor
@@ -97,7 +98,7 @@ class Rotation(NamedTuple):
     square: torch.Tensor
     unit: torch.Tensor
     omega: torch.Tensor
-    bend: torch.Tensor
+    omega_slope: torch.Tensor
 
 
 def rotations(
@@ -111,30 +112,34 @@ def rotations(
         square = dy**2 + dz**2
         value, slope = angular_velocity(square / radius**2, profile)
         unit = value / (2 * torch.pi * radius**2)
-        bend = circulation / (torch.pi * radius**4) * slope
-        found.append(Rotation(dy, dz, square, unit, circulation * unit, bend))
+        omega_slope = circulation / (torch.pi * radius**4) * slope
+        found.append(Rotation(dy, dz, square, unit, circulation * unit, omega_slope))
     return found
 
 
-def gradient(of: Sequence[Rotation]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def gradient(about: Sequence[Rotation]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """dv/dy, dv/dz and dw/dy of the wind of `rotations`, s^-1; dw/dz = -dv/dy."""
-    v_y = -sum(one.bend * one.dy * one.dz for one in of)
-    v_z = -sum(one.omega + one.bend * one.dz**2 for one in of)
-    w_y = sum(one.omega + one.bend * one.dy**2 for one in of)
+    v_y = -_total(one.omega_slope * one.dy * one.dz for one in about)
+    v_z = -_total(one.omega + one.omega_slope * one.dz**2 for one in about)
+    w_y = _total(one.omega + one.omega_slope * one.dy**2 for one in about)
     return v_y, v_z, w_y
 
 
-def sensitivity(of: Sequence[Rotation], along: torch.Tensor) -> torch.Tensor:
+def _total(parts: Iterable[torch.Tensor]) -> torch.Tensor:
+    return reduce(torch.add, parts)
+
+
+def sensitivity(about: Sequence[Rotation], along: torch.Tensor) -> torch.Tensor:
     """Derivatives (10, ...) of along . wind with respect to `PARAMETERS`; along is (2, ...)."""
     along_y, along_z = along
-    columns = of[0].dy.new_empty(10, *of[0].dy.shape)
-    for number, one in enumerate(of):
+    columns = about[0].dy.new_empty(10, *about[0].dy.shape)
+    for number, one in enumerate(about):
         first = 4 * number
         across = along_z * one.dy - along_y * one.dz
         columns[first] = one.unit * across
-        columns[first + 1] = -(2 * one.omega + one.bend * one.square) * across
-        columns[first + 2] = -(one.bend * one.dy * across + one.omega * along_z)
-        columns[first + 3] = -(one.bend * one.dz * across - one.omega * along_y)
+        columns[first + 1] = -(2 * one.omega + one.omega_slope * one.square) * across
+        columns[first + 2] = -(one.omega_slope * one.dy * across + one.omega * along_z)
+        columns[first + 3] = -(one.omega_slope * one.dz * across - one.omega * along_y)
     columns[8], columns[9] = along_y, along_z
     return columns
 
@@ -153,8 +158,8 @@ def advected(
 
     Runge-Kutta of fourth order in a steady flow; `time` in s, of all air or of each, negative:
     backward. `began` is the wind (2, ...) at the places, where it is known. The middle, which is
-    used for derivatives only, is by Hermite's cubic. Air that turns little takes one step of the
-    midpoint rule. Where the core takes many steps, air that turns less than half as fast as four
+    used for derivatives only, is by Hermite's cubic. Air that rotates little takes one step of the
+    midpoint rule. Where the core takes many steps, air that rotates less than half as fast as four
     steps allow takes four.
     """
     centre = {"lamb_oseen": _LAMB_OSEEN, "burnham_hallock": 1.0}[profile] / (2 * torch.pi)
@@ -168,11 +173,14 @@ def advected(
     if isinstance(time, torch.Tensor):
         shape = torch.broadcast_shapes(y.shape, time.shape)
         start, began, time = start.expand(2, *shape), began.expand(2, *shape), time.expand(shape)
-    there = wind(theta, *torch.add(start, began * time, alpha=0.5), profile)
+    half_y, half_z = torch.add(start, began * time, alpha=0.5)
+    there = wind(theta, half_y, half_z, profile)
     place = start + time * there
     # the wind at the end of a step is that at its middle as much further again
     middle = (start + place) / 2 + time / 4 * (began - there)
-    angle = _turning(theta, y, z) * abs(time)
+    angle = _angular_speed(theta, y, z) * (
+        time.abs() if isinstance(time, torch.Tensor) else abs(time)
+    )
     near = angle > _SLOW_ANGLE
     groups = [(near, steps)]
     if steps > _FEW_STEPS:
@@ -186,20 +194,32 @@ def advected(
     return middle, place
 
 
-def _followed(theta, place, k1, time: float | torch.Tensor, steps: int, profile: Profile):
-    """Where air at places (2, n) with the wind k1 comes in so many steps, and the wind there."""
+def _followed(
+    theta: torch.Tensor,
+    place: torch.Tensor,
+    k1: torch.Tensor,
+    time: float | torch.Tensor,
+    steps: int,
+    profile: Profile,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """End of the path of air at places (2, n) with the wind k1 after so many steps; wind there."""
+
+    def wind_at(place: torch.Tensor) -> torch.Tensor:
+        y, z = place
+        return wind(theta, y, z, profile)
+
     h = time / steps
     for _ in range(steps):
-        k2 = wind(theta, *(place + h / 2 * k1), profile)
-        k3 = wind(theta, *(place + h / 2 * k2), profile)
-        k4 = wind(theta, *(place + h * k3), profile)
+        k2 = wind_at(place + h / 2 * k1)
+        k3 = wind_at(place + h / 2 * k2)
+        k4 = wind_at(place + h * k3)
         place = place + h / 6 * (k1 + 2 * (k2 + k3) + k4)
-        k1 = wind(theta, *place, profile)
+        k1 = wind_at(place)
     return place, k1
 
 
-def _turning(theta, y, z) -> torch.Tensor:
-    """Sum of the angular velocities about both vortices, s^-1, without their signs: at most."""
+def _angular_speed(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+    """Upper limit of the angular speed: the sum of both vortices' absolute values, s^-1."""
     total = torch.zeros_like(y)
     for first in (0, 4):
         dy, dz = y - theta[first + 2], z - theta[first + 3]
@@ -239,7 +259,8 @@ def path_sensitivity(
     integral over the path is by the midpoint rule, advected on by exp(L time/2) with the gradient L
     of the wind there: a relative error of (omega time)^2/24, 0.7 % for 0.4 rad.
     """
-    about = rotations(theta, *middle, profile)
+    y, z = middle
+    about = rotations(theta, y, z, profile)
     v_y, v_z, w_y = gradient(about)
     h = time / 2
     # exp(L h) = cosh(c) + L sinh(c) / c with c^2 = -det(L h), as L has no trace

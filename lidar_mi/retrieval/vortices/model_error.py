@@ -8,7 +8,7 @@ error that does not average out over pixels.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import numpy as np
 import torch
@@ -107,7 +107,7 @@ class Lags:
         return torch.fft.fft(torch.fft.rfft(fields, n=columns), n=rows, dim=-2)
 
     def autocorrelation(
-        self, fields: Sequence[torch.Tensor], weights: Sequence[float]
+        self, fields: torch.Tensor | Sequence[torch.Tensor], weights: Sequence[float]
     ) -> torch.Tensor:
         """Sum over the fields of weight * sum_x f(x) f(x + lag), for lags of 0 or more along z.
 
@@ -115,8 +115,9 @@ class Lags:
         """
         waves = (self.transform(f) for f in fields)
         # a sum over a last axis of two takes six times as long
-        power = sum(
-            w * (f.real.square() + f.imag.square()) for f, w in zip(waves, weights, strict=True)
+        power = reduce(
+            torch.add,
+            (w * (f.real.square() + f.imag.square()) for f, w in zip(waves, weights, strict=True)),
         )
         return self.by_lags(power)
 
@@ -162,14 +163,15 @@ def model_error(
     stiffness : torch.Tensor, shape (3, z, y)
         A: yy, yz, zz.
     shortest : float
-        Lags below this (steps of the grid) are left out, as noise may correlate over them.
+        Lags below this (steps of the grid) are not used, as noise may correlate over them.
     change : torch.Tensor, optional
         Correlation by another cause, of unknown amplitude, by the lags of `lags_used`; see
         `of_change`.
     response : Response, optional
-        Of the fit. Then the departure is that before the fit, which absorbs part of it: what the
-        residuals lack is the expected part of a departure of each length (restricted maximum
-        likelihood: Patterson & Thompson 1971, Biometrika 58, 545-554). Left out: what is left.
+        Of the fit. With it the departure is that before the fit, which absorbs part of it: the
+        residuals lack the expected part of a departure of each length (restricted maximum
+        likelihood: Patterson & Thompson 1971, Biometrika 58, 545-554). Without it, the departure
+        is that in the residuals.
     tested : bool
         Whether a departure that is not significant is none; with `change` only.
     """
@@ -182,6 +184,7 @@ def model_error(
     if not float(scale) > 0 or not len(used):
         return ModelError()
     distance = lags.distance()[: lags.rows]
+    # in units of the stiffness at lag 0, so that the coefficients are the variances
     found, square = observed.take(used) / scale, distance.take(used).square()
     size = float(found.abs().max())
     if not size > 0:
@@ -206,20 +209,28 @@ def model_error(
         noise = near / (force != 0).any(0).sum().sqrt()
         if not explained.square().sum().sqrt() > _SIGNIFICANT * noise:
             return ModelError()
-    kept = [(float(a), n) for a, n in zip(variances, lengths, strict=True) if a > 0]
-    return ModelError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
+    positive = [(float(a), n) for a, n in zip(variances, lengths, strict=True) if a > 0]
+    return ModelError(tuple(a for a, _ in positive), tuple(n for _, n in positive))
 
 
-# They depend on the grid alone: kept for the next images.
+# They depend on the grid alone and are stored for the next images.
 @lru_cache(maxsize=8)
-def _distance(rows: int, columns: int, dtype, device) -> torch.Tensor:
+def _distance(rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     along = [torch.fft.fftfreq(n, 1 / n, dtype=dtype, device=device) for n in (rows, columns)]
     return torch.hypot(along[0][:, None], along[1][None, :])
 
 
 @lru_cache(maxsize=8)
-def _between(rows: int, columns: int, kept: int, dtype, device, shortest: float, longest: float):
-    distance = _distance(rows, columns, dtype, device)[:kept]
+def _between(
+    rows: int,
+    columns: int,
+    positive: int,
+    dtype: torch.dtype,
+    device: torch.device,
+    shortest: float,
+    longest: float,
+) -> torch.Tensor:
+    distance = _distance(rows, columns, dtype, device)[:positive]
     chosen = (distance >= shortest) & (distance <= longest)
     # of opposite lags along y alone, one
     chosen[0, columns // 2 + 1 :] = False
@@ -228,7 +239,8 @@ def _between(rows: int, columns: int, kept: int, dtype, device, shortest: float,
 
 def lags_used(like: torch.Tensor) -> Lags:
     """The lags that `model_error` looks at, of fields (..., z, y)."""
-    shape = tuple(like.shape[-2:])
+    rows, columns = like.shape[-2:]
+    shape = rows, columns
     return Lags(shape, like, 2 * max(_lengths(shape)))
 
 
@@ -248,7 +260,7 @@ class Response:
     inverse : torch.Tensor, shape (p, p)
         H^-1.
     even : torch.Tensor, shape (z, y)
-        Factor by which the forces are multiplied that are correlated; one if left out.
+        Factor by which the forces are multiplied that are correlated; 1 by default.
     """
 
     force: torch.Tensor
@@ -262,27 +274,28 @@ class Response:
 
         The force of a departure d is A d before the fit and A d - P a after it, with its response
         a; `stiffness` is A times `even`. For a unit variance the expectation of a d(x) is
-        K(x) = H^-1 sum_x' P(x') C(x - x'), so that the correlations with each other of A K and P,
-        and of P with itself, tell what is missing. They are sums over squares of 4 pixels, between
+        K(x) = H^-1 sum_x' P(x') C(x - x'), so that the missing part follows from the correlations
+        of A K with P and of P with itself. They are sums over squares of 4 pixels, between
         which lags are interpolated.
         """
         side = _SIDE if min(lags.shape) >= _LARGE else 1
-        force, seen, stiff = (
+        force, correlated, stiff = (
             _sums(field, side) for field in (self.force, self.even * self.force, stiffness)
         )
         # as far as the longest covariance reaches
-        coarse = Lags(tuple(force.shape[-2:]), force, 2 * lags.reach / side)
+        rows, columns = force.shape[-2:]
+        coarse = Lags((rows, columns), force, 2 * lags.reach / side)
         inverse = self.inverse.to(force)
-        waves = coarse.transform(seen)
+        waves = coarse.transform(correlated)
         follow = torch.tensordot(inverse.to(waves), coarse.transform(force), 1)
-        rows, columns = coarse.shape
         to_lags = _interpolation(lags, coarse, side)
         for length in lengths:
             # means over two squares of a Gaussian
             wide = (length / side) ** 2 + (1 - side**-2) / 6
-            share = (length / side) ** 2 / wide
-            covariance = share * torch.exp(-coarse.distance().square() / (2 * wide))
+            peak = (length / side) ** 2 / wide
+            covariance = peak * torch.exp(-coarse.distance().square() / (2 * wide))
             spectrum = torch.fft.rfft2(covariance).real.clamp(min=0)
+            # K of the docstring: the response to a departure correlated over this length
             back = torch.fft.ifft(follow * spectrum, dim=-2)[..., :rows, :]
             expected = torch.fft.irfft(back, n=coarse.sizes[1])[..., :columns]
             spread = torch.einsum("iazy,jazy->ij", expected, force) @ inverse
@@ -290,6 +303,7 @@ class Response:
             moved = torch.stack(
                 [stiff[0] * first + stiff[1] * second, stiff[1] * first + stiff[2] * second], 1
             )
+            # half of the last term: both orders of x and x + h are added below
             cross = coarse.transform(moved) - torch.tensordot(spread.to(waves), waves, 1) / 2
             power = 2 * (cross.conj() * waves).real.sum((0, 1))
             found = coarse.by_lags(power) / side**2
@@ -330,13 +344,14 @@ def of_change(residual: torch.Tensor, slope: torch.Tensor, valid: torch.Tensor) 
     """
     lags = lags_used(residual)
     number = lags.autocorrelation([valid.to(residual)], (1.0,)).clamp(min=1)
-    alike = lags.autocorrelation([valid * residual], (1.0,)) / number
-    return alike * lags.autocorrelation(slope, (1.0, 1.0))
+    correlation = lags.autocorrelation([valid * residual], (1.0,)) / number
+    return correlation * lags.autocorrelation(slope, (1.0, 1.0))
 
 
 def spread_of(responses: torch.Tensor, error: ModelError) -> torch.Tensor:
     """Covariance (p, p) of sum_x P_p(x) . d(x), d the field of the flow's error, P (p, 2, z, y)."""
-    lags = Lags(tuple(responses.shape[2:]), responses)
+    rows, columns = responses.shape[2:]
+    lags = Lags((rows, columns), responses)
     if not error.variances:
         return responses.new_zeros(len(responses), len(responses))
     return lags.quadratic(responses, error.covariance(lags.distance()))

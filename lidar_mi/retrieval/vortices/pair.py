@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import torch
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.errors import InputError
@@ -52,13 +53,13 @@ class VortexPairFit(Tabular):
     from_start : bool
         Whether it was found from an expected pair, without a search.
     turned : ndarray, shape (10,), optional
-        Change of the parameters per rad/s by which the observations turn about y = z = 0 between
-        the scans, from +y towards +z; of a roll that nobody knows.
+        Change of the parameters per rad/s by which the observations rotate about y = z = 0 between
+        the scans, from +y towards +z: by an unknown roll.
     inclined : ndarray, shape (10, 2), optional
         Change of the parameters per slope dy/dx and dz/dx of the pair's axis, if all of the air's
         motion along x showed in oblique beams; see `with_slopes`.
     slopes, slope_covariance : ndarray, shapes (2,) and (2, 2), optional
-        Of the pair's axis, dy/dx and dz/dx, where more than one slab has told them.
+        Of the pair's axis, dy/dx and dz/dx, where more than one slab determines them.
     """
 
     parameters: np.ndarray
@@ -94,7 +95,7 @@ class VortexPairFit(Tabular):
         """Both vortices and the pair, with standard errors, after whether the fit is accepted."""
         found = self.quantities
 
-        def shown(name):
+        def shown(name: str) -> str:
             return with_error(found[name].value, found[name].stderr, _SIGNS[found[name].units])
 
         sides = [
@@ -131,7 +132,7 @@ class VortexPairFit(Tabular):
         """
         theta = torch.as_tensor(self.parameters)
 
-        def derived(theta):
+        def derived(theta: torch.Tensor) -> torch.Tensor:
             return torch.stack(list(_derived(theta, self.profile).values()))
 
         values = _derived(theta, self.profile)
@@ -150,13 +151,13 @@ class VortexPairFit(Tabular):
         rotation_stderr: float = 0.0,
         centre: tuple[float, float] = (0.0, 0.0),
     ) -> "VortexPairFit":
-        """With errors of the wind that all of its observations share, by unknown pointing.
+        """With errors of the wind common to all of its observations, by an unknown pointing error.
 
         The mean wind is fitted, and so takes all of an error of v and w (m/s); what derives from it
         (drift, the wind anywhere, places after some time) has it too. Circulations, radii and
-        separation are as certain as without. Places are as seen by the mean pointing of both scans.
+        separation are as certain as without. Places refer to the mean pointing of both scans.
         A rotation (rad/s, about ``centre``: y, z in m) changes all parameters: a vortex pair cannot
-        turn everywhere, and the fit takes part of it for circulation.
+        rotate everywhere, and the fit attributes part of it to circulation.
 
         Raises
         ------
@@ -180,9 +181,9 @@ class VortexPairFit(Tabular):
     def with_slopes(self, slopes: np.ndarray, covariance: np.ndarray) -> "VortexPairFit":
         """The pair of images that look at an inclined pair with oblique beams.
 
-        Of the motion along x that a wholly resolved gate would show between none and all is seen:
-        none where the texture is the same throughout the depth of the gate, all where it is much
-        finer. This fraction is taken to be uniform over both, 1/2 with a standard error of
+        Images show between none and all of the motion along x that a wholly resolved gate would
+        show: none where the texture is the same throughout the depth of the gate, all where it is
+        much finer. This fraction is taken to be uniform over both, 1/2 with a standard error of
         1/sqrt(12), which is added, as are the errors of the slopes.
 
         Parameters
@@ -197,11 +198,11 @@ class VortexPairFit(Tabular):
         """
         if self.inclined is None:
             raise InputError("slopes: not allowed for a pair without `inclined`; give a telescope")
-        change, variance = self.inclined @ slopes, _SEEN_STD**2
-        by_slopes = (_SEEN**2 + variance) * self.inclined @ covariance @ self.inclined.T
+        change, variance = self.inclined @ slopes, _OBLIQUE_STD**2
+        by_slopes = (_OBLIQUE**2 + variance) * self.inclined @ covariance @ self.inclined.T
         return replace(
             self,
-            parameters=self.parameters - _SEEN * change,
+            parameters=self.parameters - _OBLIQUE * change,
             covariance=self.covariance + by_slopes + variance * np.outer(change, change),
             slopes=slopes,
             slope_covariance=covariance,
@@ -214,7 +215,7 @@ class VortexPairFit(Tabular):
         time in which the pair descends by its separation.
         """
 
-        def moved(theta):
+        def moved(theta: torch.Tensor) -> torch.Tensor:
             return theta + seconds * drift(theta, self.profile) @ _CENTRES.to(theta)
 
         theta = torch.as_tensor(self.parameters)
@@ -222,7 +223,7 @@ class VortexPairFit(Tabular):
         covariance = slope @ self.covariance @ slope.T
         return replace(self, parameters=moved(theta).numpy(), covariance=covariance)
 
-    def wind(self, y, z) -> xr.Dataset:
+    def wind(self, y: ArrayLike, z: ArrayLike) -> xr.Dataset:
         """The wind of the fit anywhere, at mid-time; see `after` for later times.
 
         Parameters
@@ -263,21 +264,21 @@ class VortexPairFit(Tabular):
         """v, w (2, ...) at places and their covariance vv, ww, vw (3, ...)."""
         y, z = np.broadcast_arrays(y, z)
         theta = torch.as_tensor(self.parameters)
-        places = [torch.as_tensor(np.array(axis, dtype=float)) for axis in (y, z)]
+        lateral, vertical = (torch.as_tensor(np.array(axis, dtype=float)) for axis in (y, z))
         unit = torch.eye(2, dtype=theta.dtype)
-        about = rotations(theta, *places, self.profile)
-        slope = [sensitivity(about, direction.view(2, *[1] * places[0].ndim)) for direction in unit]
+        about = rotations(theta, lateral, vertical, self.profile)
+        slope = [sensitivity(about, direction.view(2, *[1] * lateral.ndim)) for direction in unit]
         covariance = torch.as_tensor(self.covariance)
         v, w = (torch.tensordot(covariance, part, 1) for part in slope)
         model = self.model_error**2
         spread = torch.stack(
             [(v * slope[0]).sum(0) + model, (w * slope[1]).sum(0) + model, (v * slope[1]).sum(0)]
         )
-        return wind(theta, *places, self.profile).numpy(), spread.numpy()
+        return wind(theta, lateral, vertical, self.profile).numpy(), spread.numpy()
 
 
 # Fraction of the motion along x that oblique beams show, uniform from 0 to 1.
-_SEEN, _SEEN_STD = 1 / 2, 12**-0.5
+_OBLIQUE, _OBLIQUE_STD = 1 / 2, 12**-0.5
 # Derivatives of the parameters by a shift of the pair along y and along z.
 _CENTRES = torch.zeros(2, 10)
 _CENTRES[0, [2, 6]] = _CENTRES[1, [3, 7]] = 1.0

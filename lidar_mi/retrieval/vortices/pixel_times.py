@@ -1,4 +1,4 @@
-"""Air followed to the time at which its pixel was seen, which depends on where it is then."""
+"""Air followed to the time at which its pixel was measured, which depends on its place then."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ _ROUNDS = 2
 
 
 class PixelTimes(NamedTuple):
-    """When the pixels of two images were seen, s from mid-time, (2, z, y) on a grid in m."""
+    """Times of the pixels of two images, s from mid-time, (2, z, y) on a grid in m."""
 
     values: torch.Tensor
     first: tuple[float, float]
@@ -36,8 +36,8 @@ class PixelTimes(NamedTuple):
         return below + up * (above - below), slope
 
 
-class Seen(NamedTuple):
-    """Air in one image.
+class ImagedAir(NamedTuple):
+    """Air as one image shows it.
 
     `middle` of its path (2, ...) in the frame of the pair, `place` (2, ...) in the image, `time`
     (...) from mid-time. `along` maps slopes (2, ...) of the image to those by which it changes with
@@ -53,15 +53,15 @@ class Seen(NamedTuple):
     def along(self, slope: torch.Tensor) -> torch.Tensor:
         """Slope of the image for a path of fixed time.
 
-        A place that changes by a at a fixed time is seen g . a' later, g the gradient of the times,
-        and has moved on by the wind u meanwhile: a' = a + u (g . a'), so that
+        A place that changes by a at a fixed time is measured g . a' later, g the gradient of the
+        times, and is advected by the wind u meanwhile: a' = a + u (g . a'), so that
         slope . a' = (slope + g (slope . u) / (1 - g . u)) . a .
         """
         turned = (slope * self.speed).sum(0) / (1 - (self.gradient * self.speed).sum(0))
         return slope + self.gradient * turned
 
 
-def seen(
+def imaged_air(
     times: PixelTimes,
     number: int,
     steady: torch.Tensor,
@@ -69,8 +69,8 @@ def seen(
     y: torch.Tensor,
     z: torch.Tensor,
     profile: Profile,
-) -> Seen:
-    """Where and when image 0 or 1 sees the air that is at places (...) at mid-time.
+) -> ImagedAir:
+    """Where and when image 0 or 1 shows the air that is at places (...) at mid-time.
 
     Parameters
     ----------
@@ -89,5 +89,6 @@ def seen(
         middle, within = advected(steady, y, z, used, profile, began)
         place = within + moving[:, None, None] * used
         time, gradient = times.at(number, *place)
-    speed = wind(steady, *within, profile) + moving[:, None, None]
-    return Seen(middle, place, used, speed, gradient)
+    within_y, within_z = within
+    speed = wind(steady, within_y, within_z, profile) + moving[:, None, None]
+    return ImagedAir(middle, place, used, speed, gradient)

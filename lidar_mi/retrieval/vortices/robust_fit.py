@@ -52,9 +52,9 @@ class Solution(NamedTuple):
 
 def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
     """1 / variance of noise and model error, less for outliers; 0 where there is no residual."""
-    moved = flow_variance * misfit.slope.square().sum(0)
-    size = misfit.residual.abs() / (misfit.scatter + moved).sqrt()
-    return misfit.valid * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + moved)
+    by_flow = flow_variance * misfit.slope.square().sum(0)
+    size = misfit.residual.abs() / (misfit.scatter + by_flow).sqrt()
+    return misfit.valid * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + by_flow)
 
 
 def without_step(misfit: Misfit, flow_variance: float) -> torch.Tensor:
@@ -63,34 +63,34 @@ def without_step(misfit: Misfit, flow_variance: float) -> torch.Tensor:
     step = _step(normal, force, 1e-6)
     if step is None:
         return misfit.residual
-    return moved(misfit, step)
+    return residual_after(misfit, step)
 
 
-def moved(misfit: Misfit, step: torch.Tensor) -> torch.Tensor:
-    """The residuals after a step, as far as they are linear."""
+def residual_after(misfit: Misfit, step: torch.Tensor) -> torch.Tensor:
+    """The residuals after a step, to first order."""
     return misfit.residual + torch.tensordot(step.to(misfit.residual), misfit.jacobian, 1)
 
 
 def stepped(
-    parameters: torch.Tensor, misfit: Misfit, flow_variance: float, turns: int = 2
+    parameters: torch.Tensor, misfit: Misfit, flow_variance: float, iterations: int = 2
 ) -> Solution | None:
     """The minimum of residuals that are linear in the parameters, None if there is none.
 
-    The weights are those of the residuals left: after the first step so many corrections less one
-    follow, each with the residuals' own weights and the first step's matrix.
+    The weights are those of the remaining residuals: each iteration after the first corrects the
+    step with the weights of the residuals before it and the first iteration's matrix.
     """
     weight = weights(misfit, flow_variance)
     normal, force = _normal(misfit, weight)
-    step, rest = torch.zeros_like(force), misfit
-    for turn in range(turns):
-        if turn:
-            force = _force(rest, weights(rest, flow_variance))
+    step, remaining = torch.zeros_like(force), misfit
+    for iteration in range(iterations):
+        if iteration:
+            force = _force(remaining, weights(remaining, flow_variance))
         correction = _step(normal, force, 1e-6)
         if correction is None:
             return None
         step = step + correction
-        rest = misfit._replace(residual=moved(misfit, step))
-    return _solution(parameters + step, rest, flow_variance, True)
+        remaining = misfit._replace(residual=residual_after(misfit, step))
+    return _solution(parameters + step, remaining, flow_variance, True)
 
 
 def fit(
@@ -159,7 +159,7 @@ def _force(misfit: Misfit, weight: torch.Tensor) -> torch.Tensor:
     return -(misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()).double()
 
 
-def _step(normal, force, damping: float) -> torch.Tensor | None:
+def _step(normal: torch.Tensor, force: torch.Tensor, damping: float) -> torch.Tensor | None:
     diagonal = normal.diagonal()
     if not bool((diagonal > 0).all()):
         return None
@@ -170,7 +170,9 @@ def _step(normal, force, damping: float) -> torch.Tensor | None:
     return step if bool(torch.isfinite(step).all()) else None
 
 
-def _solution(parameters, misfit: Misfit, flow_variance: float, converged: bool) -> Solution:
+def _solution(
+    parameters: torch.Tensor, misfit: Misfit, flow_variance: float, converged: bool
+) -> Solution:
     weight = weights(misfit, flow_variance)
     normal, _ = _normal(misfit, weight)
     number = max(1, int(misfit.valid.sum()))

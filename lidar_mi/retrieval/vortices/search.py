@@ -4,6 +4,7 @@ For given places and core radius the wind is linear in the circulations and the 
 pair's best circulations and misfit follow in closed form from sums over the observations.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -50,7 +51,7 @@ class Observations(NamedTuple):
 def starting_points(observed: Observations, count: int, profile: Profile) -> torch.Tensor:
     """Parameters (up to `count`, 10) of pairs with the least misfit, best first.
 
-    Vortices rotate in opposite directions and are at least three core radii apart. Of each
+    Vortices rotate in opposite directions; their separation is at least three core radii. Of each
     neighbourhood only the best pair is taken.
     """
     low, high, step = _region(observed)
@@ -60,7 +61,8 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
         for a, b, side in zip(low, high, sides, strict=True)
     ]
     place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
-    apart = torch.cdist(place, place)
+    separation = torch.cdist(place, place)
+    # weighted once: all that follows is ordinary least squares
     root = observed.weight.sqrt()
     uniform = torch.linalg.qr(observed.everywhere * root[:, None])[0]
     value = observed.value * root
@@ -77,9 +79,10 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
             across += columns.T @ torch.cat([uniform[rows], value[rows, None]], 1)
         # the vortices' winds without the part that a mean wind and brightness explain
         normal -= across[:, :-1] @ across[:, :-1].T
+        # two vortices are two columns: their gain is in closed form for all pairs at once
         gain, first, second = _explained(normal, across[:, -1])
-        gain = torch.where((first > 0) & (second < 0) & (apart > 3 * radius), gain, 0.0)
-        for p, q in _peaks(gain, apart, count, 2.5 * step):
+        gain = torch.where((first > 0) & (second < 0) & (separation > 3 * radius), gain, 0.0)
+        for p, q in _peaks(gain, separation, count, 2.5 * step):
             vortices = [
                 torch.cat([amplitude[p, q][None], radius_log[None], place[at]])
                 for amplitude, at, radius_log in (
@@ -97,11 +100,11 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
 
 
 def condensed(observed: Observations) -> Observations:
-    """Two observations for each block, as large as the places are apart, in place of all in it.
+    """Two observations in place of all of a block, whose sides are the distance of the places.
 
-    Of a wind u that is uniform over a block, observations a . u = d with weights w tell as much as
-    two of L^T u = L^-1 sum w a d, where L L^T = sum w a a^T (sufficient statistics of weighted
-    least squares). Brightness is fitted and subtracted before.
+    Of a wind u that is uniform over a block, observations a . u = d with weights w have the
+    information of two of L^T u = L^-1 sum w a d, where L L^T = sum w a a^T (sufficient statistics
+    of weighted least squares). Brightness is fitted and subtracted before.
     """
     low, high, step = _region(observed)
     root = observed.weight.sqrt()
@@ -122,16 +125,16 @@ def condensed(observed: Observations) -> Observations:
     total, first, mixed = sums[:3]
     # a little stronger along y and z, as the observations of a block may all be along one line
     little = 1e-6 * total
-    left = (first + little).sqrt()
-    lower = mixed / left
-    right = (total - first + little - lower**2).clamp(min=0).sqrt().clamp(min=little.sqrt())
-    one = sums[3] / left
-    two = (sums[4] - lower * one) / right
+    upper = (first + little).sqrt()
+    mixed_root = mixed / upper
+    lower = (total - first + little - mixed_root**2).clamp(min=0).sqrt().clamp(min=little.sqrt())
+    one = sums[3] / upper
+    two = (sums[4] - mixed_root * one) / lower
     y, z = (torch.cat([part, part]) for part in sums[5:] / total)
     return Observations(
         y,
         z,
-        torch.stack([torch.cat([left, torch.zeros_like(left)]), torch.cat([lower, right])]),
+        torch.stack([torch.cat([upper, torch.zeros_like(upper)]), torch.cat([mixed_root, lower])]),
         torch.cat([one, two]),
         torch.ones_like(y),
     )
@@ -144,17 +147,24 @@ def _region(observed: Observations) -> tuple[torch.Tensor, torch.Tensor, float]:
 
 
 def _swirls(
-    observed: Observations, rows, root, place, radius: float, profile: Profile
+    observed: Observations,
+    rows: torch.Tensor,
+    root: torch.Tensor,
+    place: torch.Tensor,
+    radius: float,
+    profile: Profile,
 ) -> torch.Tensor:
     """Some weighted observations of vortices of unit circulation at each place, (n, places)."""
-    dy, dz = (observed[axis][rows, None] - place[:, axis] for axis in (0, 1))
+    dy, dz = observed.y[rows, None] - place[:, 0], observed.z[rows, None] - place[:, 1]
     value = swirl((dy**2 + dz**2) / radius**2, profile)
     scale = root[rows] / (2 * torch.pi * radius**2)
     along_y, along_z = observed.along[:, rows] * scale
     return (dy.mul_(along_z[:, None]) - dz.mul_(along_y[:, None])).mul_(value)
 
 
-def _explained(normal, wanted):
+def _explained(
+    normal: torch.Tensor, wanted: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Reduction of the misfit by every pair of columns, and the amplitudes of both."""
     power = normal.diagonal()
     determinant = power[:, None] * power - normal**2
@@ -164,18 +174,25 @@ def _explained(normal, wanted):
     return first * wanted[:, None] + second * wanted, first, second
 
 
-def _peaks(gain, apart, count: int, distance: float):
+def _peaks(
+    gain: torch.Tensor, separation: torch.Tensor, count: int, distance: float
+) -> Iterator[tuple[int, int]]:
     """The best pairs, none with both places within a distance of a better one's."""
     for _ in range(count):
         p, q = divmod(int(gain.argmax()), gain.shape[1])
         if not gain[p, q] > 0:
             return
         yield p, q
-        gain = gain.masked_fill((apart[p] < distance)[:, None] & (apart[q] < distance), 0.0)
+        gain = gain.masked_fill(
+            (separation[p] < distance)[:, None] & (separation[q] < distance), 0.0
+        )
 
 
-def _with_mean_wind(theta, observed: Observations, root, profile: Profile) -> torch.Tensor:
+def _with_mean_wind(
+    theta: torch.Tensor, observed: Observations, root: torch.Tensor, profile: Profile
+) -> torch.Tensor:
     """The parameters with the mean wind that fits the residual best."""
-    left = observed.value - (observed.along * wind(theta, observed.y, observed.z, profile)).sum(0)
-    free = torch.linalg.lstsq(observed.everywhere * root[:, None], (left * root)[:, None])
+    swirl = (observed.along * wind(theta, observed.y, observed.z, profile)).sum(0)
+    residual = observed.value - swirl
+    free = torch.linalg.lstsq(observed.everywhere * root[:, None], (residual * root)[:, None])
     return torch.cat([theta[:8], free.solution[:2, 0]])

@@ -27,8 +27,8 @@ from lidar_mi.retrieval.vortices.track_motion import (
     PLACES,
     SLOPES,
     Wandering,
-    carried,
-    moved,
+    advected,
+    advected_states,
     oblique_drift,
     unsteady,
     wandered,
@@ -60,7 +60,7 @@ class TrackSettings:
     window : int
         Newest slabs whose innovations are compared with what is stated, see `Track.inflation`.
     memory : int
-        Slabs that are kept to predict planes behind the newest: 64 at 7.5 m are 480 m.
+        Slabs that are stored to predict planes behind the newest: 64 at 7.5 m are 480 m.
     least_updates : int
         Of a usable track: with two the slopes have no redundancy, and no innovation tested them.
     circulation_error, place_error : float
@@ -86,7 +86,7 @@ class TrackSettings:
     circulation_error: float = 0.1
     place_error: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("slope", "unlike_slope", "circulation_error", "place_error"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(
@@ -102,7 +102,7 @@ class TrackSettings:
 
 @dataclass(frozen=True, eq=False)
 class Slab:
-    """The state of a track in one slab, and how the track came there.
+    """The state of a track in one slab, and its transition from the slab before.
 
     Attributes
     ----------
@@ -189,8 +189,8 @@ class Track:
         """Factor of the variances that the recent innovations ask for, 1 or more.
 
         Their mean square over what is expected, from rejected fits too, if that is beyond the gate
-        for so many slabs; else 1 (Birge 1932, Phys. Rev. 40, 207-227). Above 1 the wake is bent, or
-        the fits err, by more than stated.
+        for so many slabs; else 1 (Birge 1932, Phys. Rev. 40, 207-227). Above 1 the wake is curved,
+        or the fits err, by more than stated.
         """
         recent = [slab.innovation for slab in self.slabs[-self.settings.window :]]
         squares = [square for square in recent if square is not None]
@@ -223,8 +223,8 @@ class Track:
         From the slab nearest to the plane, whose state all later slabs have improved
         (Rauch-Tung-Striebel), it moves along the slopes and with the drift. Its covariance, times
         `inflation`, grows by the random walks over the distance and the time from that slab, and by
-        the unknown steady rates. The velocity of a bent pair is uncertain by the difference of this
-        slab's mutual induction from the mean over all. Beyond the newest slab this is the
+        the unknown steady rates. The velocity of a curved pair is uncertain by the difference of
+        this slab's mutual induction from the mean over all. Beyond the newest slab this is the
         prediction of the filter.
 
         Parameters
@@ -247,14 +247,15 @@ class Track:
         """
         _check_finite(x=x, time=time)
         nearest = int(np.argmin([abs(slab.x - x) for slab in self.slabs]))
+        # smoothed, not filtered: later slabs determine the slopes and the mean wind
         slab, (state, covariance) = self.slabs[nearest], self._smoothed[nearest]
         wandering = self.settings.wandering
         dt = time - slab.time
         state, covariance, _, _ = _predicted(
             state, covariance, x - slab.x, dt, wandering, self.profile
         )
-        bent = self._inductions[:, nearest] - self._inductions.mean(1)
-        covariance = self.inflation * covariance + unsteady(state, dt, wandering, bent)
+        by_curvature = self._inductions[:, nearest] - self._inductions.mean(1)
+        covariance = self.inflation * covariance + unsteady(state, dt, wandering, by_curvature)
         return replace(
             self.fit,
             parameters=state[:MEASURED],
@@ -280,7 +281,7 @@ class Track:
         places, times = (np.array([getattr(s, name) for s in self.slabs]) for name in ("x", "time"))
         nearest = np.abs(x[..., None] - places).argmin(-1)
         states = np.stack([state for state, _ in self._smoothed], -1)[:, nearest]
-        found = carried(states, x - places[nearest], time - times[nearest], self.profile)
+        found = advected_states(states, x - places[nearest], time - times[nearest], self.profile)
         return found[:MEASURED]
 
     @cached_property
@@ -371,11 +372,11 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
     _check_finite(x=x, time=time)
     if not time > track.time:
         raise InputError(f"time: {time:g} s is not allowed; the last slab's is {track.time:g} s")
-    fits = pair is not None and _is_fit(pair)
-    if fits and pair.profile != track.profile:
-        raise InputError(f"pair.profile: {pair.profile!r} is not that of the track")
-    if track.lost and fits and _has_sense(pair):
-        return first_track(pair, x, time, track.settings)
+    fit = pair if pair is not None and _is_fit(pair) else None
+    if fit is not None and fit.profile != track.profile:
+        raise InputError(f"pair.profile: {fit.profile!r} is not that of the track")
+    if track.lost and fit is not None and _has_sense(fit):
+        return first_track(fit, x, time, track.settings)
     state, covariance, transition, noise = _predicted(
         track.state,
         track.covariance,
@@ -384,29 +385,37 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         track.settings.wandering,
         track.profile,
     )
-    predicted, square, accepted = state, None, False
-    if fits:
-        measured = pair.parameters, pair.covariance
+    predicted, square, used = state, None, None
+    if fit is not None:
+        measured = fit.parameters, fit.covariance
         square = kalman.innovation(state, covariance, *measured)
-        accepted = _has_sense(pair) and square <= chi2.ppf(track.settings.gate, MEASURED)
-        if accepted:
+        if _has_sense(fit) and square <= chi2.ppf(track.settings.gate, MEASURED):
+            used = fit
             state, covariance = kalman.updated(state, covariance, *measured)
     slab = Slab(float(x), float(time), state, covariance, predicted, transition, noise, square)
     return Track(
         slabs=(*track.slabs, slab)[-track.settings.memory :],
-        fit=pair if accepted else track.fit,
+        fit=used or track.fit,
         settings=track.settings,
-        updates=track.updates + accepted,
-        rejected=track.rejected + (fits and not accepted),
-        missed=0 if accepted else track.missed + 1,
+        updates=track.updates + (used is not None),
+        rejected=track.rejected + (fit is not None and used is None),
+        missed=track.missed + 1 if used is None else 0,
     )
 
 
-def _predicted(state, covariance, dx, dt, wandering, profile):
+def _predicted(
+    state: np.ndarray,
+    covariance: np.ndarray,
+    dx: float,
+    dt: float,
+    wandering: Wandering,
+    profile: Profile,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """State and covariance after a move, its derivatives and its own covariance."""
-    reached, along, later = moved(state, dx, dt, profile)
+    reached, along, later = advected(state, dx, dt, profile)
     path, time = wandered(state, dx, dt, wandering)
     transition = later @ along
+    # the walk along the path comes first, so that it drifts on in time
     noise = later @ path @ later.T + time
     return reached, transition @ covariance @ transition.T + noise, transition, noise
 

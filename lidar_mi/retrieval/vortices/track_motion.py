@@ -1,4 +1,4 @@
-"""How the vortices of a slab of air become those of another slab: along the path and in time.
+"""Transition of the vortices of a slab of air to another slab: along the path and in time.
 
 State: the parameters of `lidar_mi.retrieval.vortices.model.PARAMETERS` in the plane of a slab, then
 the slopes along the path, `SLOPES`. Frame: x along the path, y left, z up.
@@ -50,7 +50,7 @@ class Wandering:
     log_radius : float
         Of each core radius along the path, relative, m^-1/2: 3.5 % over 50 m.
     place : float
-        Of each coordinate along the path, m^1/2: bends shorter than the slabs can follow, 7 cm over
+        Of each coordinate along the path, m^1/2: curvature finer than the slabs resolve, 7 cm over
         50 m.
     slope : float
         Of each slope along the path, m^-1/2: a sine of amplitude A and wave number k changes its
@@ -67,7 +67,7 @@ class Wandering:
         Enters as rate times time in predictions: what changes steadily is no random walk.
     departure : float
         Unknown departure of each vortex's velocity from the drift of a straight pair, m/s, likewise
-        times time: bent and oblique vortices induce others. Crow waves of 3 % of the separation
+        times time: curved and oblique vortices induce others. Crow waves of 3 % of the separation
         grow by 0.8 per time of descent (Crow 1970), 0.035 m/s.
 
     Raises
@@ -84,7 +84,7 @@ class Wandering:
     decay: float = 0.01
     departure: float = 0.035
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
             if not 0 <= value < np.inf:
@@ -97,7 +97,7 @@ STRAIGHT = Wandering(0, 0, 0, 0, 0, 0, 0)
 """A straight pair that keeps its parameters."""
 
 
-def moved(
+def advected(
     state: np.ndarray, dx: float, dt: float, profile: Profile
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A state dx further along the path and dt later, with derivatives.
@@ -127,8 +127,10 @@ def moved(
     return reached + dt * _DRIFTING @ speed.detach().numpy(), along, later
 
 
-def carried(state: np.ndarray, dx: np.ndarray, dt: np.ndarray, profile: Profile) -> np.ndarray:
-    """States (14, ...) of `moved` alone, for distances and times (...)."""
+def advected_states(
+    state: np.ndarray, dx: np.ndarray, dt: np.ndarray, profile: Profile
+) -> np.ndarray:
+    """States (14, ...) of `advected` alone, for distances and times (...)."""
     reached = state.copy()
     reached[PLACES] += dx * state[_OF_SLOPES]
     speed = oblique_drift(torch.as_tensor(reached), profile).numpy()
@@ -139,7 +141,7 @@ def oblique_drift(state: torch.Tensor, profile: Profile) -> torch.Tensor:
     """Velocity (2, ...) of pairs of states (14, ...) in a plane across the path, m s^-1.
 
     Mean wind plus mutual induction of two lines along the mean direction a of both slopes. At the
-    places d apart in the plane, and so b^2 = d^2 - (d.a)^2 apart across their axis, port and
+    places d apart in the plane, and at b^2 = d^2 - (d.a)^2 across their axis, port and
     starboard induce the mean velocity u = (omega_s - omega_p)/2 (a x d), with the angular velocity
     omega of each at b. In the plane the lines move with (v, w) less their slopes times u along the
     path. For lines across the plane this is `lidar_mi.retrieval.vortices.model.drift`.
@@ -176,6 +178,7 @@ def wandered(
     path[PLACES] = wandering.place**2 + wandering.slope**2 * length**2 / 3
     path[MEAN_WIND] = _TRANSVERSE * (wandering.dissipation * _MATCHED) ** (2 / 3) / _MATCHED
     path[_OF_SLOPES] = wandering.slope**2
+    # a walk to the back along the path has the same variance as one ahead
     along = np.diag(path * length)
     both = np.eye(len(SLOPES)) * wandering.slope**2 * length * dx / 2
     along[PLACES, _OF_SLOPES] += both
@@ -186,17 +189,17 @@ def wandered(
 
 
 def unsteady(
-    state: np.ndarray, dt: float, wandering: Wandering, bent: np.ndarray | float = 0.0
+    state: np.ndarray, dt: float, wandering: Wandering, by_curvature: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Covariance (14, 14) of what unknown steady rates change in a time.
 
-    ``bent`` (2,) is a velocity along y and z, m/s, by which both vortices may depart together from
-    the drift: where they are bent it is neither that of the slab nor that of the whole pair.
+    ``by_curvature`` (2,) is a velocity along y and z, m/s: the common departure of both vortices
+    from the drift where they are curved, as that is neither of the slab nor of the whole pair.
     """
-    # both vortices decay together, each moves on its own, the bent pair as a whole
+    # both vortices decay together, each moves on its own, the curved pair as a whole
     decayed = np.zeros(len(state))
     decayed[CIRCULATIONS] = wandering.decay * dt * state[CIRCULATIONS]
     departed = np.zeros(len(state))
     departed[PLACES] = (wandering.departure * dt) ** 2
-    together = dt * _DRIFTING * bent
+    together = dt * _DRIFTING * by_curvature
     return np.outer(decayed, decayed) + np.diag(departed) + together @ together.T

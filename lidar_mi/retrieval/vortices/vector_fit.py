@@ -1,6 +1,6 @@
 """A pair of wake vortices from retrieved wind vectors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -59,9 +59,9 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     ----------
     vectors : Dataset, dims (z, y)
         From `lidar_mi.retrieval.wind.pair.retrieve_wind`: v, w, and if present v_stderr,
-        w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors that are flagged or NaN are left
-        out. Without standard errors all have the same weight, with the error estimated from their
-        residuals.
+        w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors that are flagged or NaN are
+        masked. Without standard errors all have the same weight, with the error estimated from
+        their residuals.
     profile : {"lamb_oseen", "burnham_hallock"}
 
     Returns
@@ -98,33 +98,31 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         raise InputError(f"vectors: dims {tuple(vectors.sizes)} are not allowed; expected z and y")
     vectors = vectors.transpose("z", "y")
 
-    def numbers(name):
+    def numbers(name: str) -> np.ndarray:
         kind = vectors[name].dtype
         if kind.kind not in "biuf":
             raise InputError(f"vectors.{name}: {kind} is not allowed; expected real numbers")
         return vectors[name].values.astype(float)
 
-    def field(name, default=None):
-        if name not in vectors and name not in vectors.coords:
-            return default
-        return np.broadcast_to(numbers(name), vectors["v"].shape)
+    def field(name: str, default: np.ndarray | float = 0.0) -> np.ndarray:
+        known = name in vectors or name in vectors.coords
+        return np.broadcast_to(numbers(name) if known else default, vectors["v"].shape)
 
     z, y = numbers("z"), numbers("y")
-    vertical, lateral = np.meshgrid(z, y, indexing="ij")
+    grid_z, grid_y = np.meshgrid(z, y, indexing="ij")
     value = np.stack([field("v"), field("w")])
-    place = np.stack([field("y_vector", lateral), field("z_vector", vertical)])
+    place = np.stack([field("y_vector", grid_y), field("z_vector", grid_z)])
     usable = np.isfinite(value).all(0) & np.isfinite(place).all(0)
-    usable &= field("flag", np.zeros(usable.shape)) == 0
-    stderr = [field(name, np.full(usable.shape, np.nan)) for name in ("v_stderr", "w_stderr")]
+    usable &= field("flag") == 0
     common = common_stderr(vectors)
-    stderr = np.stack(stderr)
+    stderr = np.stack([field(name, np.nan) for name in ("v_stderr", "w_stderr")])
     known = bool(np.isfinite(stderr[:, usable]).any())
     if known:
         usable &= (np.isfinite(stderr) & (stderr > 0)).all(0)
     if int(usable.sum()) < 20:
         raise InputError(f"vectors: {int(usable.sum())} are valid; expected at least 20")
     stderr = np.where(usable, stderr if known else 1.0, 1.0)
-    rho = np.nan_to_num(field("vw_correlation", np.zeros(usable.shape))) * usable
+    rho = np.nan_to_num(field("vw_correlation")) * usable
     stderr, rho = own_errors(stderr, rho, common if known else np.zeros(2))
     rho = rho.clip(-0.999, 0.999) if known else 0 * rho
     root = np.zeros((2, 2, *usable.shape))
@@ -132,10 +130,13 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     root[1, 0] = -rho / np.sqrt(1 - rho**2) / stderr[0]
     root[1, 1] = 1 / np.sqrt(1 - rho**2) / stderr[1]
 
-    tensors = [torch.as_tensor(np.where(usable, a, 0.0)) for a in (*place, value)]
+    vector_y, vector_z, vector = (
+        torch.as_tensor(np.where(usable, a, 0.0)) for a in (*place, value)
+    )
     valid = torch.as_tensor(usable)
-    model = _Vectors(*tensors[:2], torch.as_tensor(root), tensors[2], valid, profile)
+    model = _Vectors(vector_y, vector_z, torch.as_tensor(root), vector, valid, profile)
     limits = step_limits(y, z, profile)
+    # a search needs only its order of magnitude: a quarter of the mean square wind
     flow_variance = float(np.square(value[:, usable]).mean()) / 4
     best = None
     for start in starting_points(_components(model, flow_variance), STARTS, profile):
@@ -144,24 +145,24 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
             best = found
     if best is None:
         return no_fit(profile, "no vortex signature")
+    # without standard errors their size follows from the residuals, robustly
     if not known:
         off = best.misfit.residual[:, valid]
         spread = float(1.4826 * (off - off.median()).abs().median())
         if spread > 0:
-            model = _Vectors(
-                *tensors[:2], torch.as_tensor(root) / spread, tensors[2], valid, profile
-            )
+            model = replace(model, root=model.root / spread)
+    # weights and model error depend on each other
     for _ in range(3):
         error = model_error_of(best, 1.0)
         best = fit(model, best.parameters, limits, error.variance, 12, TOLERANCE)
     error = model_error_of(best, 1.0)
     covariance = parameter_covariance(best, error, model_error_of(best, 1.0, before=error), 1.0)
     chi2 = float(best.misfit.residual[:, valid].square().mean()) if known else np.nan
-    left = (tensors[2] - wind(best.parameters, *tensors[:2], profile))[:, valid]
-    varied = tensors[2][:, valid] - tensors[2][:, valid].mean(1, keepdim=True)
-    explained = 1 - float(left.square().sum() / varied.square().sum())
+    residual = (model.value - wind(best.parameters, model.y, model.z, profile))[:, valid]
+    varied = model.value[:, valid] - model.value[:, valid].mean(1, keepdim=True)
+    explained = 1 - float(residual.square().sum() / varied.square().sum())
     spacing = (float(np.diff(y).mean()) * float(np.diff(z).mean())) ** 0.5
-    found = checked_fit(
+    pair = checked_fit(
         best,
         covariance,
         profile,
@@ -173,11 +174,14 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         y,
         change_by_flow(best, torch.stack([-model.z, model.y])),
     )
-    return found.with_common_error(*common, *common_rotation(vectors))
+    v_stderr, w_stderr = common
+    rotation, centre = common_rotation(vectors)
+    return pair.with_common_error(v_stderr, w_stderr, rotation, centre)
 
 
 def _components(vectors: _Vectors, flow_variance: float) -> Observations:
     """Vectors as single components, thinned to a few hundred places."""
+    # the search is quadratic in the places and needs no more than a thousand vectors
     step = max(1, round((float(vectors.valid.sum()) / 1000) ** 0.5))
     part = (Ellipsis, slice(step // 2, None, step), slice(step // 2, None, step))
     valid = vectors.valid[part]

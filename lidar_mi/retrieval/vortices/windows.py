@@ -8,6 +8,7 @@ import torch
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, non_finite
 from lidar_mi.retrieval.images.windows import Windows, image_pair
+from lidar_mi.retrieval.vortices.image_builder import Acquisition
 from lidar_mi.retrieval.vortices.image_fit import fit_pixels
 
 
@@ -47,7 +48,8 @@ def vortex_windows(
     """
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
-    found = fit_pixels(image1, image2, *axes, dt, noise, "lamb_oseen", times=times)
+    taken = Acquisition(*axes, dt, noise, "lamb_oseen", times=times)
+    found = fit_pixels(image1, image2, taken)
     centres = [
         (axis[start := np.asarray(windows.starts(k))] + axis[start + template - 1]) / 2
         for k, axis in enumerate(axes)
@@ -55,7 +57,7 @@ def vortex_windows(
     values, covariance = found.wind_and_covariance(centres[1][None, :], centres[0][:, None])
     pixel_z, pixel_y = (float(a[-1] - a[0]) / (len(a) - 1) / dt for a in axes)
 
-    def tensor(array):
+    def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), device=image1.device)
 
     v, w = tensor(values)

@@ -148,7 +148,7 @@ def test_fit_of_two_filters_is_the_speed_of_their_ratio():
 @pytest.mark.parametrize("v_los", [-860.0, -300.0, 0.0, 51.0, 444.0])
 def test_no_noise_no_error(v_los):
     for receiver in (fringe(), edges()):
-        if receiver.limits[0] < v_los < receiver.limits[1]:
+        if receiver.span[0] < v_los < receiver.span[1]:
             truth = parameter_vector(receiver, v_los, 3e4, aerosol=0.1)
             fit = fit_channels(mean_and_jacobian(receiver, truth)[0], receiver, aerosol=0.1)
             assert float(fit.v_los) == pytest.approx(v_los, abs=1e-3)

@@ -50,7 +50,7 @@ def test_rings_say_that_plates_are_uneven():
     )
     assert not even.uneven and uneven.uneven
     assert uneven.spacing_std > 10 * even.spacing_std
-    assert "deviate alike" in repr(uneven) and "deviate alike" not in repr(even)
+    assert "parts correlate" in repr(uneven) and "parts correlate" not in repr(even)
 
 
 @pytest.mark.slow

@@ -13,9 +13,9 @@ import torch
 from benchmarks.cases import DT, drifting_pair_images
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.vortices.image_fit import begun_fit, fit_vortices
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices, started_fit
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder
-from lidar_mi.retrieval.vortices.robust_fit import moved
+from lidar_mi.retrieval.vortices.robust_fit import residual_after
 from tests.support.vortex_pairs import uneven, vector
 
 SMALL = {"columns": 130, "rows": 90}
@@ -60,23 +60,23 @@ def test_a_wrong_start_is_found_out(images, cold, metres):
     np.testing.assert_allclose(found.parameters, cold.parameters, rtol=1e-5)
 
 
-def test_a_fit_that_is_begun_with_the_first_image(images, cold):
+def test_a_fit_that_is_started_with_the_first_image(images, cold):
     """The same as with both at once; pixels of the second image alone may be unknown."""
     start, noise = expected(cold, cold.parameters + 0.3 * EXPECTED), 0 * images.first + 0.03
     second = images.second.copy()
     second[30:36, 50:58] = np.nan
     for other in (images.second, second):
         at_once = fit_vortices(images.first, other, DT, noise, start=start)
-        found = begun_fit(images.first, DT, noise, start=start)(other)
+        found = started_fit(images.first, DT, noise, start=start)(other)
         assert found.from_start
         np.testing.assert_allclose(found.parameters, at_once.parameters, rtol=1e-5, atol=1e-6)
     stderr = np.sqrt(np.diag(cold.covariance))
     assert (np.abs(found.parameters - cold.parameters) < stderr).all()
     wrong = expected(cold, cold.parameters + 8.0 * np.eye(10)[2])
-    searched = begun_fit(images.first, DT, 0.03, start=wrong)(images.second)
+    searched = started_fit(images.first, DT, 0.03, start=wrong)(images.second)
     assert searched.success and not searched.from_start
     with pytest.raises(InputError, match=r"^image2: sizes"):
-        begun_fit(images.first, DT, 0.03, start=start)(images.second[1:])
+        started_fit(images.first, DT, 0.03, start=start)(images.second[1:])
 
 
 def test_what_a_step_bends_near_the_cores(images, cold):
@@ -92,7 +92,7 @@ def test_what_a_step_bends_near_the_cores(images, cold):
     views = model.views(start)
     misfit, then = model.misfit(start, views), model(end)
     found = model.curved(misfit, views, start, end)
-    left = (then.residual - moved(misfit, end - start)) * misfit.valid * then.valid
+    left = (then.residual - residual_after(misfit, end - start)) * misfit.valid * then.valid
     assert float((left - found).square().sum()) < 0.15**2 * float(left.square().sum())
 
 

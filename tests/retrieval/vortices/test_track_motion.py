@@ -10,7 +10,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices.model import drift
 from lidar_mi.retrieval.vortices.track_motion import (
     Wandering,
-    moved,
+    advected,
     oblique_drift,
     unsteady,
     wandered,
@@ -42,16 +42,16 @@ def test_oblique_lines_in_space(crossing, climb):
     slopes = (truth(1.0, 0.0) - truth(0.0, 0.0))[[2, 3, 6, 7]]
     state = np.concatenate([truth(0.0, 0.0), slopes])
     for dx, dt, tolerance in ((80.0, 0.0, 1e-9), (-80.0, 3.0, 0.06)):
-        got, _, _ = moved(state, dx, dt, "burnham_hallock")
+        got, _, _ = advected(state, dx, dt, "burnham_hallock")
         np.testing.assert_allclose(got[:10], truth(dx, dt), atol=tolerance)
 
 
 def test_derivatives_against_differences():
     state, step = some_state(), 1e-6
-    _, along, later = moved(state, -40.0, 1.5, "lamb_oseen")
+    _, along, later = advected(state, -40.0, 1.5, "lamb_oseen")
     differences = [
-        moved(state + one, -40.0, 1.5, "lamb_oseen")[0]
-        - moved(state - one, -40.0, 1.5, "lamb_oseen")[0]
+        advected(state + one, -40.0, 1.5, "lamb_oseen")[0]
+        - advected(state - one, -40.0, 1.5, "lamb_oseen")[0]
         for one in step * np.eye(14)
     ]
     np.testing.assert_allclose(
@@ -61,7 +61,7 @@ def test_derivatives_against_differences():
 
 def test_walks_do_not_depend_on_the_number_of_steps():
     state, wandering = some_state(), Wandering(circulation=0.01, dissipation=1e-3)
-    _, move, _ = moved(state, 10.0, 0.0, "lamb_oseen")
+    _, move, _ = advected(state, 10.0, 0.0, "lamb_oseen")
     once, _ = wandered(state, 20.0, 0.0, wandering)
     half, _ = wandered(state, 10.0, 0.0, wandering)
     np.testing.assert_allclose(move @ half @ move.T + half, once, rtol=1e-12, atol=1e-15)
