@@ -10,6 +10,7 @@ from lidar_mi.instrument.beams import steered_beams
 from lidar_mi.instrument.motion import Pose, attitude
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.instrument.scan_timing import ScanTiming
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.synchronised import of_one_instant
 
@@ -80,7 +81,7 @@ def wind_of(told, wind=WIND, pattern="raster", duration=DURATION, missed=(0.0, 0
         *(scan["Y"] for scan in scans),
         DT,
         "multipass",
-        stride=2,
+        windows=WindowSizes(stride=2),
         times=[scan["beam_time"] for scan in scans] if told else None,
         standard_errors=False,
     )

@@ -115,6 +115,7 @@ def retrieve(
     from lidar_mi.retrieval.images.common_grid import on_one_grid
     from lidar_mi.retrieval.images.gridding import on_nodes
     from lidar_mi.retrieval.wind.methods import METHODS
+    from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
     from lidar_mi.retrieval.wind.pair import retrieve_wind
     from lidar_mi.retrieval.wind.series import retrieve_winds
     from lidar_mi.retrieval.wind.synchronised import of_one_instant
@@ -162,13 +163,9 @@ def retrieve(
     timed = len(seen) == len(paths)
     options: dict[str, Any] = {
         "method": method,
-        "template": template,
-        "search": search,
-        "stride": stride,
+        "windows": WindowSizes(template, search, stride),
+        "validation": VectorValidation(min_correlation, min_texture, min_isotropy),
         "device": device,
-        "min_correlation": min_correlation,
-        "min_texture": min_texture,
-        "min_isotropy": min_isotropy,
     }
     grid = images[0]
     if chosen is not None:

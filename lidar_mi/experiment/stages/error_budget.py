@@ -1,7 +1,7 @@
 """The error budget of an experiment's cross-flow wind: retrieved without each cause of error."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from lidar_mi.experiment.stages.winds import (
     pixel_times,
     rendered_pairs,
     window_settings,
+    window_sizes,
 )
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
@@ -103,7 +104,8 @@ def budgets(
     images, blurred = _images(experiment, truth, flows, plans, scans, beside)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = experiment.retrieval.methods
-    settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
+    dt, sizes = experiment.platform.dt, window_sizes(experiment.retrieval)
+    settings = {"dt": dt, **window_settings(experiment.retrieval)}
     blur = known_blur(experiment, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if experiment.detector:
@@ -116,7 +118,7 @@ def budgets(
             source = sources.get(cause)
             if known is not None and source:
                 kept = known.sel(source=source, algorithm=method)
-                winds[cause] = kept.assign_attrs(method=method, **settings)
+                winds[cause] = kept.assign_attrs(method=method, dt=dt, **asdict(sizes))
             else:
                 corrected = 0.0 if cause in _SHARP else blur
                 # the flags that count are those of the images as measured
@@ -143,7 +145,7 @@ def budgets(
                     method=method,
                     checks=False,
                     standard_errors=False,
-                    **settings | {"stride": stride},
+                    **settings | {"windows": replace(sizes, stride=stride)},
                 ),
             )
             winds |= {} if stiff is None else {"shear": stiff}

@@ -24,6 +24,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.images.common_grid import resample
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 
 
@@ -210,10 +211,8 @@ def volume_winds(experiment: Experiment, flows: Flows, volumes: Volumes, *, log:
                     *pair,
                     experiment.platform.dt,
                     method,
-                    settings.template,
-                    settings.search,
-                    settings.stride,
-                    min_correlation=settings.min_correlation,
+                    windows=WindowSizes(settings.template, settings.search, settings.stride),
+                    validation=VectorValidation(settings.min_correlation),
                     noise=volumes.noise[source],
                 )
             )

@@ -12,12 +12,14 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import positive
 from lidar_mi.retrieval.images.common_grid import all_on_one_grid
 from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 _PER_PAIR = "identical_images", "fixed_pattern", "illumination"
 """Attributes of a wind that are remarks on its images."""
 
 
+@with_old_keywords
 @checked_arguments
 def retrieve_winds(
     images: Sequence[xr.DataArray],
@@ -26,7 +28,7 @@ def retrieve_winds(
     *,
     noise: float | Sequence[float | xr.DataArray | None] | None = None,
     beam_times: Sequence[xr.DataArray] | None = None,
-    notice: Callable | None = None,
+    notice: Callable[[str, float], object] | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """Wind in the image plane from each pair of a sequence of images.
@@ -47,8 +49,8 @@ def retrieve_winds(
     notice : callable, optional
         Called with a text and the fraction done (0 to 1) before each pair.
     **options
-        Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``template``,
-        ``stride`` and so on.
+        Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``windows``,
+        ``validation`` and so on.
 
     Returns
     -------

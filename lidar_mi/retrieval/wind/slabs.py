@@ -85,7 +85,7 @@ def wind_of_slab(
         )
         return found
 
-    chosen = replace(METHODS["variational"], find=find, name="variational")
+    chosen = replace(METHODS["variational"], find=find)
     wind = retrieve_wind(image1, image2, dt, chosen, checks=start is None, **options)
     if {"fixed_pattern", "illumination"} & set(wind.attrs):
         flow = None

@@ -9,6 +9,7 @@ import xarray as xr
 
 from lidar_mi.retrieval.images.common_grid import on_one_grid
 from lidar_mi.retrieval.images.gridding import on_nodes
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.synchronised import carried, mixes_times, of_one_instant
 from tests.support.flows import axes, data_array, plane_waves, texture
@@ -44,7 +45,13 @@ def test_wind_of_a_curve_that_crosses_itself():
     assert all(image["beam_time"].max() == image["beam_time"].min() for image in images)
     mixed = [on_nodes(one, errors=False) for one in scans]
     found, wrong = (
-        retrieve_wind(*(i["Y"] for i in pair), DT, "multipass", stride=4, standard_errors=False)
+        retrieve_wind(
+            *(i["Y"] for i in pair),
+            DT,
+            "multipass",
+            windows=WindowSizes(stride=4),
+            standard_errors=False,
+        )
         for pair in (images, mixed)
     )
     for name, true in (("v", V), ("w", W)):
@@ -62,7 +69,9 @@ def test_scans_by_angles_from_a_platform_that_moves():
     images = of_one_instant([first, nearer], [DT], "Y")
     np.testing.assert_array_equal(images[1]["y"], nearer["y"])
     pair = on_one_grid(*(image["Y"] for image in images))
-    found = retrieve_wind(*pair, DT, "multipass", stride=4, standard_errors=False)
+    found = retrieve_wind(
+        *pair, DT, "multipass", windows=WindowSizes(stride=4), standard_errors=False
+    )
     for name, true in (("v", V), ("w", W)):
         valid = found[name].where(found["flag"] == 0)
         independent = float(valid.count()) * 4**2 / 8**2
