@@ -10,6 +10,7 @@ retrieved wind plus the residual of the given pair.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import torch
 from torch.nn.functional import grid_sample, pad
@@ -22,7 +23,14 @@ from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.images.spline import band_limited
-from lidar_mi.retrieval.images.windows import Windows, averaged, linear_weights, separable, working
+from lidar_mi.retrieval.images.windows import (
+    Windows,
+    averaged,
+    linear_weights,
+    separable,
+    strided,
+    working,
+)
 
 # Templates by which the residual is moved along z and y, away from the texture that it is of.
 _APART = ((2, 2), (-2, 2))
@@ -153,13 +161,16 @@ def bootstrap_covariance(
     # vectors of windows that overlap by more than half would cost more and tell little
     every = max(1, windows.template // 2 // windows.stride)
     coarse = replace(windows, stride=every * windows.stride)
-    some = (..., *[slice(None, None, every)] * windows.dims)
-    d = working(found.d)[some]
+
+    def some(field: torch.Tensor) -> torch.Tensor:
+        return reduce(lambda part, axis: strided(part, every, axis), range(-windows.dims, 0), field)
+
+    d = some(working(found.d))
     per_template = windows.template / coarse.stride
     flow, replaced = validated(d, max(1, round(per_template / 2)))
     window = per_template / math.sqrt(12)
     everywhere = torch.ones_like(flow[0], dtype=torch.bool)
-    known = everywhere if textured is None else textured[some]
+    known = everywhere if textured is None else some(textured)
 
     def of_windows(field: torch.Tensor) -> torch.Tensor:
         return torch.stack([averaged(part, everywhere, window) for part in field])
@@ -192,7 +203,7 @@ def bootstrap_covariance(
     if centred:
         shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
         same.append(shear.square().expand_as(flow))
-        valid = known & ~replaced & _unflagged(found)[some]
+        valid = known & ~replaced & some(_unflagged(found))
         own = [_roughness(vectors, valid, _ROUGH * per_template)]
     else:
         same.append((flow - vectors).square())
@@ -230,7 +241,7 @@ def bootstrap_covariance(
     covariance = covariance * scale[:, None] * scale[None]
     number = torch.where(again_found < _FOUND, 0.0, number)
     if clear is not None:
-        part = averaged(clear[some].to(scale), known, _AROUND * per_template)
+        part = averaged(some(clear).to(scale), known, _AROUND * per_template)
         number = torch.where(part < _CLEAR, 0.0, number)
     weights = [
         linear_weights(*(frame.centres(axis).to(d) for frame in (coarse, windows)))
@@ -356,8 +367,11 @@ def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Te
     return wind
 
 
-def _carried(image: torch.Tensor, wind: torch.Tensor) -> torch.Tensor:
-    """The image along paths in a steady wind (axes, ...), px per time step, one time step later."""
+def _carried(image: torch.Tensor, wind: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The image along paths in a steady wind (axes, ...), px per time step, one time step later.
+
+    And where there is any.
+    """
     place = _pixels(image.shape, wind)
     for _ in range(_STEPS):
         half = place - _read(wind, place) / (2 * _STEPS)

@@ -64,7 +64,7 @@ def saturated_areas(piled: torch.Tensor, windows: Windows) -> torch.Tensor:
         return piled[0]
     images = piled.cpu().numpy()
     least = windows.template**windows.dims / 2
-    areas = _large(images.all(0), least)
+    areas = _large(np.all(images, axis=0), least)
     for number, image in enumerate(images):
         others = np.delete(images, number, 0).any(0)
         near = ndimage.maximum_filter(others, 2 * windows.search + 1)

@@ -137,13 +137,13 @@ def unexplained(
     """
     full = torch.arange(len(density), device=density.device) < min(spline.shape) // 2
     wave = wavenumbers(density, spline.shape)
-    across, blurred = displaced(wave, structure), strained(wave, structure)
-    use = density.isfinite() & (across > 0) & (wave > math.pi / knots) & full
+    moved, smeared = displaced(wave, structure), strained(wave, structure)
+    use = density.isfinite() & (moved > 0) & (wave > math.pi / knots) & full
     if int(use.sum()) < 3:
         return 0.0, 0.0
     waves = _independent_waves(spline, density) / spline.settings.smoothing
     found, across, blurred, number = (
-        part[use].double().cpu().numpy() for part in (density, across, blurred, waves)
+        part[use].double().cpu().numpy() for part in (density, moved, smeared, waves)
     )
     if not found.mean() > 0:
         return 0.0, 0.0

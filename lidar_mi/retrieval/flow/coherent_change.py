@@ -7,6 +7,7 @@ fit, tell how little.
 """
 
 from collections.abc import Callable, Iterator
+from functools import reduce
 
 import numpy as np
 import torch
@@ -169,7 +170,8 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     # identical images, images without structure
     if not all(bool(part.mean() > 0) for part in parts):
         return 0.0
-    return _component(*(part.cpu().numpy() for part in parts), images.given)
+    found_at, noise_at, moved_at, replaced_at = (part.cpu().numpy() for part in parts)
+    return _component(found_at, noise_at, moved_at, replaced_at, images.given)
 
 
 def _component(
@@ -183,6 +185,7 @@ def _component(
     stand for the displacement. Of a noise that is not given, found = a noise + b moved, and a is 5
     at most.
     """
+    held: np.ndarray | float
     if given:
         held, others, most = noise, [replaced, noise], [np.inf, _TOO_SMALL]
     else:
@@ -208,7 +211,7 @@ def square_left(linear: Linear, left: Left) -> torch.Tensor:
 
 
 def _mean(of_draw: Left, draws: Iterator[torch.Tensor]) -> torch.Tensor:
-    return sum(mapped(of_draw, draws)) / _DRAWS
+    return reduce(torch.add, mapped(of_draw, draws)) / _DRAWS
 
 
 def _displacements(linear: Linear) -> Iterator[torch.Tensor]:

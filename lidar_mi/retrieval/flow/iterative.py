@@ -74,7 +74,7 @@ class Posterior(NamedTuple):
         draw = torch.Generator(device=like.device)
         draw.manual_seed(self.settings.solver.seed + self.turn)
 
-        def normal(*shape):
+        def normal(*shape: int) -> torch.Tensor:
             return torch.randn(number, *shape, generator=draw, dtype=like.dtype, device=like.device)
 
         # right-hand sides whose covariance is the second derivative
@@ -90,7 +90,7 @@ class Posterior(NamedTuple):
     def _flows(self, bend: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         mesh, ridge = self.rough.mesh, self.settings.ridge
 
-        def applied(c):
+        def applied(c: torch.Tensor) -> torch.Tensor:
             found = mesh.transposed(_times(bend, mesh.field(c)))
             return found + _stiff(c, self.rough, ridge)
 
@@ -121,7 +121,7 @@ def solved(
         bend[a, b] = bend[b, a] = separable(squares, lumps)
     steep = linear.weight * linear.slope
 
-    def applied(c):
+    def applied(c: torch.Tensor) -> torch.Tensor:
         along = (linear.slope * mesh.field(c.to(voxels))).sum(1, keepdim=True)
         return mesh.transposed(along * steep).to(c) + _stiff(c, prior, ridge)
 
@@ -164,7 +164,7 @@ def _preconditioner(
     dims = mesh.dims
     bases = [[mesh.basis(axis, order).square().T for axis in range(dims)] for order in (0, 1)]
 
-    def diagonal(values, axis=None):
+    def diagonal(values: torch.Tensor, axis: int | None = None) -> torch.Tensor:
         return separable(values, [bases[a == axis][a] for a in range(dims)])
 
     block = diagonal(bend)
@@ -187,7 +187,7 @@ def conjugate_gradients(
 ) -> torch.Tensor:
     """Solutions (n, ...) of a symmetric positive system for right-hand sides (n, ...)."""
 
-    def inner(a, b):
+    def inner(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (a * b).flatten(1).sum(1).reshape(-1, *[1] * (a.ndim - 1))
 
     solution = torch.zeros_like(right)

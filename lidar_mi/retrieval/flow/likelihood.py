@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -178,7 +179,8 @@ def linearised_there(
     time = images.time.reshape(-1, *[1] * mesh.dims)
     difference = (time * (value - value.mean(0))).sum(0)
     informed = images.spline.efficiency * weight / variance
-    coarse, damped = None, slope
+    coarse: torch.Tensor | None = None
+    damped = slope
     if images.coherent:
         # long waves scatter by variance + coherent s^2 a pixel where structure has the slope s
         steep = steepness_of_structure(slope, valid)
@@ -278,7 +280,7 @@ def _share_of_texture(
     """
     width = _width(mesh)
     power = averaged(slope.square().sum(0) * images.weight, valid, width)
-    noisy = more * images.spline.noisy_slopes
+    noisy: torch.Tensor | float = more * images.spline.noisy_slopes
     if noise is not None and not images.given:
         noisy = noisy * averaged(noise, valid, width).clamp(max=1.0)
     return (1 - noisy / power.clamp(min=1e-30)).clamp(min=0.0)
@@ -295,11 +297,12 @@ def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int)
     term = flow
     change = time * term[:, None]
     for k in range(2, terms + 1):
-        if k == 2:
-            along = mesh.slopes(coefficients)
-        else:
-            along = torch.gradient(term, dim=tuple(range(1, term.ndim)))
-        term = sum(u * part for u, part in zip(flow, along, strict=True))
+        along: Sequence[torch.Tensor] = (
+            mesh.slopes(coefficients)
+            if k == 2
+            else torch.gradient(term, dim=tuple(range(1, term.ndim)))
+        )
+        term = reduce(torch.add, [u * part for u, part in zip(flow, along, strict=True)])
         change = change + time**k / math.factorial(k) * term[:, None]
     for axis, place in enumerate(mesh.places):
         change[axis] += place.reshape(-1, *[1] * (mesh.dims - 1 - axis))

@@ -93,10 +93,10 @@ def with_local_noise(
         mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
         level = max(floor, mean, 1e-30)
         weight = images.weight * (level / local.clamp(min=max(floor, least * level)))
-        density = None
+        density: torch.Tensor | None = None
         if coloured:
-            density = mismatch(images.spline, residual * weight.sqrt())
-            density = density.clamp(min=max(floor, least_density * level))
+            least_of_wave = max(floor, least_density * level)
+            density = mismatch(images.spline, residual * weight.sqrt()).clamp(min=least_of_wave)
         if to_come:
             chosen = filter_of(
                 images.stack,
@@ -111,7 +111,7 @@ def with_local_noise(
                 images, chosen.passed, *(part * linear.valid for part in parts)
             )
     square = 0.0
-    if coloured:
+    if density is not None:
         structure = of_structure(images.spline, images.stack, images.white)
         found = mismatch(images.spline, residual)
         square, blurred = unexplained(images.spline, found, structure, strain, knots)

@@ -255,8 +255,9 @@ def next_flow(
     covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
-    found = found._replace(covariance=covariance + placed.besides)
-    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
+    covariance = covariance + placed.besides
+    flag = found.flag | unskilled(found.d, covariance)
+    found = found._replace(covariance=covariance, flag=flag)
     return found, replace(start, coefficients=coefficients)
 
 
@@ -285,7 +286,13 @@ def _of_centres(axes: Sequence[Axis], windows: Windows, like: torch.Tensor) -> M
 
 
 @lru_cache(maxsize=8)
-def _mesh(axes: Sequence[Axis], windows: Windows, places: Callable, dtype, device) -> Mesh:
+def _mesh(
+    axes: Sequence[Axis],
+    windows: Windows,
+    places: Callable[[Windows, torch.Tensor], list[torch.Tensor]],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Mesh:
     """Kept for the next slab: to make its splines takes longer than to use them."""
     return Mesh(axes, places(windows, torch.empty(0, dtype=dtype, device=device)))
 

@@ -18,7 +18,7 @@ from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import linearised, prepared
 from lidar_mi.retrieval.flow.misfit import with_local_noise
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
-from lidar_mi.retrieval.flow.prior import first_prior, refined
+from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.flow.unresolved import made_by_noise, unresolved_variance, with_unresolved
 from lidar_mi.retrieval.images.displacement import Displacement
@@ -140,8 +140,8 @@ def variational_and_flow(
     images that do not determine the flow.
     """
     check_between("min_correlation", min_correlation, -1, 1)
-    for other in stack[1:]:
-        image_pair(stack[0], other, (2, 3))
+    for image in stack[1:]:
+        image_pair(stack[0], image, (2, 3))
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
@@ -149,7 +149,9 @@ def variational_and_flow(
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
-    last, prior, displaced_only, posterior = len(settings.knots) - 1, None, flow, None
+    last, displaced_only = len(settings.knots) - 1, flow
+    prior: Prior | None = None
+    posterior: direct.Posterior | strips.Posterior | iterative.Posterior | None = None
     width = settings.misfit_width_trusted if trusted else settings.misfit_width
     width *= windows.template
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
@@ -171,7 +173,7 @@ def variational_and_flow(
                 linear = linearised(images, mesh, coefficients, settings)
                 displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
                 left, strain = None, 0.0
-                if windows.dims == 2 and posterior is not None:
+                if isinstance(posterior, direct.Posterior | strips.Posterior):
                     left = what_is_left(linear, mesh, posterior.response)
                     strain = mean_square_strain(mesh.slopes(coefficients))
                 white = images.white
@@ -190,6 +192,7 @@ def variational_and_flow(
                 prior = prior.updated(*posterior.evidence(), settings, trusted)
             turn += 1
         flow = mesh.field(coefficients)
+    assert prior is not None  # settings have a level at least
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
     evened = posterior
@@ -213,17 +216,19 @@ def variational_and_flow(
     known = interpolated(known.to(like), centres, pixels) > 0.5
     # where the noise is not given, little is known of what it makes; in strips and in volumes a
     # draw takes as long as a step to the flow, and changes errors by 1 %
-    drawn = trusted and isinstance(posterior, direct.Posterior)
-    of_noise = made_by_noise(linear, mesh, posterior.response) if drawn else None
+    of_noise = None
+    if trusted and isinstance(posterior, direct.Posterior):
+        of_noise = made_by_noise(linear, mesh, posterior.response)
     finer = unresolved_variance(flow, apart, known, of_noise)
     finer = interpolated(finer, pixels, centres)
     # neither what the splines do not resolve nor the prior's strength is in the posterior
     off = at_centres.field((evened.coefficients - posterior.coefficients).to(like))
     besides = with_unresolved(_beyond_chance(off.to(covariance), covariance), finer)
-    found = found._replace(covariance=covariance + besides)
+    covariance = covariance + besides
+    found = found._replace(covariance=covariance)
     if windows.dims > 2:
         return found, None
-    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
+    found = found._replace(flag=found.flag | unskilled(found.d, covariance))
     if undetermined:
         found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
     if undetermined or not (keep and isinstance(posterior, direct.Posterior)):

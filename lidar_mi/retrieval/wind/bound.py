@@ -41,22 +41,22 @@ def wind_bound(
         As `retrieve_wind`.
     """
     dt = positive("dt", dt)
-    (image1, image2), noise = checked_stack([image1, image2], noise)
+    (image1, image2), known = checked_stack([image1, image2], noise)
     frame = windows.on(image1.shape)
-    level: float | torch.Tensor | None = None
-    if isinstance(noise, xr.DataArray):
-        level = on_device(noise.clip(min=1e-3 * float(noise.median())), "cpu")
+    level: float | torch.Tensor | None
+    if isinstance(known, xr.DataArray):
+        level = on_device(known.clip(min=1e-3 * float(known.median())), "cpu")
     else:
-        level = noise
+        level = known
     pair = [on_device(image, "cpu") for image in (image1, image2)]
-    covariance = displacement_bound(*(filled(image) for image in pair), level, frame.template)
+    covariance = displacement_bound(filled(pair[0]), filled(pair[1]), level, frame.template)
     rows, columns = (torch.as_tensor(frame.starts(axis)) for axis in (0, 1))
     root = covariance[:2, rows][:, :, columns].sqrt()
-    root = torch.where(non_finite(pair, frame), torch.nan, root).numpy()
+    bound = torch.where(non_finite(pair, frame), torch.nan, root).numpy()
     tau = checked_times(times, [image1, image2], dt)
     apart = vector_times(tau, dt, frame, np.zeros((2, *frame.count)), False).difference
     found = {}
-    for name, values, step in zip("wv", root, spacing(image1), strict=True):
+    for name, values, step in zip("wv", bound, spacing(image1), strict=True):
         about = f"Cramer-Rao bound of {name} from one template", "m s-1"
-        found[f"{name}_bound"] = field(image1.dims, values * step / apart, *about)
+        found[f"{name}_bound"] = field(("z", "y"), values * step / apart, *about)
     return xr.Dataset(found, centres(image1, frame, "template"))

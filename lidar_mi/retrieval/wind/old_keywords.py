@@ -46,6 +46,6 @@ def with_old_keywords(function: Callable[P, R]) -> Callable[P, R]:
                     DeprecationWarning,
                     stacklevel=2,
                 )
-        return function(*given, **named, **now)  # type: ignore[arg-type]  # P is of the new names
+        return function(*given, **named, **now)
 
     return cast("Callable[P, R]", called)

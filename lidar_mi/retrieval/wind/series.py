@@ -91,7 +91,9 @@ def retrieve_winds(
         raise InputError(
             f"beam_times: {len(beam_times)} are not allowed; expected {len(images)}, one an image"
         )
-    levels = list(noise) if isinstance(noise, list | tuple) else [noise] * len(images)
+    levels: list[float | xr.DataArray | None] = (
+        list(noise) if isinstance(noise, Sequence) else [noise] * len(images)
+    )
     if len(levels) != len(images):
         raise InputError(
             f"noise: {len(levels)} are not allowed; expected one, or {len(images)}, one an image"
@@ -158,7 +160,7 @@ def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[
 
 def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
     """Of each image from the first, s."""
-    steps = list(dt) if isinstance(dt, list | tuple) else [dt] * (count - 1)
+    steps = list(dt) if isinstance(dt, Sequence) else [dt] * (count - 1)
     if len(steps) != count - 1:
         raise InputError(
             f"dt: {len(steps)} steps are not allowed with {count} images; expected one, or "

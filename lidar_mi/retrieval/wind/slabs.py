@@ -25,11 +25,10 @@ def awaited_wind(
 
     `noise` is that of `retrieve_wind`.
     """
-    (image1,), noise = checked_stack([image1], noise)
-    if isinstance(noise, xr.DataArray):
-        noise = on_device(noise, "cpu")
+    (image1,), level = checked_stack([image1], noise)
+    known = on_device(level, "cpu") if isinstance(level, xr.DataArray) else level
     with threads_for(image1.size):
-        return awaited(start, on_device(image1, "cpu"), noise)
+        return awaited(start, on_device(image1, "cpu"), known)
 
 
 def wind_of_slab(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from typing import Any
 
 import torch
 import xarray as xr
@@ -126,7 +127,7 @@ def retrieve_wind_volume(
     defects = all_at_rest(raw, frame)
     volumes, relative = without_attenuation(defects.left_out(raw), known)
     steps = spacing(stack[0])
-    options = {
+    options: dict[str, Any] = {
         "min_correlation": validation.min_correlation,
         "noise": relative,
         "settings": settings,
