@@ -150,11 +150,12 @@ def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     if windows.dims > 2:
         return nothing_at_rest(images)._replace(piled=piled, saturated=areas)
     pair = [_left_out(image, areas) for image in images[:2]]
-    structure, stray, d = at_rest(*pair, windows)
+    structure, stray, d = at_rest(pair[0], pair[1], windows)
     hidden = stray | structure
     pattern = fixed_pattern([_left_out(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
     if pattern.columns or pattern.rows:
-        structure, stray, d = at_rest(*pattern.removed(pair), windows)
+        even = pattern.removed(pair)
+        structure, stray, d = at_rest(even[0], even[1], windows)
     more = torch.zeros_like(piled[2:])
     found = AtRest(piled, areas, structure & ~areas, torch.cat([stray, more]), pattern)
     return found._replace(pattern=pattern.with_pixels(found.filled(images)[:2], d))
@@ -210,8 +211,8 @@ def at_rest(
     found = impulses.sharp(pair)
     hidden = outstanding | _candidates(pair, found)
     for _ in range(_TURNS):
-        soft = (_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True))
-        d, _ = motion_around(*soft, windows, continued=True)
+        soft = [_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True)]
+        d, _ = motion_around(soft[0], soft[1], windows, continued=True)
         if not bool(d.any()):  # what stands out is all that there is
             return found, torch.zeros_like(outstanding), d
         stray = impulses.stray(pair, outstanding, found, d)
@@ -251,14 +252,19 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
     """Single pixels, lines, edges, spots: each from the images without what was found before."""
     same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
 
-    def known(found):
+    def known(found: torch.Tensor) -> torch.Tensor:
         return torch.where(found, torch.nan, pair)
 
-    def of(values, size, marked, same=None):
+    def of(
+        values: torch.Tensor,
+        size: int,
+        marked: Callable[[torch.Tensor], torch.Tensor],
+        same: torch.Tensor | None = None,
+    ) -> _Field:
         change = (values[1] - values[0]).nan_to_num(0.0).abs()
         return _Field(values, change if same is None else change.minimum(same), size, marked)
 
-    def pixels(found):
+    def pixels(found: torch.Tensor) -> _Field:
         images = known(found)
         heights = torch.stack([impulses.height(image) for image in images])
         soft = [~impulses.unresolved(i, h) for i, h in zip(images, heights, strict=True)]
@@ -269,14 +275,14 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
     yield pixels
     for axis in (-1, -2):
 
-        def lines(found, axis=axis):
+        def lines(found: torch.Tensor, axis: int = axis) -> _Field:
             means = _along(pixels(found).pair, axis)
             return of(means, 3, lambda new: _along(new.double(), axis) > 0)
 
         yield lines
     for axis in (-1, -2):
 
-        def edges(found, axis=axis):
+        def edges(found: torch.Tensor, axis: int = axis) -> _Field:
             steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
             either = same.minimum(same.roll(-1, axis))
             # steps beside it are as large where smoke rises over several pixels
@@ -289,7 +295,7 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         yield edges
     for size in _SIZES:
 
-        def spots(found, size=size):
+        def spots(found: torch.Tensor, size: int = size) -> _Field:
             return of(_spots(known(found), size), size, lambda new: _grown(new, size))
 
         yield spots
@@ -347,14 +353,14 @@ def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
     least = _least(field)
     one, two = field.pair.nan_to_num(0.0)
-    off = [
+    both = [
         torch.where(_inside(along), (here - moved(there, along)).abs(), torch.inf)
         for here, there, along in ((one, two, d), (two, one, -d))
     ]
-    off = torch.minimum(*off)
+    off = torch.minimum(both[0], both[1])
     off = torch.where(off.isfinite(), off, 0.0)
-    limit = impulses.threshold(off.numel() // field.size**2)
-    limit = limit * impulses.median_scale(off, field.size)
+    number = off.numel() // field.size**2
+    limit = impulses.threshold(number) * impulses.median_scale(off, field.size)
     new, weak = (
         (off > part * limit)
         & _alike(field, part * least)
