@@ -89,7 +89,7 @@ def _nameable(path: str | Path) -> bool:
     return b"\0" not in name and len(name) < 4096 and max(map(len, name.split(b"/"))) <= 255
 
 
-def _becomes(kind: Callable, value: Any) -> bool:
+def _becomes(kind: Callable[[Any], Any], value: Any) -> bool:
     try:
         kind(value)
     except (TypeError, ValueError, OverflowError):

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 import xarray as xr
 
-from lidar_mi.retrieval.flow.next_flow import Awaited, Flow
+from lidar_mi.retrieval.flow.next_flow import ExpectedFlow, Flow
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.vortices.model import wind as model_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.slabs import awaited_wind, wind_of_slab
+from lidar_mi.retrieval.wind.slabs import expected_wind, wind_of_slab
 
 Complete = Callable[[xr.Dataset], tuple[xr.Dataset, tuple[str, ...]]]
 """From the images' wind to the wind that is delivered, and flags."""
@@ -100,7 +100,7 @@ class SlabWinds:
         # the pair of the slab whose wind was found from nothing: prior and noise are known there
         self._learnt: VortexPairFit | None = None
         self._slab: FirstImage
-        self._awaited: Awaited | None = None
+        self._awaited: ExpectedFlow | None = None
 
     def awaits(self, slab: FirstImage, before: VortexPairFit | None) -> Callable[[], float]:
         """Take the first image of the next slab, before the second one is there.
@@ -143,7 +143,7 @@ class SlabWinds:
     def _awaits(self, slab: FirstImage, before: VortexPairFit | None) -> float:
         began = time.perf_counter()
         self._slab, start = slab, self._start(slab, before)
-        self._awaited = start and awaited_wind(slab.image, start, slab.noise)
+        self._awaited = start and expected_wind(slab.image, start, slab.noise)
         return time.perf_counter() - began
 
     @torch.inference_mode()

@@ -36,7 +36,7 @@ from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.images.common_grid import resample_pair
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.synchronised import of_one_instant
+from lidar_mi.retrieval.wind.synchronised import synchronised
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
@@ -253,7 +253,7 @@ def _without_noise(
         )
         for image, plan in zip(air, plans, strict=True)
     ]
-    scans = of_one_instant(scans, [experiment.platform.dt], "Y")
+    scans = synchronised(scans, [experiment.platform.dt], "Y")
     images = [scan["Y"] for scan in scans]
     if experiment.scan.aim == "angles":
         images = list(resample_pair(*images, experiment.wake.spacing))

@@ -19,7 +19,7 @@ from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS, MultipassSettings
 from lidar_mi.retrieval.images import windows as geometry
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.intensity import normalised, of_one_brightness, rms
+from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
 from lidar_mi.retrieval.images.quality import Flag, check_between, informative, non_finite
 from lidar_mi.retrieval.images.spline import Spline, band_limited, nearest
 from lidar_mi.retrieval.images.windows import Windows, averaged, image_pair, window_sums, working
@@ -296,7 +296,7 @@ def _products(
     value, *slopes = pair.spline.sample(*at)
     valid = (pair.spline.holds(*at) & nearest(pair.usable, at)).all(0)
     if pair.rebalanced:
-        value, gain = of_one_brightness(value, valid.to(value))
+        value, gain = normalised_intensity(value, valid.to(value))
         slopes = [gain * part for part in slopes]
     slope = torch.stack([part.mean(0) for part in slopes])
     shift = (slope * flow).sum(0) - (value[1] - value[0])

@@ -68,9 +68,9 @@ def solved(
     coefficients: torch.Tensor,
     prior: Prior,
     settings: VariationalSettings,
-    turn: int,
+    iteration: int,
 ) -> Posterior:
-    """One Gauss-Newton step; `turn` is for `iterative` only."""
+    """One Gauss-Newton step; `iteration` is for `iterative` only."""
     band = _band(mesh)
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
@@ -78,7 +78,7 @@ def solved(
     return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
 
 
-class Pull(NamedTuple):
+class PriorTerm(NamedTuple):
     """The prior of a flow: its quadratic form with the ridge, and its gradient there.
 
     `whole` also has what keeps the form positive in spite of rounding.
@@ -88,25 +88,25 @@ class Pull(NamedTuple):
     whole: torch.Tensor
     gradient: torch.Tensor
 
-    def at(self, prior: Prior, coefficients: torch.Tensor) -> "Pull":
+    def at(self, prior: Prior, coefficients: torch.Tensor) -> "PriorTerm":
         """The same of another flow."""
         return self._replace(gradient=-_band(prior.mesh).apply(self.stiff, coefficients))
 
 
-def pull_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> Pull:
+def prior_term_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> PriorTerm:
     """That of a prior at a flow."""
     stiff = prior_form(prior)
     with_diagonal(stiff, ridge)
     whole = stiff.clone()
     with_diagonal(whole, rounding(stiff))
-    return Pull(stiff, whole, stiff).at(prior, coefficients)
+    return PriorTerm(stiff, whole, stiff).at(prior, coefficients)
 
 
 def solved_in_single(
     linear: Linear,
     mesh: Mesh,
     coefficients: torch.Tensor,
-    pull: Pull,
+    prior_term: PriorTerm,
     near: BandCholesky | None = None,
 ) -> torch.Tensor:
     """Coefficients after a step in single precision; its residual is looked at in double precision.
@@ -115,8 +115,8 @@ def solved_in_single(
     of that. Where there is no such factor, or the residual is not small, all is in double
     precision.
     """
-    gradient = mesh.transposed(linear.gradient) + pull.gradient
-    whole = (data_form if informative(linear) else curvature)(linear, mesh) + pull.whole
+    gradient = mesh.transposed(linear.gradient) + prior_term.gradient
+    whole = (data_form if informative(linear) else curvature)(linear, mesh) + prior_term.whole
     if near is not None:
         step = solved_near(near, whole, gradient, _SINGLE, _TURNS)
         if step is not None:

@@ -52,7 +52,7 @@ class Divergence(NamedTuple):
     Attributes
     ----------
     strength : float
-        Where there is no vorticity, as from wind through the plane.
+        Where there is no vorticity, as from wind across the plane.
     ratio : float
         Strength over the vorticity's of further divergence, as where splines do not resolve a core.
     trend : (torch.Tensor, torch.Tensor) of no dimension, optional
@@ -153,7 +153,7 @@ class Prior(NamedTuple):
         informed: torch.Tensor,
         energy: torch.Tensor,
         settings: VariationalSettings,
-        trusted: bool = False,
+        noise_known: bool = False,
     ) -> "Prior":
         """The prior after a step toward largest evidence (MacKay's fixed point).
 
@@ -162,16 +162,16 @@ class Prior(NamedTuple):
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
             Variance of each kind of motion removed by the images, and its square in the flow.
         settings : VariationalSettings
-        trusted : bool
+        noise_known : bool
             Whether the noise is known, so that the largest evidence itself is wanted: steps are
             then those of the secant. Where the noise is that of the misfit, what the flow absorbs
             is missing in it, and the strength would grow too far.
         """
         count = len(self.local)
-        most = settings.largest_change_trusted if trusted else settings.largest_change
+        most = settings.largest_change_trusted if noise_known else settings.largest_change
         removed, found = (self.smooth(self.local * part[:count]) for part in (informed, energy))
         trend = self.local.log(), bounded(removed, found, most).log()
-        change = _secant(trend, self.trend if trusted else None, math.log(most)).exp()
+        change = _secant(trend, self.trend if noise_known else None, math.log(most)).exp()
         local = (self.local * change).clamp(max=_cells(self.mesh) / _LEAST**2)
         divergence = self.divergence
         if divergence is not None:

@@ -150,9 +150,9 @@ def solved(
     coefficients: torch.Tensor,
     prior: Prior,
     settings: VariationalSettings,
-    turn: int,
+    iteration: int,
 ) -> Posterior:
-    """One Gauss-Newton step; `turn` is for `iterative` only.
+    """One Gauss-Newton step; `iteration` is for `iterative` only.
 
     By conjugate gradients. The preconditioner is the sum of the strips' inverses, each with the
     flow beyond it held (additive Schwarz method; Toselli & Widlund 2005, Domain Decomposition

@@ -22,7 +22,7 @@ def normalised(images: Sequence[torch.Tensor]) -> torch.Tensor:
     return torch.where(finite, scaled, torch.nan)
 
 
-def of_one_brightness(
+def normalised_intensity(
     value: torch.Tensor, weight: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Warped images (images, ...) with one mean and contrast, and the factor of each.

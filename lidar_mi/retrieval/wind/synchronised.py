@@ -29,7 +29,7 @@ _ROUNDS = 2
 _TEMPLATE, _STRIDE = 16, 4
 
 
-def of_one_instant(
+def synchronised(
     scans: Sequence[xr.Dataset], steps: Sequence[float], image: str
 ) -> list[xr.Dataset]:
     """Scans on their nodes (`on_nodes`), each at one instant where nodes would mix times.
