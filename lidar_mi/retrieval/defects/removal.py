@@ -31,7 +31,7 @@ class CleanImages(NamedTuple):
 
     def masked(self) -> list[torch.Tensor]:
         """At the illumination of the first, NaN in place of defects."""
-        return _normalised_illumination(self.defects.left_out(self.raw), self.gains)
+        return _normalised_illumination(self.defects.masked(self.raw), self.gains)
 
     @property
     def change_of_illumination(self) -> str:

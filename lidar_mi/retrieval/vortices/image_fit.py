@@ -145,7 +145,7 @@ def fit_vortices(
     pixels = [on_device(image, device) for image in stack]
     with threads_for(image1.size):
         if min(image1.shape) >= Windows.search:
-            pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).left_out(pixels)
+            pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).masked(pixels)
         return fit_pixels(*pixels, *given)
 
 

@@ -125,7 +125,7 @@ def retrieve_wind_volume(
     raw = [on_device(volume, device) for volume in stack]
     known = on_device(level, device) if isinstance(level, xr.DataArray) else level
     defects = all_at_rest(raw, frame)
-    volumes, relative = without_attenuation(defects.left_out(raw), known)
+    volumes, relative = without_attenuation(defects.masked(raw), known)
     steps = spacing(stack[0])
     options: dict[str, Any] = {
         "min_correlation": validation.min_correlation,
