@@ -9,6 +9,7 @@ import numpy as np
 from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS, MultipassSettings
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support import volumes
@@ -89,7 +90,13 @@ def image_errors(method: str, columns: int, rows: int, settings, seed: int) -> n
     """Errors and normalised errors of every component, (2, values)."""
     pair = vortex_pair_images(NOISE, seed, columns, rows)
     wind = retrieve_wind(
-        pair.first, pair.second, DT, method, stride=2, noise=NOISE, settings=settings
+        pair.first,
+        pair.second,
+        DT,
+        method,
+        windows=WindowSizes(stride=2),
+        noise=NOISE,
+        settings=settings,
     )
     z, y = np.meshgrid(wind["z"], wind["y"], indexing="ij")
     truth = dict(zip("vw", velocity(pair.vortices, y, z), strict=True))

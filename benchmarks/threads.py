@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 
 from lidar_mi.retrieval import threads
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 from .cases import DT, Pair, vortex_pair_images
@@ -50,7 +51,9 @@ def _retrieval(pair: Pair, method: str, small: int) -> Callable[[int], None]:
     def run(_turn: int) -> None:
         before, threads.SMALL = threads.SMALL, small
         try:
-            retrieve_wind(pair.first, pair.second, DT, method, stride=4, noise=NOISE)
+            retrieve_wind(
+                pair.first, pair.second, DT, method, windows=WindowSizes(stride=4), noise=NOISE
+            )
         finally:
             threads.SMALL = before
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 from .cases import (
@@ -135,7 +136,13 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
 
 
 def cross_correlation(pair: Pair, template: int, search: int) -> Field:
-    wind = retrieve_wind(pair.first, pair.second, DT, "cc", template, search, stride=1)
+    wind = retrieve_wind(
+        pair.first,
+        pair.second,
+        DT,
+        "cc",
+        windows=WindowSizes(template=template, search=search, stride=1),
+    )
     moved = [wind[f"displacement_{axis}"].values / SPACING for axis in ("z", "y")]
     return Field(*moved, start=(search - template) // 2 + (template - 1) / 2, moved=0.5)
 

@@ -27,6 +27,7 @@ from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines
 from .retrieval.vortices.image_fit import fit_vortices
 from .retrieval.vortices.pair import VortexPairFit
 from .retrieval.vortices.vector_fit import fit_vortices_to_wind
+from .retrieval.wind.options import VectorValidation, WindowSizes
 from .retrieval.wind.pair import retrieve_wind
 from .retrieval.wind.series import retrieve_winds
 from .retrieval.wind.volume import retrieve_wind_volume
@@ -44,8 +45,10 @@ __all__ = [
     "InputError",
     "Rings",
     "Run",
+    "VectorValidation",
     "VirtualLidar",
     "VortexPairFit",
+    "WindowSizes",
     "__version__",
     "analyse_rings",
     "calibrate_etalon",

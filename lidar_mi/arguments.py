@@ -42,13 +42,21 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
             expected = hints.get(name, Any)
             more = signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD
             for key, one in value.items() if more else [(name, value)]:
-                if not _is(one, expected):
-                    raise InputError(
-                        f"{key}: {_shown(one)} is not allowed; expected {_in_words(expected)}"
-                    )
+                _check(key, one, expected)
         return function(*given, **named)
 
     return checked
+
+
+def check_fields(description: object) -> None:
+    """Raise an `InputError` unless the fields of a dataclass are of the types it annotates."""
+    for name, expected in typing.get_type_hints(type(description)).items():
+        _check(name, getattr(description, name), expected)
+
+
+def _check(name: str, value: Any, expected: Any) -> None:
+    if not _is(value, expected):
+        raise InputError(f"{name}: {_shown(value)} is not allowed; expected {_in_words(expected)}")
 
 
 def _is(value: Any, annotation: Any) -> bool:
@@ -82,7 +90,7 @@ def _nameable(path: str | Path) -> bool:
     return b"\0" not in name and len(name) < 4096 and max(map(len, name.split(b"/"))) <= 255
 
 
-def _becomes(kind: Callable[[Any], object], value: Any) -> bool:
+def _becomes(kind: Callable[[Any], Any], value: Any) -> bool:
     try:
         kind(value)
     except (TypeError, ValueError, OverflowError):

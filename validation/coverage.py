@@ -14,6 +14,7 @@ from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.flows import flows_of, mean_flow
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
@@ -283,10 +284,14 @@ def _found_and_true(case: str, method: str, seed: int) -> tuple[xr.Dataset, xr.D
         return wind, wind[[f"{n}_true" for n in names]].rename({f"{n}_true": n for n in names})
     if case in VOLUMES:
         first, second, truth, noise = VOLUMES[case](seed)
-        wind = retrieve_wind_volume(first, second, 0.1, method, stride=STRIDE, noise=noise)
+        wind = retrieve_wind_volume(
+            first, second, 0.1, method, windows=WindowSizes(stride=STRIDE), noise=noise
+        )
         return wind, truth.interp({name: wind[name] for name in ("x", "z", "y")})
     first, second, truth, noise = CASES[case](seed)
-    wind = retrieve_wind(first, second, 0.1, method, stride=STRIDE, noise=noise)
+    wind = retrieve_wind(
+        first, second, 0.1, method, windows=WindowSizes(stride=STRIDE), noise=noise
+    )
     return wind, truth_at_vectors(wind, truth)
 
 

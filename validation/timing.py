@@ -10,8 +10,9 @@ from lidar_mi.instrument.beams import steered_beams
 from lidar_mi.instrument.motion import Pose, attitude
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.instrument.scan_timing import ScanTiming
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.synchronised import of_one_instant
+from lidar_mi.retrieval.wind.synchronised import synchronised
 
 from .report import Check, Row
 
@@ -75,12 +76,12 @@ def wind_of(told, wind=WIND, pattern="raster", duration=DURATION, missed=(0.0, 0
         beams = steered_beams(time, places, plan.centre, 0.0, 0.0, true, level, body_fixed=False)
         seen = air(states + (number - 0.5) * DT, wind).assign_coords(time=states)
         scans.append(ideal_scan(seen, replace(plan, beams=beams), gridded=False))
-    scans = of_one_instant(scans, [DT], "Y")
+    scans = synchronised(scans, [DT], "Y")
     return retrieve_wind(
         *(scan["Y"] for scan in scans),
         DT,
         "multipass",
-        stride=2,
+        windows=WindowSizes(stride=2),
         times=[scan["beam_time"] for scan in scans] if told else None,
         standard_errors=False,
     )

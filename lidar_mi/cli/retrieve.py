@@ -115,9 +115,10 @@ def retrieve(
     from lidar_mi.retrieval.images.common_grid import on_one_grid
     from lidar_mi.retrieval.images.gridding import on_nodes
     from lidar_mi.retrieval.wind.methods import METHODS
+    from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
     from lidar_mi.retrieval.wind.pair import retrieve_wind
     from lidar_mi.retrieval.wind.series import retrieve_winds
-    from lidar_mi.retrieval.wind.synchronised import of_one_instant
+    from lidar_mi.retrieval.wind.synchronised import synchronised
 
     check_target(out, files, overwrite=overwrite, suffixes=SUFFIXES if pairs is None else SERIES)
     numbers = None if frame is None else _numbers(frame)
@@ -147,7 +148,7 @@ def retrieve(
                 scans[number] = scans[number].assign(image_stderr=level)
     if scans:
         if len(scans) == len(paths):
-            gridded = of_one_instant(list(scans.values()), steps, "image")
+            gridded = synchronised(list(scans.values()), steps, "image")
         else:
             gridded = [on_nodes(scan) for scan in scans.values()]
         for number, scan in zip(scans, gridded, strict=True):
@@ -162,13 +163,9 @@ def retrieve(
     timed = len(seen) == len(paths)
     options: dict[str, Any] = {
         "method": method,
-        "template": template,
-        "search": search,
-        "stride": stride,
+        "windows": WindowSizes(template, search, stride),
+        "validation": VectorValidation(min_correlation, min_texture, min_isotropy),
         "device": device,
-        "min_correlation": min_correlation,
-        "min_texture": min_texture,
-        "min_isotropy": min_isotropy,
     }
     grid = images[0]
     if chosen is not None:

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 import xarray as xr
 
-from lidar_mi.retrieval.flow.next_flow import Awaited, Flow
+from lidar_mi.retrieval.flow.next_flow import ExpectedFlow, Flow
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.vortices.model import wind as model_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.slabs import awaited_wind, wind_of_slab
+from lidar_mi.retrieval.wind.slabs import expected_wind, wind_of_slab
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -103,7 +103,7 @@ class SlabWinds:
         # the pair of the slab whose wind was found from nothing: prior and noise are known there
         self._reference: VortexPairFit | None = None
         self._slab: FirstImage
-        self._prepared: Awaited | None = None
+        self._prepared: ExpectedFlow | None = None
 
     # no derivatives are recorded, as in `Estimator.pair_of`
     @torch.inference_mode()
@@ -123,7 +123,7 @@ class SlabWinds:
         """
         began = time.perf_counter()
         self._slab, start = slab, self._start(slab, before)
-        self._prepared = awaited_wind(slab.image, start, slab.noise) if start else None
+        self._prepared = expected_wind(slab.image, start, slab.noise) if start else None
         return time.perf_counter() - began
 
     @torch.inference_mode()

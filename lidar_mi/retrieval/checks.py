@@ -52,8 +52,8 @@ def identical(
     """
     same = [
         f"{first} and {first + 1}"
-        for first, pair in enumerate(pairwise(iter(images)), start)
-        if np.array_equal(*(np.asarray(image) for image in pair), equal_nan=True)
+        for first, (one, other) in enumerate(pairwise(iter(images)), start)
+        if np.array_equal(np.asarray(one), np.asarray(other), equal_nan=True)
     ]
     more = f" and {len(same) - 3} more pairs" if len(same) > 3 else ""
     return f"{name} {', '.join(same[:3])}{more} are the same, bit for bit" if same else ""

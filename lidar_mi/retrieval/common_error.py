@@ -66,14 +66,14 @@ def with_common_error(
     ]
     turned = {"v_stderr": -rotation * arms[1], "w_stderr": rotation * arms[0]}
     for name in turned:
-        both = np.hypot(np.hypot(wind[name], stderr), turned[name])
+        both = _hypot(_hypot(wind[name], stderr), turned[name])
         found[name] = _like(both, wind[name])
-    for name in wind.data_vars:
-        of_pair = str(name).endswith("_stderr") and _PER_ROTATION in wind[name].attrs
+    for name in map(str, wind.data_vars):
+        of_pair = name.endswith("_stderr") and _PER_ROTATION in wind[name].attrs
         if of_pair or name in _OF_A_PAIR:
-            part = wind[name].attrs.get(_PER_ROTATION, 0.0) + _moved(str(name), centre)
+            part = wind[name].attrs.get(_PER_ROTATION, 0.0) + _moved(name, centre)
             shared = stderr if name in _OF_A_PAIR else 0.0
-            both = np.hypot(np.hypot(wind[name], shared), rotation * part)
+            both = _hypot(_hypot(wind[name], shared), rotation * part)
             found[name] = _like(both, wind[name])
     larger = found["v_stderr"] * found["w_stderr"]
     product = wind["vw_correlation"] * first * second + turned["v_stderr"] * turned["w_stderr"]
@@ -82,14 +82,18 @@ def with_common_error(
     for name in NAMES:
         about = {"long_name": f"part of {name[0]}_stderr that all vectors share", "units": "m s-1"}
         found[name] = (), float(stderr), about
-    about = {
+    turning: dict[str, str | float] = {
         "long_name": "part of v_stderr and w_stderr that is a rotation of all vectors",
         "units": "rad s-1",
         "centre_y": float(centre[0]),
         "centre_z": float(centre[1]),
     }
-    found[ROTATION] = (), float(rotation), about
+    found[ROTATION] = (), float(rotation), turning
     return found.assign_attrs(pointing_offset=str(offset))
+
+
+def _hypot(one: xr.DataArray, other: xr.DataArray | float) -> xr.DataArray:
+    return xr.apply_ufunc(np.hypot, one, other)
 
 
 def _like(values: xr.DataArray, like: xr.DataArray) -> xr.DataArray:

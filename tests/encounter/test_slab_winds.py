@@ -15,10 +15,11 @@ from benchmarks.realtime import UNFORESEEN
 from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProcess
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.options import WindowSizes
 from tests.support.vortex_pairs import uneven
 
 NOISE = 0.03
-WINDOWS = {"template": 8, "search": 16, "stride": 1}
+WINDOWS = {"windows": WindowSizes(8, 16, 1)}
 
 
 def slab(number, step=0.4):

@@ -80,11 +80,27 @@ BY_TYPE: dict[typing.Any, tuple[str, ...]] = {
         "vectors().astype(str)",
         "vectors().astype(complex)",
     ),
+    lm.WindowSizes: (
+        "lm.WindowSizes(4, 8, 4)",
+        "lm.WindowSizes(1)",
+        "lm.WindowSizes(search=10**9)",
+        "lm.WindowSizes('a')",
+        "lm.WindowSizes(stride=-1)",
+    ),
+    lm.VectorValidation: (
+        "lm.VectorValidation()",
+        "lm.VectorValidation(nan)",
+        "lm.VectorValidation(min_texture=-1.0)",
+        "lm.VectorValidation(min_isotropy=inf)",
+        "lm.VectorValidation(median_size=10**9)",
+        "lm.VectorValidation(median_threshold=None)",
+        "lm.VectorValidation(median_epsilon=0.0)",
+    ),
     lm.Experiment: ("lm.load_experiment('a.yaml')",),
     tuple: ("(15.0, 12.0)", "(nan, 1.0)", "(1.0,)", "(inf, inf)", "(1e30, -1e30)"),
 }
 
-VALID = {"method": "'cc'", "device": "'cpu'", "template": "4", "search": "8", "stride": "4"}
+VALID = {"method": "'cc'", "device": "'cpu'", "windows": "lm.WindowSizes(4, 8, 4)"}
 NAMED = {
     "image1": "pattern(1)",
     "image2": "pattern(1).roll(y=1)",

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.crosswind import DT, crosswind_pair
 from tests.support.flows import axes, data_array
@@ -318,7 +319,7 @@ def changes(clean: Pair, spoiled: Pair, method: str) -> tuple[np.ndarray, np.nda
             return np.zeros(0), good
         off = both[1].parameters - both[0].parameters
         return off / np.sqrt(sum(np.diag(fit.covariance) for fit in both)), good
-    both = [retrieve_wind(*pair, DT, method, stride=3) for pair in images]
+    both = [retrieve_wind(*pair, DT, method, windows=WindowSizes(stride=3)) for pair in images]
     good = np.stack([(wind.flag == 0).values for wind in both])
     use = good.all(0)
     off = [

@@ -20,6 +20,7 @@ from lidar_mi.experiment.stages.winds import attenuated_backscatter_stderr
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.io import exr
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 pytestmark = pytest.mark.slow
@@ -101,7 +102,7 @@ def test_blur_is_corrected_only_where_present(tmp_path):
     truth = make_truth(experiment, tmp_path)
     scans = noise_free_scans(experiment, truth)
     budget = budgets(experiment, truth, scans, cores=[], flagged=True)["variational"]
-    settings = {"dt": 0.1, "method": "variational", "stride": 2}
+    settings = {"dt": 0.1, "method": "variational", "windows": WindowSizes(stride=2)}
     level = attenuated_backscatter_stderr(scans[0])
     # half of the beam's 1/e^2 radius where the slab's middle is
     width = float(experiment.lidar.radius_at(501.25)) / 2

@@ -17,6 +17,7 @@ from lidar_mi.experiment.stages.winds import rendered_pairs
 from lidar_mi.io.exr import read_scan
 from lidar_mi.retrieval.images.common_grid import on_one_grid
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 SCENES = Path(str(files("lidar_mi.scenes")))
@@ -155,8 +156,8 @@ def test_the_air_between_the_vortices_moves_down(demo):
 
 def test_swapped_images_reverse_the_wind(demo):
     pair = on_one_grid(*(read_scan(demo.folder / name)["Y"] for name in IMAGES))
-    forth = retrieve_wind(*pair, dt=0.1, stride=4)
-    back = retrieve_wind(*pair[::-1], dt=0.1, stride=4)
+    forth = retrieve_wind(*pair, dt=0.1, windows=WindowSizes(stride=4))
+    back = retrieve_wind(*pair[::-1], dt=0.1, windows=WindowSizes(stride=4))
     both = ((forth["flag"] == 0) & (back["flag"] == 0)).values
     for name in ("v", "w"):
         one, other = forth[name].values[both], back[name].values[both]

@@ -1,7 +1,7 @@
 """The error budget of an experiment's cross-flow wind: retrieved without each cause of error."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from lidar_mi.experiment.stages.winds import (
     pixel_times,
     rendered_pairs,
     window_settings,
+    window_sizes,
 )
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
@@ -41,7 +42,7 @@ from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.images.common_grid import resample_pair
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.synchronised import of_one_instant
+from lidar_mi.retrieval.wind.synchronised import synchronised
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
@@ -150,7 +151,8 @@ def _budgets(
     images, blurred = _images(sensor, truth, flows, plans, scans)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = retrieval.methods
-    settings = {"dt": sensor.platform.dt, **window_settings(retrieval)}
+    dt, sizes = sensor.platform.dt, window_sizes(retrieval)
+    settings = {"dt": dt, **window_settings(retrieval)}
     blur = known_blur(retrieval, sensor.lidar, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if sensor.detector:
@@ -163,7 +165,7 @@ def _budgets(
             source = sources.get(cause)
             if known is not None and source:
                 kept = known.sel(source=source, algorithm=method)
-                winds[cause] = kept.assign_attrs(method=method, **settings)
+                winds[cause] = kept.assign_attrs(method=method, dt=dt, **asdict(sizes))
             else:
                 corrected = 0.0 if cause in _SHARP else blur
                 # the flags that count are those of the images as measured
@@ -190,7 +192,7 @@ def _budgets(
                     method=method,
                     checks=False,
                     standard_errors=False,
-                    **settings | {"stride": stride},
+                    **settings | {"windows": replace(sizes, stride=stride)},
                 ),
             )
             winds |= {} if stiff is None else {"shear": stiff}
@@ -306,7 +308,7 @@ def _without_noise(
         )
         for image, plan in zip(air, plans, strict=True)
     ]
-    scans = of_one_instant(scans, [sensor.platform.dt], "Y")
+    scans = synchronised(scans, [sensor.platform.dt], "Y")
     images = [one["Y"] for one in scans]
     if scan.aim == "angles":
         images = list(resample_pair(*images, sensor.wake.spacing))

@@ -33,7 +33,7 @@ from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.wind.synchronised import of_one_instant
+from lidar_mi.retrieval.wind.synchronised import synchronised
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""
@@ -408,13 +408,13 @@ def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:
 
 
 def gridded_scans(platform: Platform, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """The scans, on regular nodes where beams were reported beside them; see `of_one_instant`."""
+    """The scans, on regular nodes where beams were reported beside them; see `synchronised`."""
     if any("y_reported" not in scan for scan in detected):
         return list(detected)
     # times in double precision, so that those of a node are not rounded twice
     scans = [scan.assign(beam_time=scan["beam_time"].astype(float)) for scan in detected]
     image = "Y_noisy" if "Y_noisy" in scans[0] else "Y"
-    found = of_one_instant(scans, [platform.dt], image)
+    found = synchronised(scans, [platform.dt], image)
     return [scan.assign_attrs(gridded=1) for scan in found]
 
 

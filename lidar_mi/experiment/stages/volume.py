@@ -27,6 +27,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.images.common_grid import resample
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 
 
@@ -227,10 +228,8 @@ def volume_winds(
                     *pair,
                     platform.dt,
                     method,
-                    volume.template,
-                    volume.search,
-                    volume.stride,
-                    min_correlation=volume.min_correlation,
+                    windows=WindowSizes(volume.template, volume.search, volume.stride),
+                    validation=VectorValidation(volume.min_correlation),
                     noise=volumes.noise[source],
                 )
             )

@@ -23,8 +23,10 @@ from lidar_mi.retrieval.images.common_grid import resample_pair
 from lidar_mi.retrieval.images.resampling_error import flag_resampled
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.retrieval.wind.bound import wind_bound
 from lidar_mi.retrieval.wind.methods import METHODS
-from lidar_mi.retrieval.wind.pair import retrieve_wind, wind_bound
+from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 _FEW_VALID = 0.25
 _OF_TEMPLATES = (ImageMethod.CC, ImageMethod.MULTIPASS)
@@ -76,10 +78,9 @@ def cross_flow_winds(
     sources, said = [], set()
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
-        sizes = {key: getattr(retrieval, key) for key in ("template", "search", "stride")}
         # the truth's images are photographs
         seen = times if source in RENDERED else None
-        bound = wind_bound(*pair, platform.dt, noise, **sizes, times=seen)
+        bound = wind_bound(*pair, platform.dt, noise, window_sizes(retrieval), seen)
         methods = []
         for method in retrieval.methods:
             wind = retrieve_wind(
@@ -240,8 +241,14 @@ def common_error(
 
 
 def window_settings(settings: Retrieval) -> dict[str, Any]:
-    """Window sizes and thresholds, as `retrieve_wind` takes them."""
-    return settings.model_dump(exclude={"methods", "error_budget", "blur", "sources", "pointing"})
+    """Sizes of windows and tests of vectors, as `retrieve_wind` takes them."""
+    limits = settings.min_correlation, settings.min_texture, settings.min_isotropy
+    return {"windows": window_sizes(settings), "validation": VectorValidation(*limits)}
+
+
+def window_sizes(settings: Retrieval) -> WindowSizes:
+    """Sizes of windows, as `retrieve_wind` takes them."""
+    return WindowSizes(settings.template, settings.search, settings.stride)
 
 
 def _warn_of_wide_beams(

@@ -10,6 +10,7 @@ retrieved wind plus the residual of the given pair.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import torch
 from torch.nn.functional import grid_sample, pad
@@ -22,20 +23,27 @@ from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.images.spline import band_limited
-from lidar_mi.retrieval.images.windows import Windows, averaged, linear_weights, separable, working
+from lidar_mi.retrieval.images.windows import (
+    Windows,
+    averaged,
+    linear_weights,
+    separable,
+    strided,
+    working,
+)
 
 # Templates by which the residual is moved along z and y, away from the texture that it is of.
 _APART = ((2, 2), (-2, 2))
 # Standard deviations of Gaussian means over the template: of squared errors, of the residual's
-# level, of squared gradients, of squared second differences, of the share of clear texture.
+# level, of squared gradients, of squared second differences, of the fraction of clear texture.
 _REGION, _LEVEL, _SHEAR, _ROUGH, _AROUND = 1.5, 1.25, 0.35, 0.7, 4.5
 # Independent windows of known error within those means (`_REGION`) that a variance needs: of the
 # two components of five windows, it is known to 45 %.
 _FEWEST = 5.0
-# Share of textured windows in which the known motion must be found again: a method that fails in
+# Fraction of textured windows in which the known motion must be recovered: a method that fails in
 # most of them has errors that the others do not tell.
 _FOUND = 0.5
-# Share of textured windows that must be clearly so: else most of them are by chance.
+# Fraction of textured windows that must be clearly so: else most of them are by chance.
 _CLEAR = 0.5
 # Steps to the largest likelihood of the variances. A thousand change standard errors by 3 % or less
 # in the median, of single vectors by up to a quarter: of factors that vanish, slowly.
@@ -44,7 +52,7 @@ _ITERATIONS = 50
 _LEAST = 1e-3
 # Times that what a window's average takes away is added.
 _SHARPENINGS = 2
-# Least share of the residual's variance that is not stated besides.
+# Least fraction of the residual's variance that is not stated elsewhere.
 _REMAINING = 0.1
 # Of the splines that carry an image or a volume.
 _FILTERS = {2: FilterSettings(), 3: VOLUME_FILTER}
@@ -102,7 +110,7 @@ def bootstrap_covariance(
 
     Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
     that are passed the tests of texture by chance, and their errors tell nothing.
-    Where the known motion is found again in less than half of them, neither do the errors of these.
+    Where the known motion is recovered in less than half of them, neither do the errors of these.
 
     These predictors and numbers were chosen on seeds 41 to 46 of the cases of
     ``validation/coverage.py``. With one iterate of the sharpening, the standard errors of "cc" are
@@ -137,7 +145,7 @@ def bootstrap_covariance(
     clear : torch.Tensor of bool, shape windows.count, optional
         Windows that pass thresholds of texture half as high again; left out: all.
     stated : torch.Tensor, shape (z, y), optional
-        Variance of the residual by changes whose errors are stated besides: it is taken away from
+        Variance of the residual by changes whose errors are stated elsewhere: it is taken away from
         the residual's, of which a tenth remains at least.
     noise : float or torch.Tensor, optional
         Standard deviation of the images' noise. Where it is known of each pixel, the residual's
@@ -153,13 +161,16 @@ def bootstrap_covariance(
     # vectors of windows that overlap by more than half would cost more and tell little
     every = max(1, windows.template // 2 // windows.stride)
     coarse = replace(windows, stride=every * windows.stride)
-    some = (..., *[slice(None, None, every)] * windows.dims)
-    d = working(found.d)[some]
+
+    def some(field: torch.Tensor) -> torch.Tensor:
+        return reduce(lambda part, axis: strided(part, every, axis), range(-windows.dims, 0), field)
+
+    d = some(working(found.d))
     per_template = windows.template / coarse.stride
     flow, replaced = validated(d, max(1, round(per_template / 2)))
     window = per_template / math.sqrt(12)
     everywhere = torch.ones_like(flow[0], dtype=torch.bool)
-    known = everywhere if textured is None else textured[some]
+    known = everywhere if textured is None else some(textured)
 
     def of_windows(field: torch.Tensor) -> torch.Tensor:
         return torch.stack([averaged(part, everywhere, window) for part in field])
@@ -192,13 +203,13 @@ def bootstrap_covariance(
     if centred:
         shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
         same.append(shear.square().expand_as(flow))
-        valid = known & ~replaced & _unflagged(found)[some]
+        valid = known & ~replaced & some(_unflagged(found))
         own = [_roughness(vectors, valid, _ROUGH * per_template)]
     else:
         same.append((flow - vectors).square())
         own = []
     predictors = torch.stack([*same, *own])
-    tried, number, again_found = [], torch.zeros_like(flow[0]), torch.zeros_like(flow[0])
+    tried, number, recovered = [], torch.zeros_like(flow[0]), torch.zeros_like(flow[0])
     width = _REGION * per_template
     for apart in _APART[:repeats]:
         moved = (rest / level).roll([windows.template * part for part in apart], (-2, -1))
@@ -213,7 +224,7 @@ def bootstrap_covariance(
         rough = [_roughness(_continued(error, use) + smooth, use, _ROUGH * per_template)] * len(own)
         tried.append((error, use, torch.stack([*same, *rough])))
         number += _in_a_mean(windows) * averaged(use.to(number), everywhere, width)
-        again_found += averaged(use.to(number), known, _AROUND * per_template) / repeats
+        recovered += averaged(use.to(number), known, _AROUND * per_template) / repeats
     if not tried:
         return torch.full_like(torch.stack([found.d] * windows.dims), torch.nan)
     factors = _most_likely(
@@ -228,9 +239,9 @@ def bootstrap_covariance(
     scale = torch.tensordot(factors, predictors, 1).sqrt()
     covariance = torch.stack(means).mean(0).unflatten(0, (windows.dims,) * 2)
     covariance = covariance * scale[:, None] * scale[None]
-    number = torch.where(again_found < _FOUND, 0.0, number)
+    number = torch.where(recovered < _FOUND, 0.0, number)
     if clear is not None:
-        part = averaged(clear[some].to(scale), known, _AROUND * per_template)
+        part = averaged(some(clear).to(scale), known, _AROUND * per_template)
         number = torch.where(part < _CLEAR, 0.0, number)
     weights = [
         linear_weights(*(frame.centres(axis).to(d) for frame in (coarse, windows)))
@@ -356,8 +367,11 @@ def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Te
     return wind
 
 
-def _carried(image: torch.Tensor, wind: torch.Tensor) -> torch.Tensor:
-    """The image along paths in a steady wind (axes, ...), px per time step, one time step later."""
+def _carried(image: torch.Tensor, wind: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The image along paths in a steady wind (axes, ...), px per time step, one time step later.
+
+    And where there is any.
+    """
     place = _pixels(image.shape, wind)
     for _ in range(_STEPS):
         half = place - _read(wind, place) / (2 * _STEPS)

@@ -1,6 +1,7 @@
 """The first displacement of a coarse-to-fine retrieval: correlation of large windows."""
 
 import math
+from collections.abc import Sequence
 from itertools import combinations_with_replacement, product
 from typing import NamedTuple
 
@@ -71,7 +72,7 @@ class Grid(NamedTuple):
 
 
 def first_pass(
-    images: list[torch.Tensor], spline: Spline, windows: Windows, grid: Grid
+    images: Sequence[torch.Tensor], spline: Spline, windows: Windows, grid: Grid
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacement (components, *grid.shape) by large windows, and where it was replaced.
 
@@ -82,7 +83,7 @@ def first_pass(
 
     Parameters
     ----------
-    images : list of torch.Tensor
+    images : sequence of torch.Tensor
         The first two of them count.
     spline : Spline
         Through the images, band-limited.
@@ -149,15 +150,20 @@ def coarse_windows(windows: Windows) -> Windows:
     return Windows(windows.shape, template, search, max(1, template // 2))
 
 
-def _of_images(images, windows: Windows) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def _of_images(
+    images: Sequence[torch.Tensor], windows: Windows
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Displacements of windows of images, NaN where the correlation is flagged, and centres."""
-    found = cross_correlation(*images[:2], windows.template, windows.search, windows.stride)
+    sizes = windows.template, windows.search, windows.stride
+    found = cross_correlation(images[0], images[1], *sizes)
     usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
     d = torch.where(usable, found.d, torch.nan)
     return d, [windows.centres(axis).to(d.device) for axis in (0, 1)]
 
 
-def _of_volumes(images, spline: Spline, windows: Windows):
+def _of_volumes(
+    images: Sequence[torch.Tensor], spline: Spline, windows: Windows
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Windows about twice as large, as far as they fit into the volume, over the same range.
 
     Normalised cross-correlation of volumes averaged over 2 x 2 x 2 voxels at all whole shifts, and
@@ -189,7 +195,7 @@ def volume_scores(
     size = [min(windows.template, n) for n in shape]
     step = max(1, windows.template // 2)
 
-    def sums(field):
+    def sums(field: torch.Tensor) -> torch.Tensor:
         return avg_pool3d(field[:, None], size, step)[:, 0]
 
     first, second = values
@@ -208,11 +214,11 @@ def volume_scores(
         contrast = (square1 - mean1**2) * (square2 - mean2**2)
         score = (cross - mean1 * mean2) / contrast.clamp(min=1e-12).sqrt()
         scores.append(torch.where(inside > 0.5, score, -1.0))
-    scores = torch.where(contrast1 > 1e-10, torch.cat(scores), torch.nan)
+    whole = torch.where(contrast1 > 1e-10, torch.cat(scores), torch.nan)
     centres = [
-        n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, scores.shape[1:], strict=True)
+        n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, whole.shape[1:], strict=True)
     ]
-    return scores, centres
+    return whole, centres
 
 
 def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:

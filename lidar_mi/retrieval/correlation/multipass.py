@@ -19,7 +19,7 @@ from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS, MultipassSettings
 from lidar_mi.retrieval.images import windows as geometry
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.intensity import normalised, of_one_brightness, rms
+from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
 from lidar_mi.retrieval.images.quality import Flag, check_between, informative, non_finite
 from lidar_mi.retrieval.images.spline import Spline, band_limited, nearest
 from lidar_mi.retrieval.images.windows import Windows, averaged, image_pair, window_sums, working
@@ -127,7 +127,7 @@ def multipass(
     curved = torch.diag_embed(curved.movedim(0, -1)).movedim((-2, -1), (0, 1))
     matched = (fit.score > 0) & (fit.fraction_valid > 0.5)
     at = torch.meshgrid(*places, indexing="ij")
-    off = (d - flow[:, *at]).norm(dim=0) > max(settings.jump, sigma)
+    off = (d - torch.stack([part[at] for part in flow])).norm(dim=0) > max(settings.jump, sigma)
     bad = non_finite([image1, image2], windows)
     flag = (
         Flag.NO_MATCH * ~matched
@@ -276,12 +276,10 @@ def _fit(
             low, high = max(0, first - reach), min(n, last + reach)
             fields = fields.narrow(len(rims) + 1, low, high - low)
             rims.append((max(0, reach - first), max(0, last + reach - n)))
-        summed = [
-            _moments(fields[:number], kernel, steps, rims, order)
-            for number, kernel, order in ((squares + dims, kernels[0], 2), (squares, kernels[1], 2))
-        ]
+        once = _moments(fields[: squares + dims], kernels[0], steps, rims, 2)
+        twice = _moments(fields[:squares], kernels[1], steps, rims, 2)
         unweighted = _moments(fields[squares + dims :], kernels[0], steps, rims, 0)[(0,) * dims]
-        bands.append(_solved(*summed, unweighted, sigma, pair, whole))
+        bands.append(_solved(once, twice, unweighted, sigma, pair, whole))
     return _Fit(*(torch.cat(parts, dim=-dims) for parts in zip(*bands, strict=True)))
 
 
@@ -298,7 +296,7 @@ def _products(
     value, *slopes = pair.spline.sample(*at)
     valid = (pair.spline.holds(*at) & nearest(pair.usable, at)).all(0)
     if pair.rebalanced:
-        value, gain = of_one_brightness(value, valid.to(value))
+        value, gain = normalised_intensity(value, valid.to(value))
         slopes = [gain * part for part in slopes]
     slope = torch.stack([part.mean(0) for part in slopes])
     shift = (slope * flow).sum(0) - (value[1] - value[0])
@@ -318,9 +316,9 @@ def _moments(
 
     Up to `order` of them together; beyond the rims the fields are zero.
     """
-    found = {(): fields}
+    found: dict[tuple[int, ...], torch.Tensor] = {(): fields}
     for axis, (step, rim) in enumerate(zip(steps, rims, strict=True)):
-        after = {}
+        after: dict[tuple[int, ...], torch.Tensor] = {}
         for powers, sums in found.items():
             sums = pad(sums, (0, 0) * (sums.ndim - 2 - axis) + rim)
             parts = window_sums(sums, kernels[: order + 1 - sum(powers)], step, axis + 1)

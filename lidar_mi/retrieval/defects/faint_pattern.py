@@ -54,7 +54,7 @@ class Standing(NamedTuple):
         found : Displacement
             With a covariance.
         """
-        if not self.fraction or self.spoils:
+        if not self.fraction or self.spoils or found.covariance is None:
             return found
         left = 1 - self.fraction
         d = found.d / left

@@ -123,7 +123,7 @@ def fixed_pattern(
     unknown = {}
     for _ in range(_TURNS):
         now = [working(image) / _gain(gains, image) for image in images]
-        d = motion_around(*now, windows)[0].cpu().numpy()
+        d = motion_around(now[0], now[1], windows)[0].cpu().numpy()
         for axis in prior:
             others = _gain({other: p for other, p in gains.items() if other != axis}, now[0])
             rest = [_relative(working(image) / others) for image in images]

@@ -59,8 +59,8 @@ def illumination(
     if not test or whole - rest < _LEAST * whole:
         return none
     place = torch.meshgrid(*(torch.arange(n).to(none) for n in none.shape), indexing="ij")
-    gain = 1 + sum(float(a) * (p - p.mean()) for a, p in zip(plane, place, strict=True))
-    return gain.clamp(min=0.1)
+    slope_z, slope_y = (float(a) * (p - p.mean()) for a, p in zip(plane, place, strict=True))
+    return (1 + (slope_z + slope_y)).clamp(min=0.1)
 
 
 def described(gain: torch.Tensor) -> str:

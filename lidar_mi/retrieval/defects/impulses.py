@@ -1,5 +1,7 @@
 """Pixels that stand out of all around them, as no image of air does that a beam or a lens blurs."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from scipy.stats import norm
@@ -70,7 +72,7 @@ def scale(values: torch.Tensor) -> torch.Tensor:
     """Local standard deviation of values (z, y) without those that stand out of it."""
     known = values.isfinite()
     square = values.nan_to_num(0.0).square()
-    use, limit = known, threshold(known.sum()) ** 2
+    use, limit = known, threshold(int(known.sum())) ** 2
     while True:
         variance = averaged(square, use, _AROUND)
         less = known & (square <= limit * variance)
@@ -103,7 +105,7 @@ def _faintest(values: torch.Tensor) -> float:
     return _EMPTY * float(values[values.isfinite()].square().mean().sqrt())
 
 
-def _peeled(image: torch.Tensor, spread) -> torch.Tensor:
+def _peeled(image: torch.Tensor, spread: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
     """Impulses of an image, and of what is left without them."""
     found = torch.zeros_like(image, dtype=torch.bool)
     for _ in range(_PEELS):

@@ -48,7 +48,7 @@ class AtRest(NamedTuple):
 
     Attributes
     ----------
-    piled : torch.Tensor
+    clipped : torch.Tensor
         Saturated pixels, of each image.
     saturated : torch.Tensor
         Areas of them of at least half a template, see `saturation.saturated_areas`.
@@ -60,7 +60,7 @@ class AtRest(NamedTuple):
         All over the images, without these pixels.
     """
 
-    piled: torch.Tensor
+    clipped: torch.Tensor
     saturated: torch.Tensor
     structure: torch.Tensor
     stray: torch.Tensor
@@ -80,18 +80,18 @@ class AtRest(NamedTuple):
         """Pixels (images, z, y) that are left out."""
         return self.stray | self.saturated | self.structure
 
-    def left_out(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    def masked(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The images without the fixed pattern, NaN in place of what is no air."""
         pairs = zip(self.pattern.removed(images), self.hidden, strict=False)
-        return [_left_out(image, pixels) for image, pixels in pairs]
+        return [_masked(image, pixels) for image, pixels in pairs]
 
     def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The same, with smooth values in place of what is no air."""
-        found = zip(self.left_out(images), self.hidden, strict=False)
+        found = zip(self.masked(images), self.hidden, strict=False)
         return [filled_in(i, pixels) if bool(pixels.any()) else i for i, pixels in found]
 
     def flags(
-        self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, left_out: bool
+        self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, masked: bool
     ) -> torch.Tensor:
         """The flags of vectors, with the reasons by their names.
 
@@ -101,8 +101,8 @@ class AtRest(NamedTuple):
         images : sequence of torch.Tensor
             As they are.
         windows : Windows
-        left_out : bool
-            The vectors are from what was `left_out` of the images. Flags of non-finite input stay
+        masked : bool
+            The vectors are from what was `masked` of the images. Flags of non-finite input stay
             where the images themselves hold it. Otherwise the place in image 2 counts as well, and
             of saturated areas all of the search region.
         """
@@ -110,24 +110,24 @@ class AtRest(NamedTuple):
         bad = non_finite(images, windows)
         hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
         flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
-        parts = self.piled, self.saturated, self.structure, self.stray
+        parts = self.clipped, self.saturated, self.structure, self.stray
         if not any(bool(part.any()) for part in parts) and not self.pattern.spoils:
             return flag
         wide = ~torch.isfinite(found.d).all(0) & ~bad
-        piled = windows.of_templates(working(self.piled)).amax(0) > _SATURATED
+        clipped = windows.of_templates(working(self.clipped)).amax(0) > _SATURATED
         # an area of another brightness spoils a correlation from afar
         spoiled = torch.full_like(bad, self.pattern.spoils)
         hidden = self.hidden.any(0)
         spoiled |= windows.of_templates(working(hidden)) > _HIDDEN
         spoiled |= windows.of_centres(working(hidden)) > 0
-        structure = thick(hidden) if left_out else hidden
+        structure = thick(hidden) if masked else hidden
         for bit, pixels, here, reach in (
-            (Flag.SATURATED, self.saturated, piled, wide if left_out else ~bad),
+            (Flag.SATURATED, self.saturated, clipped, wide if masked else ~bad),
             (Flag.AT_REST, structure, spoiled, wide),
         ):
             here = here | (windows.of_templates(working(pixels)) > 0)
             here |= reach & (windows.of_regions(working(pixels)) > 0)
-            if not left_out:
+            if not masked:
                 here |= _matched(pixels, windows, found.d)
             flag = flag | (bit * here).to(flag.dtype)
         return flag
@@ -149,18 +149,19 @@ def _matched(pixels: torch.Tensor, windows: Windows, d: torch.Tensor) -> torch.T
 
 def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     """Saturated areas of images or volumes; structure and a fixed pattern at rest of images."""
-    piled = torch.stack([saturated(image) for image in images])
-    areas = saturated_areas(piled, windows)
+    clipped = torch.stack([saturated(image) for image in images])
+    areas = saturated_areas(clipped, windows)
     if windows.dims > 2:
-        return nothing_at_rest(images)._replace(piled=piled, saturated=areas)
-    pair = [_left_out(image, areas) for image in images[:2]]
-    structure, stray, d = at_rest(*pair, windows)
+        return nothing_at_rest(images)._replace(clipped=clipped, saturated=areas)
+    pair = [_masked(image, areas) for image in images[:2]]
+    structure, stray, d = at_rest(pair[0], pair[1], windows)
     hidden = stray | structure
-    pattern = fixed_pattern([_left_out(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
+    pattern = fixed_pattern([_masked(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
     if pattern.columns or pattern.rows:
-        structure, stray, d = at_rest(*pattern.removed(pair), windows)
-    more = torch.zeros_like(piled[2:])
-    found = AtRest(piled, areas, structure & ~areas, torch.cat([stray, more]), pattern)
+        even = pattern.removed(pair)
+        structure, stray, d = at_rest(even[0], even[1], windows)
+    more = torch.zeros_like(clipped[2:])
+    found = AtRest(clipped, areas, structure & ~areas, torch.cat([stray, more]), pattern)
     return found._replace(pattern=pattern.with_pixels(found.filled(images)[:2], d))
 
 
@@ -171,7 +172,7 @@ def nothing_at_rest(images: Sequence[torch.Tensor]) -> AtRest:
     return AtRest(all_none, none, none, all_none, FixedPattern(torch.ones(1)))
 
 
-def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+def _masked(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     if not bool(pixels.any()):
         return image
     image = image if image.is_floating_point() else working(image)
@@ -215,8 +216,8 @@ def at_rest(
     found = impulses.sharp(pair)
     hidden = outstanding | _candidates(pair, found)
     for _ in range(_TURNS):
-        soft = (_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True))
-        d, _ = motion_around(*soft, windows, continued=True)
+        soft = [_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True)]
+        d, _ = motion_around(soft[0], soft[1], windows, continued=True)
         if not bool(d.any()):  # what stands out is all that there is
             return found, torch.zeros_like(outstanding), d
         stray = impulses.stray(pair, outstanding, found, d)
@@ -256,14 +257,19 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
     """Single pixels, lines, edges, spots: each from the images without what was found before."""
     same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
 
-    def known(found):
+    def known(found: torch.Tensor) -> torch.Tensor:
         return torch.where(found, torch.nan, pair)
 
-    def of(values, size, marked, same=None):
+    def of(
+        values: torch.Tensor,
+        size: int,
+        marked: Callable[[torch.Tensor], torch.Tensor],
+        same: torch.Tensor | None = None,
+    ) -> _Field:
         change = (values[1] - values[0]).nan_to_num(0.0).abs()
         return _Field(values, change if same is None else change.minimum(same), size, marked)
 
-    def pixels(found):
+    def pixels(found: torch.Tensor) -> _Field:
         images = known(found)
         heights = torch.stack([impulses.height(image) for image in images])
         soft = [~impulses.unresolved(i, h) for i, h in zip(images, heights, strict=True)]
@@ -274,14 +280,14 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
     yield pixels
     for axis in (-1, -2):
 
-        def lines(found, axis=axis):
+        def lines(found: torch.Tensor, axis: int = axis) -> _Field:
             means = _along(pixels(found).pair, axis)
             return of(means, 3, lambda new: _along(new.double(), axis) > 0)
 
         yield lines
     for axis in (-1, -2):
 
-        def edges(found, axis=axis):
+        def edges(found: torch.Tensor, axis: int = axis) -> _Field:
             steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
             either = same.minimum(same.roll(-1, axis))
             # smoke rises over several pixels: a step beside it is as large and of its sign, which
@@ -296,7 +302,7 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         yield edges
     for size in _SIZES:
 
-        def spots(found, size=size):
+        def spots(found: torch.Tensor, size: int = size) -> _Field:
             return of(_spots(known(found), size), size, lambda new: _grown(new, size))
 
         yield spots
@@ -354,11 +360,11 @@ def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
     least = _least(field)
     one, two = field.pair.nan_to_num(0.0)
-    off = [
+    both = [
         torch.where(_inside(along), (here - moved(there, along)).abs(), torch.inf)
         for here, there, along in ((one, two, d), (two, one, -d))
     ]
-    off = torch.minimum(*off)
+    off = torch.minimum(both[0], both[1])
     off = torch.where(off.isfinite(), off, 0.0)
     chance = impulses.median_scale(off, field.size)
     limit = impulses.threshold(off.numel() // field.size**2) * chance

@@ -44,7 +44,7 @@ def saturated(image: torch.Tensor, false_alarm: float = FALSE_ALARM) -> torch.Te
     return image == values[-1]
 
 
-def saturated_areas(piled: torch.Tensor, windows: Windows) -> torch.Tensor:
+def saturated_areas(clipped: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Saturated areas of at least half a template that do not move with the air.
 
     They are saturated in all images, or in one that no other has a saturated pixel for within the
@@ -52,7 +52,7 @@ def saturated_areas(piled: torch.Tensor, windows: Windows) -> torch.Tensor:
 
     Parameters
     ----------
-    piled : torch.Tensor of bool, shape (images, ...)
+    clipped : torch.Tensor of bool, shape (images, ...)
         `saturated` pixels of each image.
     windows : Windows
 
@@ -60,16 +60,16 @@ def saturated_areas(piled: torch.Tensor, windows: Windows) -> torch.Tensor:
     -------
     torch.Tensor of bool, shape of an image
     """
-    if not bool(piled.any()):
-        return piled[0]
-    images = piled.cpu().numpy()
+    if not bool(clipped.any()):
+        return clipped[0]
+    images = clipped.cpu().numpy()
     least = windows.template**windows.dims / 2
-    areas = _large(images.all(0), least)
+    areas = _large(np.all(images, axis=0), least)
     for number, image in enumerate(images):
         others = np.delete(images, number, 0).any(0)
         near = ndimage.maximum_filter(others, 2 * windows.search + 1)
         areas |= _large(image, least, near)
-    return torch.as_tensor(areas, device=piled.device)
+    return torch.as_tensor(areas, device=clipped.device)
 
 
 def _large(pixels: np.ndarray, least: float, but: np.ndarray | None = None) -> np.ndarray:

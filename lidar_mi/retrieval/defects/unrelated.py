@@ -136,7 +136,7 @@ def _of_images(spline: Spline, finite: torch.Tensor, windows: Windows, wide: boo
     along = [torch.arange(n).to(spline.coefficients) for n in windows.shape]
     places = [place.expand(2, -1, -1) for place in torch.meshgrid(*along, indexing="ij")]
 
-    def score(first, second):
+    def score(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
         return cross_correlation(first, second, frame.template, frame.search, frame.stride).score
 
     known = frame.of_regions(working(~finite)) == 0
@@ -148,7 +148,7 @@ def _of_volumes(spline: Spline, finite: torch.Tensor, windows: Windows, _: bool)
     values = _floored(coarse_volumes(spline, finite.expand(2, *finite.shape)))
     scores, centres = volume_scores(values, windows)
 
-    def score(first, second):
+    def score(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
         return volume_scores(torch.stack([first, second]), windows)[0].nan_to_num(0.0).amax(0)
 
     return _Search(score, values, torch.ones_like(scores[0], dtype=torch.bool), centres)

@@ -19,9 +19,9 @@ from lidar_mi.retrieval.reml import most_likely
 
 # Displacements, px, that splines do not resolve in vortex cores: below, no change is assumed.
 _LEAST = 0.03
-# Largest blur of the images that is not told, standard deviation, px.
+# Largest blur of the images that is not known, standard deviation, px.
 _BLUR = 0.8
-# Gain in the log-likelihood below which none is. Where nothing moves through the plane it is 0 to
+# Gain in the log-likelihood below which none is. Where nothing moves out of the plane it is 0 to
 # 0.5 in noise and 10 at most in images without noise, whose differences are those of splines and of
 # unresolved motion; smoke with up to 2 % of texture that does move gains 120 and more.
 _GAIN = 20.0
@@ -137,13 +137,13 @@ def unexplained(
     """
     full = torch.arange(len(density), device=density.device) < min(spline.shape) // 2
     wave = wavenumbers(density, spline.shape)
-    across, blurred = displaced(wave, structure), strained(wave, structure)
-    use = density.isfinite() & (across > 0) & (wave > math.pi / knots) & full
+    moved, smeared = displaced(wave, structure), strained(wave, structure)
+    use = density.isfinite() & (moved > 0) & (wave > math.pi / knots) & full
     if int(use.sum()) < 3:
         return 0.0, 0.0
     waves = _independent_waves(spline, density) / spline.settings.smoothing
     found, across, blurred, number = (
-        part[use].double().cpu().numpy() for part in (density, across, blurred, waves)
+        part[use].double().cpu().numpy() for part in (density, moved, smeared, waves)
     )
     if not found.mean() > 0:
         return 0.0, 0.0

@@ -7,6 +7,7 @@ fit, tell how little.
 """
 
 from collections.abc import Callable, Iterator
+from functools import reduce
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from lidar_mi.retrieval.images.windows import averaged, working
 from lidar_mi.retrieval.reml import most_likely
 from lidar_mi.retrieval.threads import mapped
 
-Left = Callable[[torch.Tensor], torch.Tensor]
+ResidualOperator = Callable[[torch.Tensor], torch.Tensor]
 """From a difference (z, y) of the images in dt to what the fitted flow leaves of it."""
 
 CORRELATED_AREA = 50.0
@@ -60,9 +61,9 @@ _TOO_SMALL = 0.25
 _FLOOR = 1e-3
 
 
-def what_is_left(
+def residual_operator(
     linear: Linear, mesh: Mesh, response: Callable[[torch.Tensor], torch.Tensor]
-) -> Left:
+) -> ResidualOperator:
     """What a fit leaves of a difference of the images in a plane, to first order.
 
     Parameters
@@ -92,7 +93,7 @@ def _white_noise(images: Images, number: int, seed: int) -> Iterator[torch.Tenso
         yield images.spline.filtered(draw)
 
 
-def mean_square_displacement(images: Images, linear: Linear, left: Left) -> float:
+def mean_square_displacement(images: Images, linear: Linear, left: ResidualOperator) -> float:
     """Mean square displacement of structure besides that of the air, px^2.
 
     Differences of the images are taken as noise, as texture that is replaced, and as a smooth
@@ -121,7 +122,7 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     linear : Linear
         About the fitted flow.
     left : callable
-        See `what_is_left`.
+        See `residual_operator`.
 
     Returns
     -------
@@ -136,7 +137,7 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     fine = (difference - averaged(difference, valid, _FINE)).square()
     level = averaged(fine, valid, _LEVEL).sqrt()
     excess = level
-    if images.given:
+    if images.noise_known:
         told = images.noise**2 * images.spline.passed / images.time.square().sum() / images.weight
         beyond = (level.square() - told).clamp(min=0.0).sqrt() * valid
         excess = level = torch.maximum(level, told.sqrt())
@@ -149,7 +150,7 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
         return averaged(coarse, valid, _REGION)[::_APART, ::_APART]
 
     def noise_left(one: torch.Tensor) -> torch.Tensor:
-        rest = one if images.given else one - averaged(one, valid, _FINE)
+        rest = one if images.noise_known else one - averaged(one, valid, _FINE)
         return squares(left(level * one / rest.std()))
 
     def replaced_left(one: torch.Tensor) -> torch.Tensor:
@@ -169,7 +170,8 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     # identical images, images without structure
     if not all(bool(part.mean() > 0) for part in parts):
         return 0.0
-    return _component(*(part.cpu().numpy() for part in parts), images.given)
+    found_at, noise_at, moved_at, replaced_at = (part.cpu().numpy() for part in parts)
+    return _component(found_at, noise_at, moved_at, replaced_at, images.noise_known)
 
 
 def _component(
@@ -183,6 +185,7 @@ def _component(
     stand for the displacement. Of a noise that is not given, found = a noise + b moved, and a is 5
     at most.
     """
+    held: np.ndarray | float
     if given:
         held, others, most = noise, [replaced, noise], [np.inf, _TOO_SMALL]
     else:
@@ -194,7 +197,7 @@ def _component(
     return square if without - with_it > _GAIN and square > _LEAST**2 else 0.0
 
 
-def square_left(linear: Linear, left: Left) -> torch.Tensor:
+def square_left(linear: Linear, left: ResidualOperator) -> torch.Tensor:
     """Mean square of what is left of a displacement of 1 px of structure, (z, y).
 
     Parameters
@@ -202,13 +205,13 @@ def square_left(linear: Linear, left: Left) -> torch.Tensor:
     linear : Linear
         About the fitted flow.
     left : callable
-        See `what_is_left`.
+        See `residual_operator`.
     """
     return _mean(lambda one: left(one).square(), _displacements(linear))
 
 
-def _mean(of_draw: Left, draws: Iterator[torch.Tensor]) -> torch.Tensor:
-    return sum(mapped(of_draw, draws)) / _DRAWS
+def _mean(of_draw: ResidualOperator, draws: Iterator[torch.Tensor]) -> torch.Tensor:
+    return reduce(torch.add, mapped(of_draw, draws)) / _DRAWS
 
 
 def _displacements(linear: Linear) -> Iterator[torch.Tensor]:

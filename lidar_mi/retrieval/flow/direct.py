@@ -1,9 +1,11 @@
 """The flow in a plane, solved directly: exact posterior covariance and evidence."""
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
+from torch.linalg import LinAlgError  # type: ignore[attr-defined]  # not in torch's own list
 
 from lidar_mi.retrieval.flow.band import Band, form, spread
 from lidar_mi.retrieval.flow.band_cholesky import BandCholesky, cholesky, solved_near
@@ -66,9 +68,9 @@ def solved(
     coefficients: torch.Tensor,
     prior: Prior,
     settings: VariationalSettings,
-    turn: int,
+    iteration: int,
 ) -> Posterior:
-    """One Gauss-Newton step; `turn` is for `iterative` only."""
+    """One Gauss-Newton step; `iteration` is for `iterative` only."""
     band = _band(mesh)
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
@@ -76,7 +78,7 @@ def solved(
     return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
 
 
-class Pull(NamedTuple):
+class PriorTerm(NamedTuple):
     """The prior of a flow: its quadratic form with the ridge, and its gradient there.
 
     `whole` also has what keeps the form positive in spite of rounding.
@@ -86,25 +88,25 @@ class Pull(NamedTuple):
     whole: torch.Tensor
     gradient: torch.Tensor
 
-    def at(self, prior: Prior, coefficients: torch.Tensor) -> "Pull":
+    def at(self, prior: Prior, coefficients: torch.Tensor) -> "PriorTerm":
         """The same of another flow."""
         return self._replace(gradient=-_band(prior.mesh).apply(self.stiff, coefficients))
 
 
-def pull_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> Pull:
+def prior_term_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> PriorTerm:
     """That of a prior at a flow."""
     stiff = prior_form(prior)
     with_diagonal(stiff, ridge)
     whole = stiff.clone()
     with_diagonal(whole, rounding(stiff))
-    return Pull(stiff, whole, stiff).at(prior, coefficients)
+    return PriorTerm(stiff, whole, stiff).at(prior, coefficients)
 
 
 def solved_in_single(
     linear: Linear,
     mesh: Mesh,
     coefficients: torch.Tensor,
-    pull: Pull,
+    prior_term: PriorTerm,
     near: BandCholesky | None = None,
 ) -> torch.Tensor:
     """Coefficients after a step in single precision; its residual is looked at in double precision.
@@ -113,8 +115,8 @@ def solved_in_single(
     of that. Where there is no such factor, or the residual is not small, all is in double
     precision.
     """
-    gradient = mesh.transposed(linear.gradient) + pull.gradient
-    whole = (data_form if informative(linear) else curvature)(linear, mesh) + pull.whole
+    gradient = mesh.transposed(linear.gradient) + prior_term.gradient
+    whole = (data_form if informative(linear) else curvature)(linear, mesh) + prior_term.whole
     if near is not None:
         step = solved_near(near, whole, gradient, _SINGLE, _TURNS)
         if step is not None:
@@ -136,7 +138,7 @@ def factor_in_single(form: torch.Tensor) -> BandCholesky:
 def _in_double(form: torch.Tensor) -> BandCholesky:
     root = cholesky(form.double())
     if root is None:
-        raise torch.linalg.LinAlgError("the quadratic form of a flow is not positive definite")
+        raise LinAlgError("the quadratic form of a flow is not positive definite")
     return root
 
 
@@ -148,7 +150,7 @@ def in_single(band: Band, form: torch.Tensor) -> Factor | None:
     """A factor in single precision, if there is one."""
     try:
         return band.factor(form.float())
-    except torch.linalg.LinAlgError:
+    except LinAlgError:
         return None
 
 
@@ -193,14 +195,14 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
     mesh = prior.mesh
     rows = mesh.axes[0].knots if cells is None else cells.stop - cells.start + REACH
     total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
-    pairs: dict = {}
+    pairs: dict[tuple[tuple[int, int], tuple[int, int]], list[tuple[int, int, int, float]]] = {}
     for kind, terms in enumerate(_kinds(prior)):
         for a, first, one in terms:
             for b, second, other in terms:
                 pairs.setdefault((first, second), []).append((kind, a, b, one * other))
     weight = prior.cell * prior.strength
-    for orders, members in pairs.items():
-        parts = form(weight, mesh, *orders, cells)
+    for (first, second), members in pairs.items():
+        parts = form(weight, mesh, first, second, cells)
         for kind, a, b, scale in members:
             total[a, b].add_(parts[kind], alpha=scale)
     return total
@@ -210,10 +212,13 @@ def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None
     """Variance of each kind of motion (kinds, ...) on the prior's mesh, from a band's."""
     return torch.stack(
         [
-            sum(
-                one * other * spread(covariance[a, b], prior.mesh, first, second, cells)
-                for a, first, one in terms
-                for b, second, other in terms
+            reduce(
+                torch.add,
+                (
+                    one * other * spread(covariance[a, b], prior.mesh, first, second, cells)
+                    for a, first, one in terms
+                    for b, second, other in terms
+                ),
             )
             for terms in _kinds(prior)
         ]

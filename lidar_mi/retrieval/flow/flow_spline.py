@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch.nn.functional import pad
@@ -88,7 +89,9 @@ class Mesh:
         self.axes, self.places = tuple(axes), tuple(places)
         self.shape = tuple(len(place) for place in places)
         self.dims = len(self.axes)
-        self._bases, self._products, self._groups = {}, {}, {}
+        self._bases: dict[tuple[int, int], torch.Tensor] = {}
+        self._products: dict[tuple[int, int, int], torch.Tensor] = {}
+        self._groups: dict[tuple[int, int, int], list[tuple[slice, slice]]] = {}
         self._nearest: list[torch.Tensor] = []
 
     def basis(self, axis: int, order: int = 0) -> torch.Tensor:
@@ -149,7 +152,8 @@ class Mesh:
 
     def slopes_transposed(self, values: Sequence[torch.Tensor]) -> torch.Tensor:
         """The transpose of `slopes`: coefficients from one field for each axis."""
-        return sum(self.transposed(v, order) for v, order in zip(values, self._first, strict=True))
+        pairs = zip(values, self._first, strict=True)
+        return reduce(torch.add, (self.transposed(part, order) for part, order in pairs))
 
     @property
     def _first(self) -> list[tuple[int, ...]]:

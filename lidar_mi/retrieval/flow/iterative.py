@@ -23,28 +23,28 @@ class Posterior(NamedTuple):
     Attributes
     ----------
     coefficients : torch.Tensor
-    bend : torch.Tensor, shape (components, components, *prior.mesh.shape)
+    curvature : torch.Tensor, shape (components, components, *prior.mesh.shape)
         The information of the volumes, lumped to the prior's mesh.
     prior : Prior
-    rough : Prior
+    single : Prior
         The same in the precision of the voxels, which is enough for draws.
     settings : VariationalSettings
-    turn : int
+    iteration : int
         Seeds the draws.
     """
 
     coefficients: torch.Tensor
-    bend: torch.Tensor
+    curvature: torch.Tensor
     prior: Prior
-    rough: Prior
+    single: Prior
     settings: VariationalSettings
-    turn: int
+    iteration: int
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow."""
         solver = self.settings.solver
         before, after = (
-            self.rough.by_kind(self.rough.rates(flows).square()).mean(0)
+            self.single.by_kind(self.single.rates(flows).square()).mean(0)
             for flows in self._drawn(solver.draws, before=True)
         )
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
@@ -59,7 +59,7 @@ class Posterior(NamedTuple):
         images it is infinite: the prior leaves rigid motion free.
         """
         (flows,) = self._drawn(self.settings.solver.final_draws, before=False)
-        flows = self.rough.mesh.field(flows).to(self.prior.local)
+        flows = self.single.mesh.field(flows).to(self.prior.local)
         mean = self.prior.smooth((flows[:, :, None] * flows[:, None]).mean(0))
         after = interpolated(mean, self.prior.mesh.places, [p.to(mean) for p in places])
         return after, torch.full_like(after, torch.inf)
@@ -69,32 +69,32 @@ class Posterior(NamedTuple):
 
         Both from the same random numbers: they are equal where the volumes inform nothing.
         """
-        prior, ridge = self.rough, self.settings.ridge
+        prior, ridge = self.single, self.settings.ridge
         like = self.coefficients.to(prior.local)
         draw = torch.Generator(device=like.device)
-        draw.manual_seed(self.settings.solver.seed + self.turn)
+        draw.manual_seed(self.settings.solver.seed + self.iteration)
 
-        def normal(*shape):
+        def normal(*shape: int) -> torch.Tensor:
             return torch.randn(number, *shape, generator=draw, dtype=like.dtype, device=like.device)
 
         # right-hand sides whose covariance is the second derivative
         weights = prior.weights
         right = prior.rates_transposed(weights.sqrt() * normal(*weights.shape))
         right = right + ridge**0.5 * normal(*like.shape)
-        bend = self.bend.to(like)
-        flows = [self._flows(torch.zeros_like(bend), right)] if before else []
-        root = _root(bend)
+        curvature = self.curvature.to(like)
+        flows = [self._flows(torch.zeros_like(curvature), right)] if before else []
+        root = _root(curvature)
         right = right + prior.mesh.transposed(_times(root, normal(len(root), *prior.mesh.shape)))
-        return [*flows, self._flows(bend, right)]
+        return [*flows, self._flows(curvature, right)]
 
-    def _flows(self, bend: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-        mesh, ridge = self.rough.mesh, self.settings.ridge
+    def _flows(self, curvature: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        mesh, ridge = self.single.mesh, self.settings.ridge
 
-        def applied(c):
-            found = mesh.transposed(_times(bend, mesh.field(c)))
-            return found + _stiff(c, self.rough, ridge)
+        def applied(c: torch.Tensor) -> torch.Tensor:
+            found = mesh.transposed(_times(curvature, mesh.field(c)))
+            return found + _stiff(c, self.single, ridge)
 
-        ready = _preconditioner(bend, self.rough, ridge)
+        ready = _preconditioner(curvature, self.single, ridge)
         solver = self.settings.solver
         return conjugate_gradients(applied, right, ready, solver.loose, solver.steps)
 
@@ -105,9 +105,9 @@ def solved(
     coefficients: torch.Tensor,
     prior: Prior,
     settings: VariationalSettings,
-    turn: int,
+    iteration: int,
 ) -> Posterior:
-    """One Gauss-Newton step; the number `turn` seeds the flows drawn from the posterior."""
+    """One Gauss-Newton step; the number `iteration` seeds the flows drawn from the posterior."""
     ridge, solver = settings.ridge, settings.solver
     lumps = [
         linear_weights(m.to(p), p).T for m, p in zip(prior.mesh.places, mesh.places, strict=True)
@@ -115,22 +115,22 @@ def solved(
     # knots have the precision of the prior, which may be strong; voxels have their own
     coefficients, voxels = coefficients.to(prior.local), linear.slope.dtype
     dims = mesh.dims
-    bend = coefficients.new_empty(dims, dims, *prior.mesh.shape)
+    curvature = coefficients.new_empty(dims, dims, *prior.mesh.shape)
     for a, b in combinations_with_replacement(range(dims), 2):
         squares = linear.information * linear.slope[a] * linear.slope[b]
-        bend[a, b] = bend[b, a] = separable(squares, lumps)
+        curvature[a, b] = curvature[b, a] = separable(squares, lumps)
     steep = linear.weight * linear.slope
 
-    def applied(c):
+    def applied(c: torch.Tensor) -> torch.Tensor:
         along = (linear.slope * mesh.field(c.to(voxels))).sum(1, keepdim=True)
         return mesh.transposed(along * steep).to(c) + _stiff(c, prior, ridge)
 
-    right = mesh.transposed(linear.gradient).to(bend)[None]
+    right = mesh.transposed(linear.gradient).to(curvature)[None]
     right = right - _stiff(coefficients[None], prior, ridge)
-    ready = _preconditioner(bend, prior, ridge)
+    ready = _preconditioner(curvature, prior, ridge)
     (change,) = conjugate_gradients(applied, right, ready, solver.tolerance, solver.steps)
-    rough = prior.to(linear.slope)
-    return Posterior(coefficients + change, bend, prior, rough, settings, turn)
+    single = prior.to(linear.slope)
+    return Posterior(coefficients + change, curvature, prior, single, settings, iteration)
 
 
 def _times(matrix: torch.Tensor, flows: torch.Tensor) -> torch.Tensor:
@@ -147,33 +147,33 @@ def _stiff(coefficients: torch.Tensor, prior: Prior, ridge: float) -> torch.Tens
     return prior.rates_transposed(rates) + ridge * coefficients
 
 
-def _root(bend: torch.Tensor) -> torch.Tensor:
+def _root(curvature: torch.Tensor) -> torch.Tensor:
     """A square root of positive semidefinite matrices (components, components, ...)."""
-    matrix = bend.movedim((0, 1), (-2, -1))
-    unit = torch.eye(len(bend), dtype=matrix.dtype, device=matrix.device)
+    matrix = curvature.movedim((0, 1), (-2, -1))
+    unit = torch.eye(len(curvature), dtype=matrix.dtype, device=matrix.device)
     floor = 1e-5 * matrix.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-20
     root = torch.linalg.cholesky(matrix + floor[..., None, None] * unit)
     return root.movedim((-2, -1), (0, 1)).contiguous()
 
 
 def _preconditioner(
-    bend: torch.Tensor, prior: Prior, ridge: float
+    curvature: torch.Tensor, prior: Prior, ridge: float
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """The inverse of each knot's diagonal block (components, components)."""
     mesh = prior.mesh
     dims = mesh.dims
     bases = [[mesh.basis(axis, order).square().T for axis in range(dims)] for order in (0, 1)]
 
-    def diagonal(values, axis=None):
+    def diagonal(values: torch.Tensor, axis: int | None = None) -> torch.Tensor:
         return separable(values, [bases[a == axis][a] for a in range(dims)])
 
-    block = diagonal(bend)
+    block = diagonal(curvature)
     for weight, (_, motion) in zip(prior.weights, prior.motions, strict=True):
         for a, b, scale in motion:
             block[a, a] += diagonal(weight, b) * scale**2
     for a in range(dims):
         block[a, a] += ridge
-    inverse = torch.linalg.inv(block.movedim((0, 1), (-2, -1)).double()).to(bend)
+    inverse = torch.linalg.inv(block.movedim((0, 1), (-2, -1)).double()).to(curvature)
     inverse = inverse.movedim((-2, -1), (0, 1)).contiguous()
     return lambda c: _times(inverse, c)
 
@@ -187,7 +187,7 @@ def conjugate_gradients(
 ) -> torch.Tensor:
     """Solutions (n, ...) of a symmetric positive system for right-hand sides (n, ...)."""
 
-    def inner(a, b):
+    def inner(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (a * b).flatten(1).sum(1).reshape(-1, *[1] * (a.ndim - 1))
 
     solution = torch.zeros_like(right)

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
 
 from lidar_mi.retrieval.flow.flow_spline import Mesh
 from lidar_mi.retrieval.flow.settings import VariationalSettings
-from lidar_mi.retrieval.images.intensity import normalised, of_one_brightness, rms
+from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
 from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import misfit_variance
 from lidar_mi.retrieval.images.spline import Spline, band_limited, filter_of, nearest
@@ -18,10 +19,10 @@ from lidar_mi.retrieval.images.windows import averaged
 _INTERPOLATION = 1e-5
 # A noise that is given and below this fraction of that of the spectra (of the variances) is only a
 # lower limit: what differs are the air and what splines cannot interpolate.
-_SAYS_LITTLE = 0.1
+_LEAST_KNOWN = 0.1
 # Width of the means that tell texture from noise, in cells between knots: at 0.8 too few pixels,
-# at 3 the rim of smoke counts as texture beside it.
-_SHARE_WIDTH = 1.5
+# at 3 the rim of smoke counts as texture next to it.
+_FRACTION_WIDTH = 1.5
 # Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
 _STRUCTURE = 3.0
 # Of the mean that passes the long waves in which structure moves alike over an area; and the
@@ -53,15 +54,14 @@ class Images(NamedTuple):
         The noise before it contained the local misfit.
     noise_updated : bool
         Whether noise and weight contain the local misfit already.
-    through : float
-        Mean square displacement through the plane that the misfit tells of, px^2.
-    given : bool
+    out_of_plane : float
+        Mean square displacement out of the plane, from the misfit, px^2.
+    noise_known : bool
         Whether the noise is as given; else it is that of the images' spectra.
-    told : float
+    known_noise : float
         The noise that was given, a lower limit; 0 if none was.
     coherent : float
-        Variance of the displacement by which structure as a whole moves otherwise than the air in
-        the plane, times the area over which it does so alike, px^4.
+        Variance of the displacement of non-advected structure, times its correlated area, px^4.
     """
 
     spline: Spline
@@ -72,10 +72,10 @@ class Images(NamedTuple):
     stack: torch.Tensor
     blur: float
     white: float
-    told: float
+    known_noise: float
     noise_updated: bool = False
-    through: float = 0.0
-    given: bool = True
+    out_of_plane: float = 0.0
+    noise_known: bool = True
     coherent: float = 0.0
 
     def single(self) -> "Images":
@@ -95,7 +95,7 @@ class Linear(NamedTuple):
         The same without what is `coarse`: slopes that tell of the flow.
     coarse : torch.Tensor, shape (z, y), or None
         Fraction of the long waves of differences and slopes that is left out at each pixel, as
-        structure moves otherwise than the air there: what is left is as white as the noise.
+        structure is not advected there: the residual is as white as the noise.
     gradient : torch.Tensor, shape (components, ...)
         Of the log-likelihood with respect to the flow at each pixel.
     weight : torch.Tensor
@@ -130,12 +130,12 @@ def prepared(
     """The images, normalised and band-limited, with the noise as given or estimated."""
     known_at, weight = known_and_weight(stack, noise, settings.noise_width)
     images = normalised(stack)
-    told = 0.0 if noise is None else rms(noise)
+    known_noise = 0.0 if noise is None else rms(noise)
     of_spectra = filter_of(images, None, None, weight.sqrt(), blur, settings.filter).level
-    given = told**2 > _SAYS_LITTLE * of_spectra**2
+    noise_known = known_noise**2 > _LEAST_KNOWN * of_spectra**2
     spline, level = band_limited(
         images,
-        told if given else of_spectra,
+        known_noise if noise_known else of_spectra,
         weight=weight.sqrt(),
         blur=blur,
         settings=settings.filter,
@@ -143,7 +143,18 @@ def prepared(
     level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     time = time - time.mean()
-    return Images(spline, known_at, time, level, weight, images, blur, level, told, given=given)
+    return Images(
+        spline,
+        known_at,
+        time,
+        level,
+        weight,
+        images,
+        blur,
+        level,
+        known_noise,
+        noise_known=noise_known,
+    )
 
 
 def linearised(
@@ -164,7 +175,7 @@ def linearised_there(
     """`linearised`, with the images' values and slopes at the places of `path`."""
     value, *slopes = sampled
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
-    value, gain = of_one_brightness(value, images.weight * valid)
+    value, gain = normalised_intensity(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])
     residual = (value - value.mean(0)) * images.weight.sqrt()
     passed = max(images.spline.passed, 1e-6)
@@ -178,7 +189,8 @@ def linearised_there(
     time = images.time.reshape(-1, *[1] * mesh.dims)
     difference = (time * (value - value.mean(0))).sum(0)
     informed = images.spline.efficiency * weight / variance
-    coarse, damped = None, slope
+    coarse: torch.Tensor | None = None
+    damped = slope
     if images.coherent:
         # long waves scatter by variance + coherent s^2 a pixel where structure has the slope s
         steep = steepness_of_structure(slope, valid)
@@ -192,8 +204,8 @@ def linearised_there(
     information = second / images.spline.excess
     if mesh.dims == 2:
         noise = misfit / ((len(value) - 1) * passed * variance)
-        share = _share_of_texture(images, slope, noise, valid, mesh)
-        information = second * share.square() * images.spline.excess
+        fraction = _fraction_of_texture(images, slope, noise, valid, mesh)
+        information = second * fraction.square() * images.spline.excess
     gradient = informed * downhill
     return Linear(slope, damped, coarse, gradient, second, information, variance, value, valid)
 
@@ -211,7 +223,7 @@ def without_coarse(
     return field if coarse is None else field - coarse * averaged(field, valid, _LONG)
 
 
-def told_by_first(
+def information_of_first(
     images: Images, mesh: Mesh, places: torch.Tensor, sampled: Sequence[torch.Tensor], number: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """What images in a plane will tell of a flow, as far as the first of them shows.
@@ -241,24 +253,24 @@ def told_by_first(
     slope = torch.stack([(torch.cat(slopes) * along).sum(0) for along in turned])
     valid = nearest(images.usable, places[:, :1])[0] & images.spline.holds(*places).all(0)
     # one image has more noise than the mean of them
-    share = _share_of_texture(images, slope, None, valid, mesh, number)
+    fraction = _fraction_of_texture(images, slope, None, valid, mesh, number)
     informed = images.spline.efficiency * images.weight * valid / max(images.noise**2, 1e-30)
     second = images.time.square().sum() * informed
-    return slope, second * share.square() * images.spline.excess
+    return slope, second * fraction.square() * images.spline.excess
 
 
 def information_near(slope: torch.Tensor, information: torch.Tensor, mesh: Mesh) -> torch.Tensor:
     """Information on both components about each pixel: the mean that the flow's splines see."""
-    told = information * slope.square().sum(0)
-    return averaged(told, torch.ones_like(told, dtype=torch.bool), _width(mesh))
+    of_both = information * slope.square().sum(0)
+    return averaged(of_both, torch.ones_like(of_both, dtype=torch.bool), _width(mesh))
 
 
 def _width(mesh: Mesh) -> float:
     axis = mesh.axes[0]
-    return _SHARE_WIDTH * (axis.size - 1) / axis.cells
+    return _FRACTION_WIDTH * (axis.size - 1) / axis.cells
 
 
-def _share_of_texture(
+def _fraction_of_texture(
     images: Images,
     slope: torch.Tensor,
     noise: torch.Tensor | None,
@@ -266,20 +278,20 @@ def _share_of_texture(
     mesh: Mesh,
     more: float = 1.0,
 ) -> torch.Tensor:
-    """Share of texture in the mean square of the slopes at each pixel of a plane, 0 to 1.
+    """Fraction of texture in the mean square of the slopes at each pixel of a plane, 0 to 1.
 
-    Noise has slopes too, and beside bright smoke there are no others. With slopes J = T + N of
+    Noise has slopes too, and next to bright smoke there are no others. With slopes J = T + N of
     texture and noise the differences of two images tell of the flow by T J, and scatter by
-    s^2 J^2. Their information on it is (T J)^2 / (s^2 J^2), on average the square of this share
+    s^2 J^2. Their information on it is (T J)^2 / (s^2 J^2), on average the square of this fraction
     times J^2 / s^2. Both mean squares are Gaussian means over 1.5 cells of the flow's splines.
-    Where the noise was not told, `noise`, the square of the misfit over that assumed, is its
+    Where the noise is not known, `noise`, the square of the misfit over that assumed, is its
     upper limit: texture down to single pixels looks like noise in the spectrum. Slopes may have
     `more` noise than those of the mean of two images.
     """
     width = _width(mesh)
     power = averaged(slope.square().sum(0) * images.weight, valid, width)
-    noisy = more * images.spline.noisy_slopes
-    if noise is not None and not images.given:
+    noisy: torch.Tensor | float = more * images.spline.noisy_slopes
+    if noise is not None and not images.noise_known:
         noisy = noisy * averaged(noise, valid, width).clamp(max=1.0)
     return (1 - noisy / power.clamp(min=1e-30)).clamp(min=0.0)
 
@@ -295,11 +307,12 @@ def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int)
     term = flow
     change = time * term[:, None]
     for k in range(2, terms + 1):
-        if k == 2:
-            along = mesh.slopes(coefficients)
-        else:
-            along = torch.gradient(term, dim=tuple(range(1, term.ndim)))
-        term = sum(u * part for u, part in zip(flow, along, strict=True))
+        along: Sequence[torch.Tensor] = (
+            mesh.slopes(coefficients)
+            if k == 2
+            else torch.gradient(term, dim=tuple(range(1, term.ndim)))
+        )
+        term = reduce(torch.add, [u * part for u, part in zip(flow, along, strict=True)])
         change = change + time**k / math.factorial(k) * term[:, None]
     for axis, place in enumerate(mesh.places):
         change[axis] += place.reshape(-1, *[1] * (mesh.dims - 1 - axis))

@@ -4,7 +4,11 @@ import numpy as np
 import torch
 
 from lidar_mi.retrieval.flow.change import displaced, of_structure, unexplained
-from lidar_mi.retrieval.flow.coherent_change import CORRELATED_AREA, Left, mean_square_displacement
+from lidar_mi.retrieval.flow.coherent_change import (
+    CORRELATED_AREA,
+    ResidualOperator,
+    mean_square_displacement,
+)
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
 from lidar_mi.retrieval.images.band_limit import WORTH_WHITENING, flat_if_nearly, wavenumbers
 from lidar_mi.retrieval.images.intensity import rms
@@ -35,11 +39,11 @@ def with_local_noise(
     coloured: bool,
     knots: float,
     strain: float = 0.0,
-    left: Left | None = None,
+    residual_of: ResidualOperator | None = None,
 ) -> Images:
     """The images with the noise estimated from their misfit at each place and wavenumber.
 
-    Warped images differ by more than their noise where structure moves through the plane, is
+    Warped images differ by more than their noise where structure moves out of the plane, is
     undersampled, or moves on scales smaller than the splines'. A noise that is given is the lower
     limit. One that was not given is of the spectra, where fine texture looks like noise: their
     misfit takes its place if it is clearly less. In a plane it then does so at each place and
@@ -47,7 +51,7 @@ def with_local_noise(
     the filter passes, and the filter on the weights of the places: both are estimated in turn.
 
     Two kinds of change leave less of themselves than noise does. In each wavenumber a lower limit
-    is the motion through the plane that the waves shorter than two `knots` (px) tell of: the flow
+    is the out-of-plane motion that the waves shorter than two `knots` (px) tell of: the flow
     absorbs part of the misfit of longer ones. And structure as a whole can move otherwise than the
     air in the plane, see `coherent_change.mean_square_displacement`.
 
@@ -63,29 +67,29 @@ def with_local_noise(
     knots : float
         Spacing of the flow's knots, px.
     strain : float
-        Mean square of the flow's strain in dt, in a plane along its axes; blur that is not told
+        Mean square of the flow's strain in dt, in a plane along its axes; blur that is not known
         makes images differ by it.
-    left : callable, optional
+    residual_of : callable, optional
         What the fit leaves of a difference of images in a plane, see
-        `coherent_change.what_is_left`. Left out: of volumes.
+        `coherent_change.residual_operator`. Left out: of volumes.
     """
     again, overstated = images.noise_updated, False
     coherent = images.coherent
-    if left is not None:
-        square = mean_square_displacement(images, linear, left)
+    if residual_of is not None:
+        square = mean_square_displacement(images, linear, residual_of)
         coherent = max(coherent, square * CORRELATED_AREA)
     residual = (linear.warped - linear.warped.mean(0)) * linear.valid
     slope = linear.slope * linear.valid
     power, steep = _weighted(images, images.spline.passed, residual, slope)
-    if not images.given and linear.valid.any():
+    if not images.noise_known and linear.valid.any():
         whole = float(power[linear.valid].sum() / steep[linear.valid].sum())
         overstated = whole < _OVERSTATED * images.white**2
         if overstated:
             images = images._replace(white=whole**0.5)
     floor = images.white**2
     least, least_density, rounds = _LEAST_GIVEN, _LEAST_GIVEN, 1
-    if overstated and left is not None:
-        floor = max(min(floor, (_FINEST * rms(images.stack)) ** 2), images.told**2)
+    if overstated and residual_of is not None:
+        floor = max(min(floor, (_FINEST * rms(images.stack)) ** 2), images.known_noise**2)
         # where air changes, what differs by less than the mean has been absorbed by the flow
         least, least_density, rounds = 1.0 if again else _LEAST_LOCAL, _LEAST_DENSITY, _ROUNDS
     for to_come in reversed(range(rounds)):
@@ -93,10 +97,10 @@ def with_local_noise(
         mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
         level = max(floor, mean, 1e-30)
         weight = images.weight * (level / local.clamp(min=max(floor, least * level)))
-        density = None
+        density: torch.Tensor | None = None
         if coloured:
-            density = mismatch(images.spline, residual * weight.sqrt())
-            density = density.clamp(min=max(floor, least_density * level))
+            least_of_wave = max(floor, least_density * level)
+            density = mismatch(images.spline, residual * weight.sqrt()).clamp(min=least_of_wave)
         if to_come:
             chosen = filter_of(
                 images.stack,
@@ -111,7 +115,7 @@ def with_local_noise(
                 images, chosen.passed, *(part * linear.valid for part in parts)
             )
     square = 0.0
-    if coloured:
+    if density is not None:
         structure = of_structure(images.spline, images.stack, images.white)
         found = mismatch(images.spline, residual)
         square, blurred = unexplained(images.spline, found, structure, strain, knots)
@@ -121,7 +125,7 @@ def with_local_noise(
             settings = images.spline.settings
             spectrum = spectrum_of(images.stack, weight.sqrt(), settings)
             # a filter that is not flat adds to what blur in strain makes
-            worth = np.inf if images.given and blurred > _BLURRED else WORTH_WHITENING
+            worth = np.inf if images.noise_known and blurred > _BLURRED else WORTH_WHITENING
             density = flat_if_nearly(spectrum, density, settings.threshold, worth)
     spline, level = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
@@ -131,7 +135,7 @@ def with_local_noise(
         noise=level,
         weight=weight,
         noise_updated=True,
-        through=square,
+        out_of_plane=square,
         coherent=coherent,
     )
 

@@ -10,10 +10,10 @@ from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.flow.band_cholesky import BandCholesky, spread_half
 from lidar_mi.retrieval.flow.direct import (
     Posterior,
-    Pull,
+    PriorTerm,
     factor_in_single,
     form_of_slopes,
-    pull_of,
+    prior_term_of,
     solved_in_single,
 )
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
@@ -21,10 +21,10 @@ from lidar_mi.retrieval.flow.likelihood import (
     Images,
     Linear,
     information_near,
+    information_of_first,
     linearised,
     linearised_there,
     path,
-    told_by_first,
 )
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
@@ -58,8 +58,8 @@ class Flow:
         Of the flow then, in the prior's units.
     before : torch.Tensor, shape (2, 2, *windows.count)
         Covariance of the flow a priori, px^2.
-    besides : torch.Tensor, shape (2, 2, *windows.count)
-        Covariance besides the posterior's, px^2: of motion that the splines do not resolve
+    additional : torch.Tensor, shape (2, 2, *windows.count)
+        Covariance in addition to the posterior's, px^2: of motion that the splines do not resolve
         (`unresolved`), and by the prior's strength (`Prior.evened`).
     images : Images
         Their filter and noise.
@@ -71,14 +71,14 @@ class Flow:
     settings : VariationalSettings
     offset : (float, float)
         Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
-        `besides`, `local`) has moved since.
+        `additional`, `local`) has moved since.
     """
 
     coefficients: torch.Tensor
     prior: Prior
     energy: float
     before: torch.Tensor
-    besides: torch.Tensor
+    additional: torch.Tensor
     images: Images
     local: torch.Tensor
     misfit: float
@@ -118,7 +118,7 @@ class Flow:
             self,
             prior=self.prior._replace(local=strength.exp()),
             before=interpolated(self.before, centres, _back(centres, self.offset)),
-            besides=interpolated(self.besides, centres, _back(centres, self.offset)),
+            additional=interpolated(self.additional, centres, _back(centres, self.offset)),
             local=interpolated(self.local, pixels, _back(pixels, self.offset)),
             offset=(0.0, 0.0),
         )
@@ -130,7 +130,7 @@ def flow_of(
     images: Images,
     given: torch.Tensor,
     before: torch.Tensor,
-    besides: torch.Tensor,
+    additional: torch.Tensor,
     windows: Windows,
     settings: VariationalSettings,
 ) -> Flow:
@@ -143,7 +143,7 @@ def flow_of(
         posterior.prior,
         _energy(posterior.prior, posterior.coefficients),
         before,
-        besides,
+        additional,
         images,
         images.weight / given,
         _misfit(linear, torch.zeros_like(linear.slope), images),
@@ -153,8 +153,8 @@ def flow_of(
 
 
 @dataclass(frozen=True, eq=False)
-class Awaited:
-    """The next flow before its second image is there; see `awaited`.
+class ExpectedFlow:
+    """The next flow before its second image is there; see `expected_flow`.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class Awaited:
         Of the air at the pixels at mid-time in both images, px.
     first : tuple of torch.Tensor, shape (1, z, y)
         Value and slopes of the first image there.
-    pull : Pull
+    prior_term : Pull
     root : BandCholesky
         Factor of the precision of the flow, by the information that the first image shows.
     covariance : torch.Tensor, shape (2, 2, *windows.count)
@@ -183,13 +183,15 @@ class Awaited:
     images: Images
     places: torch.Tensor
     first: tuple[torch.Tensor, ...]
-    pull: Pull
+    prior_term: PriorTerm
     root: BandCholesky
     covariance: torch.Tensor
     information: torch.Tensor
 
 
-def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None) -> Awaited:
+def expected_flow(
+    start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None
+) -> ExpectedFlow:
     """All of `next_flow` that concerns the first image and the expected flow alone."""
     placed = start.placed()
     images = _prepared(placed, first, noise)
@@ -197,19 +199,21 @@ def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None
     mesh = _of_pixels(axes, start.windows, images.spline.coefficients)
     places = path(mesh, start.coefficients.float(), images.time, start.settings.path_order)
     sampled = images.spline.sample(*places[:, :1])
-    slope, told = told_by_first(images, mesh, places, sampled, len(images.time))
-    pull = pull_of(placed.prior, start.coefficients, start.settings.ridge)
-    root = factor_in_single(form_of_slopes(told, slope, mesh) + pull.whole)
+    slope, information = information_of_first(images, mesh, places, sampled, len(images.time))
+    prior_term = prior_term_of(placed.prior, start.coefficients, start.settings.ridge)
+    root = factor_in_single(form_of_slopes(information, slope, mesh) + prior_term.whole)
     # the recursion for the inverse damps rounding: 1e-5 in single precision
     inverse = root.covariance().float()
     at_centres = _of_centres(axes, start.windows, inverse)
     covariance = spread_half(inverse, at_centres).to(start.coefficients)
-    near = information_near(slope, told, mesh)
-    return Awaited(start, placed, mesh, images, places, sampled, pull, root, covariance, near)
+    near = information_near(slope, information, mesh)
+    return ExpectedFlow(
+        start, placed, mesh, images, places, sampled, prior_term, root, covariance, near
+    )
 
 
 def next_flow(
-    start: Flow | Awaited,
+    start: Flow | ExpectedFlow,
     stack: Sequence[torch.Tensor],
     noise: float | torch.Tensor | None,
     min_correlation: float,
@@ -221,7 +225,7 @@ def next_flow(
 
     Parameters
     ----------
-    start : Flow or Awaited
+    start : Flow or ExpectedFlow
         The expected one, or what was made of it and of the first image before.
     stack : sequence of torch.Tensor, shape (z, y)
         Two images of the windows' size.
@@ -229,19 +233,19 @@ def next_flow(
     min_correlation : float
         As `variational` takes them.
     """
-    ready = start if isinstance(start, Awaited) else awaited(start, stack[0], noise)
+    ready = start if isinstance(start, ExpectedFlow) else expected_flow(start, stack[0], noise)
     start, placed, mesh = ready.start, ready.placed, ready.mesh
     windows, settings, prior = start.windows, start.settings, placed.prior
     images = _completed(ready.images, placed, stack, noise)
     second = images.spline.only(1).sample(*ready.places[:, 1:])
     sampled = [torch.cat(pair) for pair in zip(ready.first, second, strict=True)]
     linear = linearised_there(images, mesh, ready.places, sampled, settings)
-    coefficients, pull = start.coefficients, ready.pull
-    for turn in range(_ROUNDS):
-        if turn:
+    coefficients, prior_term = start.coefficients, ready.prior_term
+    for iteration in range(_ROUNDS):
+        if iteration:
             linear = linearised(images, mesh, coefficients.float(), settings)
-            pull = pull.at(prior, coefficients)
-        after = solved_in_single(linear, mesh, coefficients, pull, ready.root)
+            prior_term = prior_term.at(prior, coefficients)
+        after = solved_in_single(linear, mesh, coefficients, prior_term, ready.root)
         step = mesh.field((after - coefficients).float())
         coefficients = after
         far = float(step.abs().flatten().kthvalue(int(0.99 * step.numel())).values)
@@ -255,12 +259,13 @@ def next_flow(
     covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
-    found = found._replace(covariance=covariance + placed.besides)
-    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
+    covariance = covariance + placed.additional
+    flag = found.flag | unskilled(found.d, covariance)
+    found = found._replace(covariance=covariance, flag=flag)
     return found, replace(start, coefficients=coefficients)
 
 
-def _as_informed(ready: Awaited, linear: Linear) -> torch.Tensor:
+def _as_informed(ready: ExpectedFlow, linear: Linear) -> torch.Tensor:
     """The covariance (2, 2, *windows.count) by the information of all images.
 
     That by the first one, changed as the information near each window differs. With a fraction f of
@@ -285,7 +290,13 @@ def _of_centres(axes: Sequence[Axis], windows: Windows, like: torch.Tensor) -> M
 
 
 @lru_cache(maxsize=8)
-def _mesh(axes: Sequence[Axis], windows: Windows, places: Callable, dtype, device) -> Mesh:
+def _mesh(
+    axes: Sequence[Axis],
+    windows: Windows,
+    places: Callable[[Windows, torch.Tensor], list[torch.Tensor]],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Mesh:
     """Kept for the next slab: to make its splines takes longer than to use them."""
     return Mesh(axes, places(windows, torch.empty(0, dtype=dtype, device=device)))
 

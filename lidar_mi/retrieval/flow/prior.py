@@ -7,6 +7,7 @@ the prior variance less the posterior variance.
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -51,7 +52,7 @@ class Divergence(NamedTuple):
     Attributes
     ----------
     strength : float
-        Where there is no vorticity, as from wind through the plane.
+        Where there is no vorticity, as from wind across the plane.
     ratio : float
         Strength over the vorticity's of further divergence, as where splines do not resolve a core.
     trend : (torch.Tensor, torch.Tensor) of no dimension, optional
@@ -99,7 +100,7 @@ class Prior(NamedTuple):
         """Of every kind, (kinds, *mesh.shape)."""
         if self.divergence is None:
             return self.local
-        return torch.cat([self.local, self._divergent()[None]])
+        return torch.cat([self.local, self._divergent(self.divergence)[None]])
 
     @property
     def motions(self) -> list[tuple[int, Motion]]:
@@ -114,13 +115,12 @@ class Prior(NamedTuple):
         """Motions of flows (..., components, knots) on the mesh: (..., motions, *mesh.shape)."""
         slopes = self.mesh.slopes(coefficients)
         component = -1 - self.mesh.dims
-        return torch.stack(
-            [
-                sum(scale * slopes[b].select(component, a) for a, b, scale in motion)
-                for _, motion in self.motions
-            ],
-            component,
-        )
+
+        def rate(motion: Motion) -> torch.Tensor:
+            terms = (scale * slopes[b].select(component, a) for a, b, scale in motion)
+            return reduce(torch.add, terms)
+
+        return torch.stack([rate(motion) for _, motion in self.motions], component)
 
     def rates_transposed(self, values: torch.Tensor) -> torch.Tensor:
         """The transpose of `rates`: (..., motions, *mesh.shape) to coefficients."""
@@ -137,10 +137,10 @@ class Prior(NamedTuple):
     def by_kind(self, squares: torch.Tensor) -> torch.Tensor:
         """(..., motions, *mesh.shape) summed to (..., kinds, *mesh.shape)."""
         component = -1 - self.mesh.dims
-        parts: list = [0.0] * len(KINDS[self.mesh.dims])
+        parts: list[torch.Tensor | float] = [0.0] * len(KINDS[self.mesh.dims])
         for (kind, _), square in zip(self.motions, squares.unbind(component), strict=True):
             parts[kind] = parts[kind] + square
-        return torch.stack(parts, component)
+        return torch.stack([torch.as_tensor(part) for part in parts], component)
 
     @property
     def weights(self) -> torch.Tensor:
@@ -153,7 +153,7 @@ class Prior(NamedTuple):
         informed: torch.Tensor,
         energy: torch.Tensor,
         settings: VariationalSettings,
-        trusted: bool = False,
+        noise_known: bool = False,
     ) -> "Prior":
         """The prior after a step toward largest evidence (MacKay's fixed point).
 
@@ -162,18 +162,20 @@ class Prior(NamedTuple):
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
             Variance of each kind of motion removed by the images, and its square in the flow.
         settings : VariationalSettings
-        trusted : bool
+        noise_known : bool
             Whether the noise is known, so that the largest evidence itself is wanted: steps are
             then those of the secant. Where the noise is that of the misfit, what the flow absorbs
             is missing in it, and the strength would grow too far.
         """
         count = len(self.local)
-        most = settings.largest_change_trusted if trusted else settings.largest_change
-        means = (self.smooth(self.local * part[:count]) for part in (informed, energy))
-        trend = self.local.log(), bounded(*means, most).log()
-        change = _secant(trend, self.trend if trusted else None, math.log(most)).exp()
+        most = settings.largest_change_trusted if noise_known else settings.largest_change
+        removed, found = (self.smooth(self.local * part[:count]) for part in (informed, energy))
+        trend = self.local.log(), bounded(removed, found, most).log()
+        change = _secant(trend, self.trend if noise_known else None, math.log(most)).exp()
         local = (self.local * change).clamp(max=_cells(self.mesh) / _LEAST**2)
-        divergence = self.divergence and self._divergence(informed[-1], energy[-1], settings)
+        divergence = self.divergence
+        if divergence is not None:
+            divergence = self._updated(divergence, informed[-1], energy[-1], settings)
         return self._replace(local=local, divergence=divergence, trend=trend)
 
     def to(self, like: torch.Tensor) -> "Prior":
@@ -198,18 +200,26 @@ class Prior(NamedTuple):
         wider = self._replace(width=_EVENED * self.width)
         return self._replace(local=1 / wider.smooth(1 / self.local))
 
-    def _divergent(self) -> torch.Tensor:
+    def _divergent(self, parts: Divergence) -> torch.Tensor:
         """Strength of all divergence in a plane: its variances add."""
-        return 1 / (1 / self.divergence.strength + 1 / (self.divergence.ratio * self.local[0]))
+        return 1 / (1 / parts.strength + 1 / (parts.ratio * self.local[0]))
 
-    def _divergence(
-        self, informed: torch.Tensor, energy: torch.Tensor, settings: VariationalSettings
+    def _updated(
+        self,
+        before: Divergence,
+        informed: torch.Tensor,
+        energy: torch.Tensor,
+        settings: VariationalSettings,
     ) -> Divergence:
-        before, all_of_it = self.divergence, self._divergent()
+        all_of_it = self._divergent(before)
         fraction = all_of_it / before.strength
         largest = settings.largest_change_divergence
         everywhere, beside = (
-            float(bounded(*((part * all_of_it * f).mean() for f in (informed, energy)), most))
+            float(
+                bounded(
+                    (part * all_of_it * informed).mean(), (part * all_of_it * energy).mean(), most
+                )
+            )
             for part, most in ((fraction, largest), (1 - fraction, settings.largest_change))
         )
         trend = torch.tensor(before.strength).log(), torch.tensor(everywhere).log()

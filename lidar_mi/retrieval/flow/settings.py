@@ -99,7 +99,7 @@ class VariationalSettings:
     noise_round : int
         Round of the last level before which noise is estimated from the misfit.
     rounds_changed : int
-        Further rounds of the last level if structure moves through the plane (`change`), after a
+        Further rounds of the last level if structure moves out of the plane (`change`), after a
         second estimate of the noise: the first flow absorbed part of the misfit.
     rounds_finer : int
         Further rounds of the last level if the misfit takes the place of a noise that was not

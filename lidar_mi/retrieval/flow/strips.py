@@ -150,9 +150,9 @@ def solved(
     coefficients: torch.Tensor,
     prior: Prior,
     settings: VariationalSettings,
-    turn: int,
+    iteration: int,
 ) -> Posterior:
-    """One Gauss-Newton step; `turn` is for `iterative` only.
+    """One Gauss-Newton step; `iteration` is for `iterative` only.
 
     By conjugate gradients. The preconditioner is the sum of the strips' inverses, each with the
     flow beyond it held (additive Schwarz method; Toselli & Widlund 2005, Domain Decomposition
@@ -217,8 +217,9 @@ def _before(mesh: Mesh, prior: Prior, settings: VariationalSettings) -> torch.Te
         means.append(member / member.sum(1, keepdim=True))
     local = 1 / separable(1 / prior.local, means)
     form = prior_form(prior._replace(local=local, mesh=coarse))
-    knots, fine = ([axis.knots for axis in m] for m in (axes, mesh.axes))
-    with_diagonal(form, settings.ridge * fine[0] * fine[1] / (knots[0] * knots[1]))
+    rows, columns = (axis.knots for axis in axes)
+    fine_rows, fine_columns = (axis.knots for axis in mesh.axes)
+    with_diagonal(form, settings.ridge * fine_rows * fine_columns / (rows * columns))
     with_diagonal(form, rounding(form))
-    band = Band(*knots)
+    band = Band(rows, columns)
     return spread(band.covariance(band.factor(form)), Mesh(axes, mesh.places))

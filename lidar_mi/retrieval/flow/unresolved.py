@@ -41,10 +41,10 @@ def unresolved_variance(
         Spacing of the knots of its splines, px; variances are averaged over a Gaussian of 0.8 of
         it. Wider, what splines leave in vortex cores is stated all around them.
     known : torch.Tensor of bool, shape (...), optional
-        Pixels whose flow the images tell: beside them it is what the prior makes of noise. Left
-        out: all.
+        Pixels whose flow the images determine: next to them it is what the prior makes of noise.
+        Left out: all.
     of_noise : torch.Tensor, shape (number, ...), optional
-        Components of flows that nothing but the images' noise makes, see `made_by_noise`. The mean
+        Components of flows that nothing but the images' noise makes, see `flows_of_noise`. The mean
         variance of their octaves is no motion. Left out: none is.
 
     Returns
@@ -67,7 +67,7 @@ def unresolved_variance(
     return fine * ratio * (1 - ratio ** math.log2(max(knots, 1.0))) / (1 - ratio)
 
 
-def made_by_noise(
+def flows_of_noise(
     linear: Linear, mesh: Mesh, response: Callable[[torch.Tensor], torch.Tensor], number: int = 4
 ) -> torch.Tensor:
     """Flows at the pixels that the noise of the images alone makes; seeded.
@@ -88,8 +88,10 @@ def made_by_noise(
         px in dt.
     """
     root = linear.information.sqrt()
-    told = (mesh.transposed(root * draw * linear.damped) for draw in normal_fields(root, number, 3))
-    return torch.cat([mesh.field(response(gradient).to(root)) for gradient in told])
+    gradients = (
+        mesh.transposed(root * draw * linear.damped) for draw in normal_fields(root, number, 3)
+    )
+    return torch.cat([mesh.field(response(gradient).to(root)) for gradient in gradients])
 
 
 def _octaves(flow: torch.Tensor, knots: float, known: torch.Tensor) -> torch.Tensor:

@@ -13,14 +13,14 @@ from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.flow import direct, iterative, strips
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.flow.change import mean_square_strain
-from lidar_mi.retrieval.flow.coherent_change import what_is_left
+from lidar_mi.retrieval.flow.coherent_change import residual_operator
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import linearised, prepared
 from lidar_mi.retrieval.flow.misfit import with_local_noise
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
-from lidar_mi.retrieval.flow.prior import first_prior, refined
+from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
-from lidar_mi.retrieval.flow.unresolved import made_by_noise, unresolved_variance, with_unresolved
+from lidar_mi.retrieval.flow.unresolved import flows_of_noise, unresolved_variance, with_unresolved
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import SMALL, Flag, check_between, no_skill
 from lidar_mi.retrieval.images.windows import Windows, image_pair, working
@@ -140,64 +140,68 @@ def variational_and_flow(
     images that do not determine the flow.
     """
     check_between("min_correlation", min_correlation, -1, 1)
-    for other in stack[1:]:
-        image_pair(stack[0], other, (2, 3))
+    for image in stack[1:]:
+        image_pair(stack[0], image, (2, 3))
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
-    given, trusted = images.weight, images.given and windows.dims == 2
+    given_weight = images.weight
+    noise_known = images.noise_known and windows.dims == 2
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
-    last, prior, displaced_only, posterior = len(settings.knots) - 1, None, flow, None
-    width = settings.misfit_width_trusted if trusted else settings.misfit_width
+    last, displaced_only = len(settings.knots) - 1, flow
+    prior: Prior | None = None
+    posterior: direct.Posterior | strips.Posterior | iterative.Posterior | None = None
+    width = settings.misfit_width_trusted if noise_known else settings.misfit_width
     width *= windows.template
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
-        apart = max(2.0, knots * windows.template)
-        axes = [Axis(n, apart) for n in windows.shape]
+        separation = max(2.0, knots * windows.template)
+        axes = [Axis(n, separation) for n in windows.shape]
         mesh, single = Mesh(axes, pixels), Mesh(axes, [place.float() for place in pixels])
         solve = _solver(axes, settings)
         coefficients = mesh.fitted(flow)
         if prior is None:
             unit = (1.0,) * windows.dims
-            wide = settings.prior_width_trusted if trusted else settings.prior_width
+            wide = settings.prior_width_trusted if noise_known else settings.prior_width
             wide *= windows.template
             prior = first_prior(axes, working(coefficients), wide, spacing or unit, settings)
         else:
             prior = refined(prior, axes)
-        rough, turn = images.single(), 0
-        while turn < rounds + settings.rounds_changed * (images.through > 0):
-            if level == last and turn in (settings.noise_round, rounds):
+        in_single, iteration = images.single(), 0
+        while iteration < rounds + settings.rounds_changed * (images.out_of_plane > 0):
+            if level == last and iteration in (settings.noise_round, rounds):
                 linear = linearised(images, mesh, coefficients, settings)
-                displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
-                left, strain = None, 0.0
-                if windows.dims == 2 and posterior is not None:
-                    left = what_is_left(linear, mesh, posterior.response)
+                displaced_only = displaced_only if iteration == rounds else mesh.field(coefficients)
+                residual_of, strain = None, 0.0
+                if isinstance(posterior, direct.Posterior | strips.Posterior):
+                    residual_of = residual_operator(linear, mesh, posterior.response)
                     strain = mean_square_strain(mesh.slopes(coefficients))
                 white = images.white
                 images = with_local_noise(
-                    images, linear, width, settings.coloured, apart, strain, left
+                    images, linear, width, settings.coloured, separation, strain, residual_of
                 )
                 # flow and prior so far are those of a noise that was far too large
-                if turn == settings.noise_round and images.white < white:
+                if iteration == settings.noise_round and images.white < white:
                     rounds += settings.rounds_finer
-                rough = images.single()
-            linear = linearised(rough, single, coefficients.float(), settings)
-            posterior = solve(linear, single, coefficients, prior, settings, turn)
+                in_single = images.single()
+            linear = linearised(in_single, single, coefficients.float(), settings)
+            posterior = solve(linear, single, coefficients, prior, settings, iteration)
             coefficients = posterior.coefficients.to(like)
             # the first flow on coarse knots is too far off to estimate the prior from
-            if turn or level:
-                prior = prior.updated(*posterior.evidence(), settings, trusted)
-            turn += 1
+            if iteration or level:
+                prior = prior.updated(*posterior.evidence(), settings, noise_known)
+            iteration += 1
         flow = mesh.field(coefficients)
+    assert prior is not None  # settings have a level at least
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
     evened = posterior
-    if trusted:
+    if noise_known:
         evened = solve(linear, mesh, coefficients, prior.evened(), settings, settings.rounds[-1])
     flow = mesh.field(posterior.coefficients.to(like))
     # a flow that depends on how much is assumed to move otherwise is not in the images
-    undetermined = images.through > 0 and _differ(flow, displaced_only, 1.0)
+    undetermined = images.out_of_plane > 0 and _differ(flow, displaced_only, 1.0)
     if images.coherent and not undetermined:
         farther = images._replace(coherent=_FARTHER**2 * images.coherent)
         there = linearised(farther, mesh, posterior.coefficients.to(like), settings)
@@ -213,30 +217,34 @@ def variational_and_flow(
     known = interpolated(known.to(like), centres, pixels) > 0.5
     # where the noise is not given, little is known of what it makes; in strips and in volumes a
     # draw takes as long as a step to the flow, and changes errors by 1 %
-    drawn = trusted and isinstance(posterior, direct.Posterior)
-    of_noise = made_by_noise(linear, mesh, posterior.response) if drawn else None
-    finer = unresolved_variance(flow, apart, known, of_noise)
+    of_noise = None
+    if noise_known and isinstance(posterior, direct.Posterior):
+        of_noise = flows_of_noise(linear, mesh, posterior.response)
+    finer = unresolved_variance(flow, separation, known, of_noise)
     finer = interpolated(finer, pixels, centres)
     # neither what the splines do not resolve nor the prior's strength is in the posterior
     off = at_centres.field((evened.coefficients - posterior.coefficients).to(like))
-    besides = with_unresolved(_beyond_chance(off.to(covariance), covariance), finer)
-    found = found._replace(covariance=covariance + besides)
+    additional = with_unresolved(_beyond_chance(off.to(covariance), covariance), finer)
+    covariance = covariance + additional
+    found = found._replace(covariance=covariance)
     if windows.dims > 2:
         return found, None
-    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
+    found = found._replace(flag=found.flag | unskilled(found.d, covariance))
     if undetermined:
         found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
     if undetermined or not (keep and isinstance(posterior, direct.Posterior)):
         return found, None
-    return found, flow_of(posterior, linear, images, given, before, besides, windows, settings)
+    return found, flow_of(
+        posterior, linear, images, given_weight, before, additional, windows, settings
+    )
 
 
 def _beyond_chance(off: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """Covariance of a flow's change (components, ...) where it is more than noise makes of it."""
     square = off.square().sum(0)
     chance = _CHANCE * covariance.diagonal().sum(-1)
-    share = _COUNTS * ((square - chance) / square.clamp(min=1e-30)).clamp(min=0.0)
-    return share * off[:, None] * off
+    excess = _COUNTS * ((square - chance) / square.clamp(min=1e-30)).clamp(min=0.0)
+    return excess * off[:, None] * off
 
 
 def _differ(flow: torch.Tensor, other: torch.Tensor, fraction: float) -> bool:

@@ -126,7 +126,9 @@ def best_filter(
     tiny = torch.finfo(density.dtype).tiny
     response = texture / (texture + floor / 2 + tiny)
     # as if all noise were white and of this variance
-    level = floor if mismatch is None else torch.as_tensor(noise**2).to(floor)
+    level = floor
+    if mismatch is not None and noise is not None:
+        level = torch.as_tensor(noise**2).to(floor)
     if blur:
         sharper = torch.exp((blur * wavenumbers(response, shape)).square() / 2).clamp(
             max=settings.sharpening
@@ -242,12 +244,16 @@ def shells(frequency: Sequence[torch.Tensor], shape: Sequence[int]) -> torch.Ten
 
 
 @lru_cache(maxsize=8)
-def _radii(sizes, shape, dtype, device) -> tuple[torch.Tensor, torch.Tensor]:
+def _radii(
+    sizes: tuple[int, ...], shape: Sequence[int], dtype: torch.dtype, device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
     frequency = frequencies(sizes, torch.empty(0, dtype=dtype, device=device))
     return _radius(frequency), shells(frequency, shape)
 
 
-def radii(sizes, shape, dtype, device) -> tuple[torch.Tensor, torch.Tensor]:
+def radii(
+    sizes: tuple[int, ...], shape: Sequence[int], dtype: torch.dtype, device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Frequency of each wave of a real Fourier transform, cycles per px, and its shell.
 
     They depend on the grid alone: those of images are kept for the next images.

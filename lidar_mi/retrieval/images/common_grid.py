@@ -216,7 +216,7 @@ def _axis(image: xr.DataArray, name: str) -> tuple[str, np.ndarray]:
         raise InputError(f"image.{name}: {coordinate.ndim} dims; one or two are allowed")
     if values.size < 2 or not np.all(np.diff(values) > 0):
         raise InputError(f"image.{name}: not at least two finite, ascending values")
-    return dim, values
+    return str(dim), values
 
 
 def _within(nodes: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -72,18 +72,18 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
     InputError
         Places that are not finite, or fewer than three.
     """
-    places = [scan[f"{axis}_reported"].transpose("z", "y").values.astype(float) for axis in "zy"]
-    nodes = np.meshgrid(*(scan[axis].values.astype(float) for axis in "zy"), indexing="ij")
     steps = [float(np.ptp(scan[axis].values)) / max(scan.sizes[axis] - 1, 1) for axis in "zy"]
-    for axis, values in zip("zy", places, strict=True):
+    reported = [scan[f"{axis}_reported"].transpose("z", "y").values.astype(float) for axis in "zy"]
+    for axis, values in zip("zy", reported, strict=True):
         if not np.isfinite(values).all():
             raise InputError(
                 f"{axis}_reported: {int((~np.isfinite(values)).sum())} beams are not finite; "
                 "expected a place in m for every beam"
             )
+    own = np.meshgrid(*(scan[axis].values.astype(float) for axis in "zy"), indexing="ij")
     places, nodes = (
         np.stack([part.ravel() / (step or 1.0) for part, step in zip(both, steps, strict=True)], -1)
-        for both in (places, nodes)
+        for both in (reported, own)
     )
     rest = scan.drop_vars(["y_reported", "z_reported"])
     off = np.abs(places - nodes).max(1) > _ON_NODE
@@ -99,7 +99,7 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
         rest[f"{name}_resampling_std"] = _resampling_error(
             rest, name, places, nodes, changed, weights
         )
-    for name in [name for name in rest.data_vars if {"z", "y"} <= set(rest[name].dims)]:
+    for name in [str(n) for n in rest.data_vars if {"z", "y"} <= set(rest[n].dims)]:
         field = rest[name].transpose(..., "z", "y")
         values = field.values.reshape(-1, len(nodes))
         found = values.astype(values.dtype if values.dtype.kind == "f" else float)

@@ -40,7 +40,7 @@ def inpainted(values: np.ndarray) -> np.ndarray:
     for axis in range(values.ndim):
         along, known = np.moveaxis(number, axis, 0), np.moveaxis(found, axis, 0)
         for stencil in (np.array([1.0, -2.0, 1.0]), np.sqrt(_TENSION) * np.array([-1.0, 1.0])):
-            length = along.shape[0] - len(stencil) + 1
+            length = len(along) - len(stencil) + 1
             if length < 1:
                 continue
             parts = [along[k : k + length] for k in range(len(stencil))]

@@ -14,15 +14,15 @@ def normalised(images: Sequence[torch.Tensor]) -> torch.Tensor:
     Non-finite pixels are NaN.
     """
     finite = torch.stack([torch.isfinite(image) for image in images])
-    images = [stored(filled(image)) for image in images]
-    images = torch.stack([image - image.mean() for image in images])
-    dims = tuple(range(1, images.ndim))
-    contrast = images.square().mean(dims, keepdim=True).sqrt()
-    images = images * torch.where(contrast > 0, contrast[:1] / contrast, 1.0)
-    return torch.where(finite, images, torch.nan)
+    known = [stored(filled(image)) for image in images]
+    centred = torch.stack([image - image.mean() for image in known])
+    dims = tuple(range(1, centred.ndim))
+    contrast = centred.square().mean(dims, keepdim=True).sqrt()
+    scaled = centred * torch.where(contrast > 0, contrast[:1] / contrast, 1.0)
+    return torch.where(finite, scaled, torch.nan)
 
 
-def of_one_brightness(
+def normalised_intensity(
     value: torch.Tensor, weight: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Warped images (images, ...) with one mean and contrast, and the factor of each.

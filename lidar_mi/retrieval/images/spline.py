@@ -97,13 +97,17 @@ class Spline(NamedTuple):
         -------
         value, *slopes : torch.Tensor, shape (images, ...)
         """
-        read = _read_images if len(place) == 2 else _read_volumes
-        value, *slopes = read(self.coefficients, *self._in_nodes(place))
+        at = self._in_nodes(place)
+        if len(at) == 2:
+            value, *slopes = _read_images(self.coefficients, at[0], at[1])
+        else:
+            value, *slopes = _read_volumes(self.coefficients, *at)
         return value, *(self.settings.nodes * slope for slope in slopes)
 
     def values(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         """The first of `sample` alone, of images."""
-        (value,) = _read_images(self.coefficients, *self._in_nodes((z, y)), slopes=False)
+        row, column = self._in_nodes((z, y))
+        (value,) = _read_images(self.coefficients, row, column, slopes=False)
         return value
 
     def _in_nodes(self, place: Sequence[torch.Tensor]) -> list[torch.Tensor]:
@@ -151,7 +155,7 @@ def _read_images(
     return total
 
 
-def _read_volumes(coefficients: torch.Tensor, *place: torch.Tensor):
+def _read_volumes(coefficients: torch.Tensor, *place: torch.Tensor) -> torch.Tensor:
     """Values and slopes, per node, at places counted in nodes: three dimensions, by tiles."""
     found = place[0].new_empty(4, *place[0].shape)
     for number, volume in enumerate(coefficients[: len(place[0])]):
@@ -194,7 +198,7 @@ def _read_volume(volume: torch.Tensor, *at: torch.Tensor) -> torch.Tensor:
     return total
 
 
-def nearest(mask: torch.Tensor, place: Sequence[torch.Tensor]) -> torch.Tensor:
+def nearest(mask: torch.Tensor, place: torch.Tensor | Sequence[torch.Tensor]) -> torch.Tensor:
     """A mask (images, ...) at the pixels nearest to places (images, ...)."""
     if bool(mask.all()):
         return torch.ones_like(place[0], dtype=torch.bool)
@@ -217,7 +221,7 @@ def _value_weights(t: torch.Tensor) -> tuple[list[torch.Tensor]]:
 
 
 def band_limited(
-    images: Sequence[torch.Tensor],
+    images: torch.Tensor | Sequence[torch.Tensor],
     noise: float | None = None,
     mismatch: torch.Tensor | None = None,
     weight: torch.Tensor | None = None,
@@ -264,7 +268,7 @@ def band_limited(
 
 
 def filter_of(
-    images: Sequence[torch.Tensor],
+    images: torch.Tensor | Sequence[torch.Tensor],
     noise: float | None = None,
     mismatch: torch.Tensor | None = None,
     weight: torch.Tensor | None = None,
@@ -278,7 +282,9 @@ def filter_of(
 
 
 def spectrum_of(
-    images: Sequence[torch.Tensor], weight: torch.Tensor | None, settings: FilterSettings
+    images: torch.Tensor | Sequence[torch.Tensor],
+    weight: torch.Tensor | None,
+    settings: FilterSettings,
 ) -> PowerSpectrum:
     """The power spectrum of images that `band_limited` filters."""
     known = torch.stack([torch.isfinite(image) for image in images])
@@ -292,7 +298,7 @@ def spectrum_of(
     return found._replace(density=torch.minimum(found.density, other.density))
 
 
-def _finite(images: Sequence[torch.Tensor]) -> torch.Tensor:
+def _finite(images: torch.Tensor | Sequence[torch.Tensor]) -> torch.Tensor:
     """Images (images, ...) as they are stored, with smooth values where they are not finite."""
     return torch.stack([stored(filled_in(image)) for image in images])
 
@@ -339,7 +345,9 @@ def filtered_splines(
 
 
 @lru_cache(maxsize=4)
-def _through_nodes(sizes, finer: int, dtype, device) -> torch.Tensor:
+def _through_nodes(
+    sizes: tuple[int, ...], finer: int, dtype: torch.dtype, device: torch.device
+) -> torch.Tensor:
     """Coefficients over values of a spline through nodes, `finer` of them a pixel, by its waves."""
     factor = torch.ones((), dtype=dtype, device=device)
     for axis in frequencies(sizes, factor):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import torch
@@ -143,11 +143,11 @@ class Windows:
                     slice(top, min(top + height, rows)),
                     slice(left, min(left + width, columns)),
                 )
-                pixels = tuple(
-                    slice(s.start * self.stride, (s.stop - 1) * self.stride + self.search)
-                    for s in vectors
-                )
-                yield Tile(vectors, pixels)
+                yield Tile(vectors, (self._seen(vectors[0]), self._seen(vectors[1])))
+
+    def _seen(self, vectors: slice) -> slice:
+        """Pixels along an axis in the search regions of some windows of an image."""
+        return slice(vectors.start * self.stride, (vectors.stop - 1) * self.stride + self.search)
 
     def of_templates(self, pixels: torch.Tensor) -> torch.Tensor:
         """Mean of an image over every template, shape (..., *count)."""
@@ -182,16 +182,16 @@ def box_sum(values: torch.Tensor, size: int, axis: int) -> torch.Tensor:
     running sum its rounding error does not grow along the image and a NaN stays in its windows.
     """
     length = values.shape[axis] - size + 1
-    total, offset, width = None, 0, 1
+    parts: list[torch.Tensor] = []
+    offset, width = 0, 1
     while True:
         if size & width:
-            part = values.narrow(axis, offset, length)
-            total = part if total is None else total + part
+            parts.append(values.narrow(axis, offset, length))
             offset += width
         if 2 * width > size:
-            return total
-        kept = values.shape[axis] - width
-        values = values.narrow(axis, 0, kept) + values.narrow(axis, width, kept)
+            return reduce(torch.add, parts)
+        whole = values.shape[axis] - width
+        values = values.narrow(axis, 0, whole) + values.narrow(axis, width, whole)
         width *= 2
 
 
@@ -241,10 +241,12 @@ def averaged(field: torch.Tensor, known: torch.Tensor, width: float) -> torch.Te
 def _gaussian_sums(fields: torch.Tensor, width: float) -> torch.Tensor:
     """Sums of fields (n, ...) about each pixel, weighted by a Gaussian up to three widths."""
     reach = math.ceil(3 * width)
-    kind = {"dtype": fields.dtype, "device": fields.device}
+    dtype, device = fields.dtype, fields.device
     if max(fields.shape[1:]) <= _WHOLE:
-        return separable(fields, [_gaussians(n, width, reach, **kind) for n in fields.shape[1:]])
-    gaussian = torch.exp(-(torch.arange(-reach, reach + 1, **kind) / width).square() / 2)
+        along = [_gaussians(n, width, reach, dtype, device) for n in fields.shape[1:]]
+        return separable(fields, along)
+    place = torch.arange(-reach, reach + 1, dtype=dtype, device=device)
+    gaussian = torch.exp(-(place / width).square() / 2)
     for axis in range(1, fields.ndim):
         rim = [0, 0] * (fields.ndim - 1 - axis) + [reach, reach]
         fields = window_sums(pad(fields, rim), [gaussian], 1, axis)[0]
@@ -252,7 +254,9 @@ def _gaussian_sums(fields: torch.Tensor, width: float) -> torch.Tensor:
 
 
 @lru_cache(maxsize=16)
-def _gaussians(n: int, width: float, reach: int, dtype, device) -> torch.Tensor:
+def _gaussians(
+    n: int, width: float, reach: int, dtype: torch.dtype, device: torch.device
+) -> torch.Tensor:
     """Weights (n, n) of the pixels along an axis about each of them."""
     place = torch.arange(n, dtype=dtype, device=device)
     apart = place[:, None] - place

@@ -153,7 +153,7 @@ def fit_vortices(
     pixels = [on_device(image, device) for image in stack]
     with threads_for(image1.size):
         if min(image1.shape) >= Windows.search:
-            pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).left_out(pixels)
+            pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).masked(pixels)
         first, second = pixels
         return fit_pixels(first, second, taken, start)
 

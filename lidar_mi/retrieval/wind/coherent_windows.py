@@ -13,7 +13,7 @@ from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.flow.coherent_change import (
     SMOOTH,
-    Left,
+    ResidualOperator,
     mean_square_displacement,
     square_left,
 )
@@ -81,7 +81,7 @@ def coherent_change(
     return alike * square * along[:, None] * along, remains
 
 
-def left_by_windows(linear: Linear, windows: Windows) -> Left:
+def left_by_windows(linear: Linear, windows: Windows) -> ResidualOperator:
     """What displacements of windows leave of a difference of the images, to first order."""
     slope = working(linear.slope) * linear.valid
 

@@ -35,7 +35,7 @@ class Method:
         Retrievals of a known motion that the standard errors are from (`bootstrap`). 0: the method
         states its errors by itself.
     name : str
-        Of a method that is not one of `METHODS`.
+        As data sets have it.
     """
 
     find: Callable[..., Displacement]
@@ -47,6 +47,11 @@ class Method:
     repeats: int = 0
     name: str = ""
 
+    @property
+    def timed(self) -> bool:
+        """Whether the method takes the times of pixels and gives displacements in dt."""
+        return "times" in self.options
+
 
 METHODS: Mapping[str, Method] = {
     "cc": Method(
@@ -54,11 +59,13 @@ METHODS: Mapping[str, Method] = {
         ("correlation", "normalised cross-correlation at the peak"),
         ("min_correlation",),
         repeats=2,
+        name="cc",
     ),
     "ws": Method(
         weight_shift,
         ("mismatch", "misfit of weight and centre of mass over their spread"),
         repeats=2,
+        name="ws",
     ),
     "multipass": Method(
         multipass,
@@ -67,6 +74,7 @@ METHODS: Mapping[str, Method] = {
         centred=True,
         reach=2,
         repeats=1,
+        name="multipass",
     ),
     "variational": Method(
         variational,
@@ -75,6 +83,7 @@ METHODS: Mapping[str, Method] = {
         centred=True,
         local=False,
         reach=2,
+        name="variational",
     ),
     "vortex_fit": Method(
         vortex_windows,
@@ -83,6 +92,7 @@ METHODS: Mapping[str, Method] = {
         centred=True,
         local=False,
         reach=0,
+        name="vortex_fit",
     ),
 }
 """Methods by name."""

@@ -12,12 +12,14 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import positive
 from lidar_mi.retrieval.images.common_grid import all_on_one_grid
 from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 _PER_PAIR = "identical_images", "fixed_pattern", "illumination"
 """Attributes of a wind that are remarks on its images."""
 
 
+@with_old_keywords
 @checked_arguments
 def retrieve_winds(
     images: Sequence[xr.DataArray],
@@ -26,7 +28,7 @@ def retrieve_winds(
     *,
     noise: float | Sequence[float | xr.DataArray | None] | None = None,
     beam_times: Sequence[xr.DataArray] | None = None,
-    notice: Callable | None = None,
+    notice: Callable[[str, float], object] | None = None,
     **options: Any,
 ) -> xr.Dataset:
     """Wind in the image plane from each pair of a sequence of images.
@@ -47,8 +49,8 @@ def retrieve_winds(
     notice : callable, optional
         Called with a text and the fraction done (0 to 1) before each pair.
     **options
-        Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``template``,
-        ``stride`` and so on.
+        Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``windows``,
+        ``validation`` and so on.
 
     Returns
     -------
@@ -89,7 +91,9 @@ def retrieve_winds(
         raise InputError(
             f"beam_times: {len(beam_times)} are not allowed; expected {len(images)}, one an image"
         )
-    levels = list(noise) if isinstance(noise, list | tuple) else [noise] * len(images)
+    levels: list[float | xr.DataArray | None] = (
+        list(noise) if isinstance(noise, Sequence) else [noise] * len(images)
+    )
     if len(levels) != len(images):
         raise InputError(
             f"noise: {len(levels)} are not allowed; expected one, or {len(images)}, one an image"
@@ -156,7 +160,7 @@ def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[
 
 def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
     """Of each image from the first, s."""
-    steps = list(dt) if isinstance(dt, list | tuple) else [dt] * (count - 1)
+    steps = list(dt) if isinstance(dt, Sequence) else [dt] * (count - 1)
     if len(steps) != count - 1:
         raise InputError(
             f"dt: {len(steps)} steps are not allowed with {count} images; expected one, or "

@@ -8,7 +8,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.retrieval.checks import checked_stack, on_device
-from lidar_mi.retrieval.flow.next_flow import Awaited, Flow, awaited, next_flow
+from lidar_mi.retrieval.flow.next_flow import ExpectedFlow, Flow, expected_flow, next_flow
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational_and_flow
 from lidar_mi.retrieval.images.displacement import Displacement
@@ -18,25 +18,24 @@ from lidar_mi.retrieval.wind.methods import METHODS
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 
-def awaited_wind(
+def expected_wind(
     image1: xr.DataArray, start: Flow, noise: float | xr.DataArray | None = None
-) -> Awaited:
+) -> ExpectedFlow:
     """A start for `wind_of_slab`: the flow expected, and the first image, before the second one.
 
     `noise` is that of `retrieve_wind`.
     """
-    (image1,), noise = checked_stack([image1], noise)
-    if isinstance(noise, xr.DataArray):
-        noise = on_device(noise, "cpu")
+    (image1,), level = checked_stack([image1], noise)
+    known = on_device(level, "cpu") if isinstance(level, xr.DataArray) else level
     with threads_for(image1.size):
-        return awaited(start, on_device(image1, "cpu"), noise)
+        return expected_flow(start, on_device(image1, "cpu"), known)
 
 
 def wind_of_slab(
     image1: xr.DataArray,
     image2: xr.DataArray,
     dt: float,
-    start: Flow | Awaited | None = None,
+    start: Flow | ExpectedFlow | None = None,
     **options: Any,
 ) -> tuple[xr.Dataset, Flow | None]:
     """The wind by the method "variational", and the flow from which the next one may start.
@@ -46,8 +45,8 @@ def wind_of_slab(
     image1, image2 : DataArray, dims (z, y)
     dt : float
         s.
-    start : Flow or Awaited, optional
-        The flow expected, see `Flow.moved`, or what `awaited_wind` made of it and of image 1: the
+    start : Flow or ExpectedFlow, optional
+        The flow expected, see `Flow.moved`, or what `expected_wind` made of it and of image 1: the
         retrieval starts there, with the prior and the noise learnt before, and from scratch only
         where the images do not fit to these. They are not searched again for structure at rest,
         changes of illumination and unrelated air.
@@ -85,7 +84,7 @@ def wind_of_slab(
         )
         return found
 
-    chosen = replace(METHODS["variational"], find=find, name="variational")
+    chosen = replace(METHODS["variational"], find=find)
     wind = retrieve_wind(image1, image2, dt, chosen, checks=start is None, **options)
     if {"fixed_pattern", "illumination"} & set(wind.attrs):
         flow = None

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.images.common_grid import nearest_filled, on_one_grid
 from lidar_mi.retrieval.images.gridding import on_nodes
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 Wind = Callable[[np.ndarray], np.ndarray]
@@ -28,7 +29,7 @@ _ROUNDS = 2
 _TEMPLATE, _STRIDE = 16, 4
 
 
-def of_one_instant(
+def synchronised(
     scans: Sequence[xr.Dataset], steps: Sequence[float], image: str
 ) -> list[xr.Dataset]:
     """Scans on their nodes (`on_nodes`), each at one instant where nodes would mix times.
@@ -130,9 +131,7 @@ def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
         *pair,
         dt,
         "multipass",
-        template=template,
-        search=2 * template,
-        stride=_STRIDE,
+        windows=WindowSizes(template, 2 * template, _STRIDE),
         times=on_one_grid(*(_without_gaps(scan["beam_time"]) for scan in images)),
         standard_errors=False,
         checks=False,

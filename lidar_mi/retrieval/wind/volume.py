@@ -1,7 +1,9 @@
 """From two volumes to the wind in three dimensions: one call, CF data set out."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
+from typing import Any
 
 import torch
 import xarray as xr
@@ -17,10 +19,17 @@ from lidar_mi.retrieval.defects.rest import all_at_rest
 from lidar_mi.retrieval.defects.unrelated import unrelated
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
-from lidar_mi.retrieval.images.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, uncertain
-from lidar_mi.retrieval.images.windows import Windows, working
+from lidar_mi.retrieval.images.windows import working
+from lidar_mi.retrieval.wind.dataset import centres, dataset, field, flags, spacing, winds
+from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
+from lidar_mi.retrieval.wind.options import (
+    VALIDATION,
+    VOLUME_WINDOWS,
+    VectorValidation,
+    WindowSizes,
+)
 
 AXES = ("x", "z", "y")
 
@@ -31,21 +40,20 @@ METHODS: Mapping[str, Callable[..., Displacement]] = {
 """Methods by name."""
 
 
+@with_old_keywords
 @checked_arguments
 def retrieve_wind_volume(
     volume1: xr.DataArray,
     volume2: xr.DataArray,
     dt: float,
     method: str = "variational",
-    template: int = 8,
-    search: int = 16,
-    stride: int = 4,
-    device: str | torch.device = "cpu",
     *,
-    more: Sequence[xr.DataArray] = (),
-    min_correlation: float = 0.5,
+    windows: WindowSizes = VOLUME_WINDOWS,
+    validation: VectorValidation = VALIDATION,
     noise: float | xr.DataArray | None = None,
+    more: Sequence[xr.DataArray] = (),
     settings: MultipassSettings | VariationalSettings | None = None,
+    device: str | torch.device = "cpu",
 ) -> xr.Dataset:
     """Wind in three dimensions from two volumes of the same air, dt apart.
 
@@ -60,20 +68,20 @@ def retrieve_wind_volume(
     method : {"correlation", "variational"}
         Correlation of deformed windows (`multipass.multipass`), or a smooth flow fitted to the
         volumes as a whole (`variational.variational`).
-    template, search, stride : int
-        Voxels: windows of template^3 (>= 4), displacements up to (search - template) / 2 in each
+    windows : WindowSizes
+        Voxels: windows of template^3, displacements up to (search - template) / 2 in each
         direction, a vector every `stride`.
-    device : str or torch.device
-        Where to compute.
+    validation : VectorValidation
+        Its least correlation is that of the volumes warped to mid-time, over a window, and its
+        median test is that of "correlation". Volumes are not tested for texture.
+    noise : float or xr.DataArray, optional
+        Standard deviation of a voxel's noise in volume 1, in its unit. Default: from the spectra.
     more : sequence of xr.DataArray
         Further volumes, each dt after the one before ("variational" only).
-    min_correlation : float
-        Flag vectors whose volumes, warped to mid-time, correlate less over a window (variational:
-        by less than half way from this to 1).
-    noise : float or xr.DataArray, optional
-        Standard deviation of a voxel's noise in volume 1, in its unit. Left out: from the spectra.
     settings : MultipassSettings or VariationalSettings, optional
-        Of "correlation" or "variational", see `settings`. Left out: the defaults of volumes.
+        Of "correlation" or "variational". Default: those of volumes.
+    device : str or torch.device
+        Where to compute.
 
     Returns
     -------
@@ -111,33 +119,44 @@ def retrieve_wind_volume(
     if more and method != "variational":
         raise InputError(f"more: {len(more)} volumes are not allowed with {method}; expected none")
     dt = positive("dt", dt)
-    check_between("min_correlation", min_correlation, -1, 1)
-    stack, noise = checked_stack([volume1, volume2, *more], noise, AXES, "volume")
-    windows = Windows(tuple(stack[0].shape), template, search, stride)
-    volumes = [on_device(volume, device) for volume in stack]
-    if isinstance(noise, xr.DataArray):
-        noise = on_device(noise, device)
-    resting, whole = all_at_rest(volumes, windows), volumes
-    volumes, noise = without_attenuation(resting.left_out(volumes), noise)
+    check_between("min_correlation", validation.min_correlation, -1, 1)
+    stack, level = checked_stack([volume1, volume2, *more], noise, AXES, "volume")
+    frame = windows.on(stack[0].shape)
+    raw = [on_device(volume, device) for volume in stack]
+    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    defects = all_at_rest(raw, frame)
+    volumes, relative = without_attenuation(defects.masked(raw), known)
     steps = spacing(stack[0])
-    options = {"min_correlation": min_correlation, "noise": noise, "settings": settings}
+    options: dict[str, Any] = {
+        "min_correlation": validation.min_correlation,
+        "noise": relative,
+        "settings": settings,
+    }
     if method == "variational":
         options |= {"more": volumes[2:], "spacing": steps}
-    find = partial(METHODS[method], template=template, search=search, **options)
-    found = find(*volumes[:2], stride=stride)
-    flag = resting.flags(found, whole, windows, True)
-    flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+    estimate = partial(METHODS[method], template=frame.template, search=frame.search, **options)
+    found = estimate(*volumes[:2], stride=frame.stride)
+    flag = defects.flags(found, raw, frame, True)
+    if found.covariance is not None:
+        flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
     if method == "correlation":
-        if enough_windows(windows):
+        if enough_windows(frame):
+            textured = flag & Flag.LOW_TEXTURE.value == 0
             covariance = bootstrap_covariance(
-                volumes, found, windows, find, True, textured=flag & Flag.LOW_TEXTURE.value == 0
+                volumes, found, frame, estimate, True, textured=textured
             )
             flag, found = flag | of_bootstrap(covariance), found._replace(covariance=covariance)
-        apart = max(1, round(template / 2 / stride))
-        outlier = median_outliers(found.d, spacing=apart, continued=True)
+        outlier = median_outliers(
+            found.d,
+            validation.median_size,
+            max(1, round(frame.template / 2 / frame.stride)),
+            validation.median_threshold,
+            validation.median_epsilon,
+            continued=True,
+        )
         flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
     # shear lowers the correlation of windows as large as a volume is thick: all windows together
-    if bool(unrelated(volumes, windows, False, noise).all()):
+    if bool(unrelated(volumes, frame, False, relative).all()):
         flag = flag | Flag.UNRELATED.value
     same = identical(stack, "volumes")
     if same:
@@ -149,15 +168,13 @@ def retrieve_wind_volume(
     variables["flag"] = flags(found, AXES)
     attributes = {
         "method": method,
-        "template": template,
-        "search": search,
-        "stride": stride,
+        **asdict(windows),
         "dt": dt,
-        "min_correlation": min_correlation,
+        "min_correlation": validation.min_correlation,
     }
     if same:
         attributes["identical_images"] = same
-    coords = centres(stack[0], windows, "window")
+    coords = centres(stack[0], frame, "window")
     return dataset(variables, coords, "Wind from two volumes", attributes, found)
 
 

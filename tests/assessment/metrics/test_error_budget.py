@@ -20,6 +20,7 @@ from lidar_mi.assessment.metrics.error_budget import (
 )
 from lidar_mi.assessment.report.error_budget import budget_chapter, limit_sentence
 from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture
 
@@ -264,7 +265,7 @@ def test_noise_alone_has_all_of_it(method):
     observed = [i + 0.1 * rng.standard_normal(i.shape) for i in sharp]
     images = images_without(observed, sharp, sharp, sharp)
     truth = flow(lambda y, z: H / DT + 0 * y, lambda y, z: -H / DT + 0 * y)
-    settings = {"dt": DT, "method": method, "stride": 2}
+    settings = {"dt": DT, "method": method, "windows": WindowSizes(stride=2)}
     found = retrieve_wind(*observed, noise=0.1, **settings)
     without = {
         cause: retrieve_wind(*pair, noise=0.0 if cause == "detector_noise" else 0.1, **settings)
@@ -289,7 +290,8 @@ def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
     rng = np.random.default_rng(29)
     noisy = [[i + 0.04 * rng.standard_normal(i.shape) for i in blurred] for _ in range(6)]
     truth = flow(lambda y, z: 0.7 * H / DT + 0 * y, lambda y, z: -0.4 * H / DT + 0 * y)
-    settings = {"dt": DT, "method": method, "stride": 4, "noise": 0.04}
+    windows = WindowSizes(stride=4)
+    settings = {"dt": DT, "method": method, "windows": windows, "noise": 0.04}
     without = {"detector_noise": retrieve_wind(*blurred, **settings | {"noise": 0.0})}
     found = [retrieve_wind(*pair, **settings) for pair in noisy]
     budgets = [error_budget(one, without, truth, [], flagged=True) for one in found]
@@ -310,14 +312,15 @@ def test_shear_within_the_window(shear):
     rng = np.random.default_rng(4)
     observed = [i + 0.02 * rng.standard_normal(i.shape) for i in sharp]
     truth = flow(lambda y, z: 5 + shear * z, lambda y, z: 0 * y, 57, 41)
-    settings = {"dt": DT, "method": "cc", "search": 24}
-    found = retrieve_wind(*observed, **settings)
+    found = retrieve_wind(*observed, DT, "cc", windows=WindowSizes(search=24))
     stiff = moved_rigidly(
         found,
         observed,
         sharp,
         truth,
-        lambda pair, stride: retrieve_wind(*pair, stride=stride, **settings),
+        lambda pair, stride: retrieve_wind(
+            *pair, DT, "cc", windows=WindowSizes(search=24, stride=stride)
+        ),
     )
     budget = error_budget(found, {"shear": stiff}, truth, [], flagged=True)
     if shear:

@@ -16,6 +16,7 @@ from lidar_mi.retrieval.images.intensity import normalised
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.methods import METHODS
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture
 from validation.coverage import CASES, measured
@@ -41,7 +42,7 @@ def test_standard_errors_in_a_uniform_wind(method):
     uncertain by 1 / sqrt(2 x 400) = 4 %, less what neighbours share; 25 % is 4 sigma of both.
     """
     for noise in (0.02, 0.08):
-        wind = retrieve_wind(*uniform(noise, 5), DT, method, stride=4)
+        wind = retrieve_wind(*uniform(noise, 5), DT, method, windows=WindowSizes(stride=4))
         valid = wind["flag"] == 0
         assert valid.mean() > 0.75
         error = np.stack([(wind["v"] - 4).where(valid), (wind["w"] + 3).where(valid)])
@@ -59,7 +60,7 @@ def test_differences_between_vectors_that_are_errors_are_not_shear():
     """
     error, stated = [], []
     for seed in (5, 6, 7):
-        wind = retrieve_wind(*uniform(0.02, seed), DT, "multipass", stride=4)
+        wind = retrieve_wind(*uniform(0.02, seed), DT, "multipass", windows=WindowSizes(stride=4))
         valid = wind["flag"] == 0
         error += [(wind["v"] - 4).where(valid), (wind["w"] + 3).where(valid)]
         stated += [wind[f"{name}_stderr"].where(valid) for name in "vw"]
@@ -120,7 +121,7 @@ def test_displacements_are_those_of_the_method(method):
     pair = uniform(0.05, 6, 60, 70)
     first, second = (torch.as_tensor(image.values) for image in pair)
     alone = METHODS[method].find(first, second, 8, 16, 2)
-    wind = retrieve_wind(*pair, DT, method, stride=2)
+    wind = retrieve_wind(*pair, DT, method, windows=WindowSizes(stride=2))
     for part, name in zip(alone.d, "zy", strict=True):
         np.testing.assert_array_equal(
             wind[f"displacement_{name}"], (part.numpy() * 0.5).astype(np.float32)
@@ -131,7 +132,7 @@ def test_vectors_whose_candidates_are_confused_are_flagged():
     """Weight shift, in a uniform wind with noise: errors of 2 to 3 m/s were called valid."""
     images = uniform(0.05, 7, 60, 70)
     raw, wind = (
-        retrieve_wind(*images, DT, "ws", stride=2, standard_errors=stated)
+        retrieve_wind(*images, DT, "ws", windows=WindowSizes(stride=2), standard_errors=stated)
         for stated in (False, True)
     )
     valid = raw["flag"] == 0
@@ -143,17 +144,19 @@ def test_vectors_whose_candidates_are_confused_are_flagged():
 @pytest.mark.parametrize(("rows", "columns"), [(16, 16), (16, 40), (24, 24)])
 def test_few_windows(method, rows, columns):
     """A vector has a standard error or a flag."""
-    wind = retrieve_wind(*uniform(0.02, 8, rows, columns), DT, method, stride=8)
+    wind = retrieve_wind(
+        *uniform(0.02, 8, rows, columns), DT, method, windows=WindowSizes(stride=8)
+    )
     assert ((wind["flag"] != 0) | (wind["v_stderr"] > 0)).all()
 
 
 def test_pixels_that_are_not_finite_take_part_in_nothing():
     """Standard errors far from a hole are those without it; near it there is no vector."""
     first, second = uniform(0.03, 9)
-    whole = retrieve_wind(first, second, DT, "cc", stride=4)
+    whole = retrieve_wind(first, second, DT, "cc", windows=WindowSizes(stride=4))
     second = second.copy()
     second[40:44, 50:54] = np.nan
-    holed = retrieve_wind(first, second, DT, "cc", stride=4)
+    holed = retrieve_wind(first, second, DT, "cc", windows=WindowSizes(stride=4))
     hole = (holed["flag"] & Flag.NON_FINITE_INPUT.value) != 0
     assert hole.any() and np.isnan(holed["v_stderr"]).where(hole, True).all()
     ratio = (holed["v_stderr"] / whole["v_stderr"]).where(holed["flag"] == 0)
@@ -291,7 +294,7 @@ def test_errors_are_not_known_where_the_motion_is_not_found_again(share, known):
 def test_smooth_smoke_has_no_standard_errors(method, second, rms):
     """Windows pass the tests of texture by chance, and were wrong by up to 2 standard errors."""
     first, second, *_ = CASES[f"{second}, texture {rms} %"](51)
-    wind = retrieve_wind(first, second, DT, method, stride=4)
+    wind = retrieve_wind(first, second, DT, method, windows=WindowSizes(stride=4))
     assert not (wind["flag"] == 0).any()
     assert ((wind["flag"] & Flag.ERROR_UNKNOWN.value) > 0).any()
 
@@ -308,7 +311,9 @@ def test_a_patch_of_texture_in_the_dark_is_not_there_by_chance(method):
         off = np.hypot(grid[0] - y.mean(), grid[1] - z.mean())
         puff = texture(waves, *grid) / (1 + np.exp((off - 12.5) / 1.0))
         images.append(data_array(puff + 0.01 * random.standard_normal(puff.shape), y, z))
-    wind = retrieve_wind(*images, DT, method, stride=4, noise=0.01, checks=False)
+    wind = retrieve_wind(
+        *images, DT, method, windows=WindowSizes(stride=4), noise=0.01, checks=False
+    )
     valid = (wind["flag"] == 0).values
     off = np.hypot(wind["y"] - y.mean(), wind["z"] - z.mean()).transpose("z", "y").values
     assert valid[off < 8].mean() > 0.8 and not valid[off > 20].any()

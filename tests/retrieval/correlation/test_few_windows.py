@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.crosswind import DT, crosswind_pair
 from tests.support.flows import axes, data_array
@@ -19,7 +20,10 @@ def normalised_errors(method, side, pairs):
         )
         grid = axes(side, side)
         wind = retrieve_wind(
-            *(data_array(i, *grid) for i in images), DT, method, stride=2 if side < 30 else 4
+            *(data_array(i, *grid) for i in images),
+            DT,
+            method,
+            windows=WindowSizes(stride=2 if side < 30 else 4),
         )
         good = (wind.flag == 0).values
         off = [

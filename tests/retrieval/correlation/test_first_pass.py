@@ -4,6 +4,7 @@ passes then correlate the wrong places."""
 import numpy as np
 import pytest
 
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.turning import displacement, turning_pair
 
@@ -27,7 +28,9 @@ def test_strong_shear_is_followed(kind, method, template, allowed):
     8 px for particles.
     """
     pair = turning_pair(kind, 1)
-    found = retrieve_wind(*pair, 1.0, method, template=template, search=2 * template, stride=4)
+    found = retrieve_wind(
+        *pair, 1.0, method, windows=WindowSizes(template=template, search=2 * template, stride=4)
+    )
     y, z = np.meshgrid(found["y"], found["z"])
     true = displacement(y, z)
     error = np.hypot(found["v"] - true[0], found["w"] - true[1]).values

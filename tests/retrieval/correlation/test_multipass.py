@@ -16,6 +16,7 @@ from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.correlation.multipass import multipass, travelled
 from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import data_array, plane_waves, texture
 
@@ -60,7 +61,9 @@ def test_standard_errors_cover_the_errors():
     """
     reduced = []
     for seed in (1, 2):
-        errors, stderr, far = wind_errors(vortex_pair_images(0.03, seed), "multipass", stride=2)
+        errors, stderr, far = wind_errors(
+            vortex_pair_images(0.03, seed), "multipass", windows=WindowSizes(stride=2)
+        )
         reduced.append((errors / stderr)[:, far].ravel())
     reduced = np.concatenate(reduced)
     assert np.std(reduced) == pytest.approx(1, abs=0.15)
@@ -192,7 +195,13 @@ def test_particle_images(method):
     axes = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
     pair = [data_array(rendered(part), *axes) for part in (-0.5, 0.5)]
     # a pixel is 1 m and dt 1 s: winds are px. Particles on black have no mean to compare with
-    wind = retrieve_wind(*pair, 1.0, method, template=12, search=24, min_texture=0.0)
+    wind = retrieve_wind(
+        *pair,
+        1.0,
+        method,
+        windows=WindowSizes(template=12, search=24),
+        validation=VectorValidation(min_texture=0.0),
+    )
     good = (wind.flag == 0).values
     assert good.mean() > 0.9
     true = 1.3 + shear * (wind["z_vector"].values - 45)

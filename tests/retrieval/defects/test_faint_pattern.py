@@ -14,6 +14,7 @@ from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
@@ -85,7 +86,13 @@ def test_correction_divides_by_the_rest():
 
 
 def retrieved(pair, method):
-    return retrieve_wind(*(data_array(i, Y, Z) for i in pair), 0.1, method, stride=3, noise=NOISE)
+    return retrieve_wind(
+        *(data_array(i, Y, Z) for i in pair),
+        0.1,
+        method,
+        windows=WindowSizes(stride=3),
+        noise=NOISE,
+    )
 
 
 def test_standard_errors_hold_with_a_pattern():

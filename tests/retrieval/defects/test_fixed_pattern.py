@@ -15,6 +15,7 @@ from lidar_mi.retrieval.defects.fixed_pattern import fixed_pattern
 from lidar_mi.retrieval.defects.rest import all_at_rest
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.crosswind import DT, crosswind_pair
 from tests.support.flows import axes, data_array
@@ -45,7 +46,9 @@ def pattern(images):
 def retrieved(images, method):
     """Weight shift without standard errors, which flag nearly all of its vectors."""
     images = (data_array(i, *axes(COLUMNS, ROWS)) for i in images)
-    return retrieve_wind(*images, DT, method, stride=3, standard_errors=method != "ws")
+    return retrieve_wind(
+        *images, DT, method, windows=WindowSizes(stride=3), standard_errors=method != "ws"
+    )
 
 
 def errors(wind, v):
@@ -202,6 +205,8 @@ def test_images_of_counts_and_holes():
     found = pattern(images)
     assert found.columns > 0.03 and not found.rows
     y, z = axes(COLUMNS, ROWS)
-    wind = retrieve_wind(*(data_array(i, y, z) for i in images), DT, "multipass", stride=4)
+    wind = retrieve_wind(
+        *(data_array(i, y, z) for i in images), DT, "multipass", windows=WindowSizes(stride=4)
+    )
     hidden = (wind.flag & Flag.NON_FINITE_INPUT.value) > 0
     assert isinstance(wind, xr.Dataset) and bool(hidden.any()) and not bool(hidden.all())

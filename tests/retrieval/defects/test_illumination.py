@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from lidar_mi.retrieval.defects.illumination import described, illumination
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.crosswind import DT, crosswind_pair
 from tests.support.flows import axes, data_array
@@ -73,7 +74,7 @@ def test_winds_are_as_if_lit_evenly():
 
     def wind(second):
         images = (data_array(i, y, z) for i in (image1, second))
-        return retrieve_wind(*images, DT, "variational", stride=4, noise=0.01)
+        return retrieve_wind(*images, DT, "variational", windows=WindowSizes(stride=4), noise=0.01)
 
     even, uneven = wind(image2), wind(lit(image2, 0.0, 0.05))
     assert "illumination" in uneven.attrs and "illumination" not in even.attrs

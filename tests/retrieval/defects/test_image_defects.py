@@ -10,6 +10,7 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 
 from lidar_mi.retrieval.defects.rest import at_rest
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array
 from tests.support.image_defects import METHODS, SORTS, check
@@ -40,9 +41,13 @@ def test_hot_pixels_do_not_hold_the_air(counts, fraction, noise, method):
     pair = shifted_air(1)
     hot = random.random(pair[0].shape) < fraction
     images = [i + noise * random.standard_normal(i.shape) for i in pair]
-    clean = retrieve_wind(*(data_array(i, y, z) for i in images), 0.1, method, stride=3)
+    clean = retrieve_wind(
+        *(data_array(i, y, z) for i in images), 0.1, method, windows=WindowSizes(stride=3)
+    )
     images = [np.where(hot, counts, image) for image in images]
-    wind = retrieve_wind(*(data_array(i, y, z) for i in images), 0.1, method, stride=3)
+    wind = retrieve_wind(
+        *(data_array(i, y, z) for i in images), 0.1, method, windows=WindowSizes(stride=3)
+    )
     good = (wind.flag == 0).values
     assert good.mean() > 0.9
     assert "at rest" in wind.attrs["defects"]

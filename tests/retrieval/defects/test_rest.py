@@ -13,6 +13,7 @@ import xarray as xr
 from lidar_mi.retrieval.defects.rest import all_at_rest, saturated
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.crosswind import DT, crosswind_pair
@@ -32,7 +33,9 @@ def retrieved(images, method, **options):
     """Weight shift without standard errors, which flag nearly all of its vectors."""
     y, z = axes(COLUMNS, ROWS)
     stated = {"standard_errors": method != "ws"} | options
-    return retrieve_wind(*(data_array(i, y, z) for i in images), DT, method, stride=2, **stated)
+    return retrieve_wind(
+        *(data_array(i, y, z) for i in images), DT, method, windows=WindowSizes(stride=2), **stated
+    )
 
 
 def errors(wind, v):
@@ -234,7 +237,9 @@ def test_saturated_voxels():
     first, second = shifted((16, 24, 28), (0.2, 0.4, -0.6), 0.01, seed=69)
     for volume in (first, second):
         volume.values[3:12, 6:14, 4:12] = 9.0
-    wind = retrieve_wind_volume(first, second, DT, method="correlation", stride=4)
+    wind = retrieve_wind_volume(
+        first, second, DT, method="correlation", windows=WindowSizes(stride=4)
+    )
     flagged = (wind.flag & Flag.SATURATED.value) > 0
     assert bool(flagged.any()) and not bool(flagged.all())
     assert not bool(((wind.flag & Flag.NON_FINITE_INPUT.value) > 0).any())

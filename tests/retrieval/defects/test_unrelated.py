@@ -14,6 +14,7 @@ from benchmarks.cases import vortex_pair_images
 from lidar_mi.retrieval.defects.unrelated import unrelated
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.flows import axes, data_array
@@ -48,7 +49,9 @@ def test_unrelated_images_give_no_valid_vector(method, cases, repeats):
     for number, (*shape, template, search) in enumerate(cases):
         for repeat in range(repeats):
             pair = images(100 * number + repeat, *shape, noise=0.05 * (repeat % 2))
-            wind = retrieve_wind(*pair, DT, method, template, search, stride=3)
+            wind = retrieve_wind(
+                *pair, DT, method, windows=WindowSizes(template=template, search=search, stride=3)
+            )
             valid.append(float((wind.flag == 0).mean()))
     assert np.mean(valid) < 0.01
     assert binom.sf(np.count_nonzero(valid) - 1, len(valid), 1e-3) > 1e-3
@@ -78,7 +81,7 @@ def test_related_images_lose_no_vector(noise):
 def test_the_unrelated_half_of_an_image_is_flagged():
     first, other = images(31, 190, 80, 3.0)
     second = xr.where(first.y < 0, first.roll(y=2), other).transpose("z", "y")
-    wind = retrieve_wind(first, second, DT, "cc", stride=4)
+    wind = retrieve_wind(first, second, DT, "cc", windows=WindowSizes(stride=4))
     flagged = (wind.flag & Flag.UNRELATED.value) > 0
     # a region of windows reaches 24 px to both sides
     assert float((wind.flag.where(wind.y > 12, drop=True) == 0).mean()) < 0.01

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lidar_mi.retrieval.flow import direct
-from lidar_mi.retrieval.flow.coherent_change import mean_square_displacement, what_is_left
+from lidar_mi.retrieval.flow.coherent_change import mean_square_displacement, residual_operator
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.flow.likelihood import linearised, prepared
 from lidar_mi.retrieval.flow.prior import first_prior
@@ -33,7 +33,7 @@ def estimated(images, noise=None):
         posterior = direct.solved(linear, mesh, coefficients, prior, settings, 0)
         coefficients = posterior.coefficients
     linear = linearised(of_images, mesh, coefficients, settings)
-    left = what_is_left(linear, mesh, posterior.response)
+    left = residual_operator(linear, mesh, posterior.response)
     return np.sqrt(mean_square_displacement(of_images, linear, left))
 
 

@@ -99,9 +99,9 @@ def test_draws_have_the_posterior_covariance():
     nodes = prior.mesh
     units = torch.eye(posterior.coefficients.numel(), dtype=torch.float64)
     fields = nodes.field(units.reshape(-1, *posterior.coefficients.shape))
-    bend = torch.einsum("mapqr,abpqr,nbpqr->mn", fields, posterior.bend, fields)
+    curvature = torch.einsum("mapqr,abpqr,nbpqr->mn", fields, posterior.curvature, fields)
     _, stiff = dense(linear, mesh, prior, settings.ridge)
-    inverse = torch.linalg.inv(bend + stiff)
+    inverse = torch.linalg.inv(curvature + stiff)
     spread = torch.einsum("mapqr,mn,nbpqr->abpqr", fields, inverse, fields)
     mean = prior.smooth(spread).mean((2, 3, 4))
     torch.testing.assert_close(found.mean((2, 3, 4)), mean, rtol=0.15, atol=0.1 * float(mean.max()))

@@ -185,9 +185,9 @@ def test_a_noise_far_below_that_of_the_spectra_is_a_lower_limit():
     assert abs(none.noise / 0.05 - 1) < 0.15
     for told in (0.0, 1e-3):
         found = prepared(images, told, 0.0, settings)
-        assert (found.noise, found.told, found.given) == (none.noise, told, False)
+        assert (found.noise, found.known_noise, found.noise_known) == (none.noise, told, False)
     given = prepared(images, 0.04, 0.0, settings)
-    assert (given.noise, given.told, given.given) == (0.04, 0.04, True)
+    assert (given.noise, given.known_noise, given.noise_known) == (0.04, 0.04, True)
 
 
 def test_long_waves_are_left_out_and_short_ones_stay():

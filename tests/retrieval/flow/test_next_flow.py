@@ -13,7 +13,7 @@ from benchmarks.cases import DT, SPACING, drifting_pair_images
 from lidar_mi.retrieval.flow.direct import (
     data_form,
     factor_in_single,
-    pull_of,
+    prior_term_of,
     solved,
     solved_in_single,
 )
@@ -68,20 +68,20 @@ def test_a_step_with_a_factor_in_single_precision(slabs, learnt):
     start = 0.9 * flow.coefficients
     linear = linearised(flow.images, mesh, start, flow.settings)
     exact = solved(linear, mesh, start, flow.prior, flow.settings, 0)
-    pull = pull_of(flow.prior, start, flow.settings.ridge)
+    prior_term = prior_term_of(flow.prior, start, flow.settings.ridge)
     # by its own factor, and from that of a similar form
-    similar = factor_in_single(1.2 * data_form(linear, mesh) + pull.whole)
+    similar = factor_in_single(1.2 * data_form(linear, mesh) + prior_term.whole)
     assert similar.lower.dtype == np.float32
     stderr = learnt[0].covariance.diagonal().sqrt().median()
     for near in (None, similar):
-        found = solved_in_single(linear, mesh, start, pull, near)
+        found = solved_in_single(linear, mesh, start, prior_term, near)
         off = mesh.field(found - exact.coefficients)
         assert float(off.abs().max()) < 0.05 * float(stderr)
         assert float(off.square().mean().sqrt()) < 0.01 * float(stderr)
     # stronger by far than single precision resolves beside the data
     stiff = flow.prior._replace(local=1e12 * flow.prior.local)
-    pull = pull_of(stiff, start, flow.settings.ridge)
-    root = factor_in_single(data_form(linear, mesh) + pull.whole)
+    prior_term = prior_term_of(stiff, start, flow.settings.ridge)
+    root = factor_in_single(data_form(linear, mesh) + prior_term.whole)
     assert root.lower.dtype == np.float64
 
 

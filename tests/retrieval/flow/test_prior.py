@@ -17,7 +17,7 @@ SETTINGS = VariationalSettings()
 AXES = [Axis(64, 4.0), Axis(64, 4.0)]
 
 
-def after(rounds, trusted, squares, noise):
+def after(rounds, noise_known, squares, noise):
     """Strength where each rate is seen by itself with white noise; its mean square is given.
 
     One strength for the whole mesh: posterior variance 1 / (L + 1 / noise), mean y / (1 + noise L).
@@ -28,7 +28,7 @@ def after(rounds, trusted, squares, noise):
         strength = prior.strength
         posterior = 1 / (strength + 1 / noise)
         energy = squares / (1 + noise * strength) ** 2
-        prior = prior.updated(1 / strength - posterior, energy, SETTINGS, trusted)
+        prior = prior.updated(1 / strength - posterior, energy, SETTINGS, noise_known)
     return float(prior.local.log().mean().exp())
 
 

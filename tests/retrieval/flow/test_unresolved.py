@@ -17,7 +17,7 @@ from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.flow.likelihood import linearised, prepared
 from lidar_mi.retrieval.flow.prior import first_prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
-from lidar_mi.retrieval.flow.unresolved import made_by_noise, unresolved_variance
+from lidar_mi.retrieval.flow.unresolved import flows_of_noise, unresolved_variance
 from tests.support.flows import axes, plane_waves, texture
 
 KNOTS = 4.0
@@ -94,7 +94,7 @@ def test_what_noise_makes_is_no_motion():
     linear = linearised(pair, mesh, still, settings)
     posterior = direct.solved(linear, mesh, still, prior, settings, 0)
     flow = mesh.field(posterior.coefficients)
-    noise = made_by_noise(linear, mesh, posterior.response)
+    noise = flows_of_noise(linear, mesh, posterior.response)
     ratio = float(noise.square().mean() / flow.square().mean())
     assert abs(np.log(ratio)) < np.log(1.3)
     left, all_of_it = (

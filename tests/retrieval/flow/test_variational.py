@@ -19,6 +19,7 @@ from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.bound import displacement_bound
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import data_array, origin, plane_waves, texture
 
@@ -281,7 +282,9 @@ def blurred_errors(seed, noise, sigma, undone=(False, True), length=2.0, shape=(
     errors = []
     for known in undone:
         blur = sigma * SPACING if known else 0.0
-        wind = retrieve_wind(*rendered, DT, "variational", noise=noise, blur=blur, stride=2)
+        wind = retrieve_wind(
+            *rendered, DT, "variational", noise=noise, blur=blur, windows=WindowSizes(stride=2)
+        )
         z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
         true = velocity(pair.vortices, y, z)
         core = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) < 6
@@ -357,7 +360,9 @@ def test_the_rim_of_a_round_image_does_not_look_at_rest():
         air = air + 0.002 * np.random.default_rng(len(images)).standard_normal(air.shape)
         disc = np.hypot(yy - middle, zz - middle) < 20
         images.append(data_array(np.where(disc, air, np.nan), y, z))
-    found = retrieve_wind(*images, DT, "variational", template=8, search=16, stride=4)
+    found = retrieve_wind(
+        *images, DT, "variational", windows=WindowSizes(template=8, search=16, stride=4)
+    )
     y, z = np.meshgrid(found["y"], found["z"])
     rim = (found["flag"] == 0).values & (np.hypot(y - middle, z - middle) > 10)
     assert rim.sum() > 50

@@ -11,6 +11,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.common_grid import on_one_grid, resample, resample_pair
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture
 
@@ -67,7 +68,7 @@ def test_pair_at_two_distances_stands_still():
     assert float(first.y[-1]) == np.floor(half / 0.5) * 0.5
     # spline errors differ between the two: texture of 6 px correlation length loses 1e-4
     np.testing.assert_allclose(first, second, atol=2e-3)
-    wind = retrieve_wind(first, second, 0.1, stride=4)
+    wind = retrieve_wind(first, second, 0.1, windows=WindowSizes(stride=4))
     assert float(np.abs(wind.displacement_y).max()) < 0.25  # within the pixel: the fit's own error
     assert abs(float(wind.v.mean())) < 0.1 and abs(float(wind.w.mean())) < 0.1
 

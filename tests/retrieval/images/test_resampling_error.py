@@ -18,6 +18,7 @@ from lidar_mi.retrieval.images.resampling_error import (
     variance,
 )
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture
 from tests.support.timed import DT, scattered_vortices
@@ -131,7 +132,13 @@ def normalised(pattern, px, seeds, noise=NOISE, length=3.0):
         )
         level = np.sqrt(scans[0]["Y_noise_std"].fillna(noise) ** 2 + added)
         found = retrieve_wind(
-            *images, DT, "variational", times=times, noise=level, stride=3, checks=False
+            *images,
+            DT,
+            "variational",
+            times=times,
+            noise=level,
+            windows=WindowSizes(stride=3),
+            checks=False,
         )
         valid = (found["flag"] == 0).values
         y, z = np.meshgrid(found["y"], found["z"])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.retrieval.images.intensity import normalised, of_one_brightness
+from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER
 from lidar_mi.retrieval.images.spline import band_limited
 from tests.support.volumes import nodes, random_waves
@@ -66,7 +66,7 @@ def test_brightness_of_volumes_is_from_their_common_air():
     valid[:, :3] = False
     other = torch.where(valid, other, 20.0)
     pair = torch.stack([pattern, other])
-    value, gain = of_one_brightness(pair, valid.to(pattern))
+    value, gain = normalised_intensity(pair, valid.to(pattern))
     assert float(gain[1, 0, 0, 0] * 1.3) == pytest.approx(1, abs=1e-4)
     left = (value[1] - value[0])[valid]
     assert float(left.std()) < 1e-3 and float(left.mean()) == pytest.approx(0, abs=1e-4)

@@ -8,6 +8,7 @@ import xarray as xr
 from benchmarks.cases import vortex_pair_images
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.vortex_pairs import uneven
 
@@ -19,7 +20,9 @@ SMALL = {"columns": 130, "rows": 90}
 @pytest.mark.slow
 def test_vectors_and_numbers_in_one_data_set(tmp_path):
     pair = vortex_pair_images(0.02, seed=11, vortices=uneven(), **SMALL)
-    found = retrieve_wind(pair.first, pair.second, DT, "vortex_fit", stride=2, noise=0.02)
+    found = retrieve_wind(
+        pair.first, pair.second, DT, "vortex_fit", windows=WindowSizes(stride=2), noise=0.02
+    )
     fit = fit_vortices(pair.first, pair.second, DT, noise=0.02)
     assert (found.flag == 0).all() and found.attrs["fit"] == "accepted"
     assert found.attrs["profile"] == "lamb_oseen"
@@ -32,7 +35,7 @@ def test_vectors_and_numbers_in_one_data_set(tmp_path):
         np.testing.assert_allclose(found[name], model[name], rtol=1e-5, atol=1e-5)
     found.to_netcdf(tmp_path / "wind.nc", engine="h5netcdf")
     # beside a method that knows no such numbers
-    other = retrieve_wind(pair.first, pair.second, DT, "cc", stride=2)
+    other = retrieve_wind(pair.first, pair.second, DT, "cc", windows=WindowSizes(stride=2))
     both = xr.concat([other, found], "method", combine_attrs="drop_conflicts")
     assert np.isnan(both.separation[0]) and both.separation[1] == found.separation
 

@@ -15,8 +15,10 @@ from benchmarks.cases import CORE_RADIUS, DT, vortex_pair_images
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.bound import wind_bound
 from lidar_mi.retrieval.wind.methods import METHODS
-from lidar_mi.retrieval.wind.pair import retrieve_wind, wind_bound
+from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
 
@@ -135,7 +137,7 @@ def test_vortex_core_is_retrieved_at_its_position():
 
 @pytest.mark.parametrize("v, w", [(6.0, 0.0), (-6.0, 0.0), (0.0, 4.0), (0.0, -4.0)])
 def test_sign_and_axis(v, w):
-    dataset = retrieve_wind(*moved(v, w), DT, stride=2)
+    dataset = retrieve_wind(*moved(v, w), DT, windows=WindowSizes(stride=2))
     good = dataset.where(dataset.flag == 0)
     assert float(good.v.mean()) == pytest.approx(v, abs=0.2)
     assert float(good.w.mean()) == pytest.approx(w, abs=0.2)
@@ -143,7 +145,7 @@ def test_sign_and_axis(v, w):
 
 def test_unequal_spacings():
     images = moved(5.0, 8.0, spacing_y=0.4, spacing_z=0.8)
-    dataset = retrieve_wind(*images, DT, template=7, search=14, stride=3)
+    dataset = retrieve_wind(*images, DT, windows=WindowSizes(template=7, search=14, stride=3))
     good = dataset.where(dataset.flag == 0)
     assert float(good.v.mean()) == pytest.approx(5.0, abs=0.3)
     assert float(good.w.mean()) == pytest.approx(8.0, abs=0.3)
@@ -191,7 +193,9 @@ def test_constant_images_are_flagged_throughout(method):
     y, z = axes(50, 40)
     for value in (0.0, 1e-4):
         flat = data_array(np.full((40, 50), value), y, z)
-        dataset = retrieve_wind(flat, flat, DT, method, min_texture=0.0, min_isotropy=0.0)
+        dataset = retrieve_wind(
+            flat, flat, DT, method, validation=VectorValidation(min_texture=0.0, min_isotropy=0.0)
+        )
         assert (dataset.flag & Flag.LOW_TEXTURE.value > 0).all()
         assert (dataset.flag & Flag.NO_MATCH.value > 0).all()
 
@@ -230,7 +234,7 @@ def test_beyond_the_search_range_no_vector_is_valid():
 def test_data_set_is_cf_and_survives_a_file(tmp_path):
     pair = moved(6.0, -3.0)
     for method, score in (("cc", "correlation"), ("ws", "mismatch")):
-        dataset = retrieve_wind(*pair, DT, method, stride=2)
+        dataset = retrieve_wind(*pair, DT, method, windows=WindowSizes(stride=2))
         assert dataset.attrs["Conventions"] == "CF-1.11"
         expected = {"method": method, "template": 8, "search": 16, "stride": 2, "dt": DT}
         assert {key: dataset.attrs[key] for key in expected} == expected
@@ -277,10 +281,16 @@ def test_bad_input_is_named():
         (lambda: retrieve_wind(one, two, DT, "piv"), "method: 'piv' is not one of cc, ws"),
         (lambda: retrieve_wind(one, two, 0), "dt: 0 s"),
         (lambda: retrieve_wind(one, two, "soon"), "dt: 'soon'"),
-        (lambda: retrieve_wind(one, two, DT, "cc", template=1), "template: 1 px"),
-        (lambda: retrieve_wind(one, two, DT, "cc", search=9), "search: 9 px"),
-        (lambda: retrieve_wind(one, two, DT, "cc", stride=0), "stride: 0 px"),
-        (lambda: retrieve_wind(one, two, DT, "cc", search=31), "search: 31 px does not fit"),
+        (
+            lambda: retrieve_wind(one, two, DT, "cc", windows=WindowSizes(template=1)),
+            "template: 1 px",
+        ),
+        (lambda: retrieve_wind(one, two, DT, "cc", windows=WindowSizes(search=9)), "search: 9 px"),
+        (lambda: retrieve_wind(one, two, DT, "cc", windows=WindowSizes(stride=0)), "stride: 0 px"),
+        (
+            lambda: retrieve_wind(one, two, DT, "cc", windows=WindowSizes(search=31)),
+            "search: 31 px does not fit",
+        ),
         (lambda: retrieve_wind(one, two[:-1], DT, "cc"), "image2: sizes 30 x 40 and 29 x 40"),
         (lambda: retrieve_wind(one, bare, DT, "cc"), "image2.y: units None"),
         (lambda: retrieve_wind(one, off, DT, "cc"), "image2.y: up to 0.2 m off"),
@@ -294,9 +304,20 @@ def test_bad_input_is_named():
         (lambda: retrieve_wind(one + 1j, two, DT, "cc"), "image1: values of type complex128"),
         (lambda: retrieve_wind(one, two, DT, "cc", device="abacus"), "device: 'abacus'"),
         (lambda: retrieve_wind(one, two, DT, "cc", noise=one[1:]), "noise: sizes"),
-        (lambda: retrieve_wind(one, two, DT, "cc", min_texture=-1), "min_texture: -1"),
-        (lambda: retrieve_wind(one, two, DT, "cc", min_correlation=1.5), "min_correlation: 1.5"),
-        (lambda: retrieve_wind(one, two, DT, "cc", median_size=7), "median_size: 7"),
+        (
+            lambda: retrieve_wind(one, two, DT, "cc", validation=VectorValidation(min_texture=-1)),
+            "min_texture: -1",
+        ),
+        (
+            lambda: retrieve_wind(
+                one, two, DT, "cc", validation=VectorValidation(min_correlation=1.5)
+            ),
+            "min_correlation: 1.5",
+        ),
+        (
+            lambda: retrieve_wind(one, two, DT, "cc", validation=VectorValidation(median_size=7)),
+            "median_size: 7",
+        ),
     ):
         with pytest.raises(InputError) as error:
             call()
@@ -349,8 +370,10 @@ def test_bound_of_two_waves_on_the_grid_of_the_vectors():
     image = xr.DataArray(
         1 + waves, {n: (n, x, {"units": "m"}) for n, x in (("z", z), ("y", y))}, ("z", "y")
     )
-    bound = wind_bound(image, image, DT, noise, 16, 24, 3)
-    wind = retrieve_wind(image, image, DT, template=16, search=24, stride=3)
+    bound = wind_bound(
+        image, image, DT, noise, windows=WindowSizes(template=16, search=24, stride=3)
+    )
+    wind = retrieve_wind(image, image, DT, windows=WindowSizes(template=16, search=24, stride=3))
     np.testing.assert_allclose(bound["z"], wind["z"])
     np.testing.assert_allclose(bound["y"], wind["y"])
     # a template holds whole waves: sqrt(2 noise^2 / (pixels mean squared slope)) / dt
@@ -359,7 +382,14 @@ def test_bound_of_two_waves_on_the_grid_of_the_vectors():
         np.testing.assert_allclose(bound[f"{name}_bound"], expected, rtol=0.02)
     # rows of image 2 seen one after the other: a displacement over more and more time
     late = xr.zeros_like(image) + 0.5 * DT * xr.DataArray(z / z[-1], {"z": image["z"]}, "z")
-    timed = wind_bound(image, image, DT, noise, 16, 24, 3, [xr.zeros_like(image), late])
+    timed = wind_bound(
+        image,
+        image,
+        DT,
+        noise,
+        windows=WindowSizes(template=16, search=24, stride=3),
+        times=[xr.zeros_like(image), late],
+    )
     expected = bound["v_bound"] / (1 + 0.5 * bound["z"] / z[-1])
     np.testing.assert_allclose(timed["v_bound"], expected, rtol=1e-6)
     image[30, 40] = np.nan

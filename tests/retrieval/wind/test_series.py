@@ -9,6 +9,7 @@ import pytest
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.series import retrieve_winds
 from tests.support.flows import axes, data_array, plane_waves, texture
@@ -32,7 +33,9 @@ def mean(winds, name="v"):
 
 def test_each_pair_has_its_wind_and_time(images):
     said = []
-    winds = retrieve_winds(images, STEPS, stride=4, notice=lambda *call: said.append(call))
+    winds = retrieve_winds(
+        images, STEPS, windows=WindowSizes(stride=4), notice=lambda *call: said.append(call)
+    )
     np.testing.assert_allclose(mean(winds), (10, -10, 5), atol=0.1)  # 0.01 px in 0.05 s
     np.testing.assert_allclose(winds["time"], [0.05, 0.125, 0.25])
     np.testing.assert_allclose(winds["dt"], STEPS)
@@ -40,13 +43,13 @@ def test_each_pair_has_its_wind_and_time(images):
     np.testing.assert_allclose(winds["vector_time"].mean(("z", "y")), winds["time"], rtol=1e-6)
     assert [text for text, _ in said] == ["images 0-1", "images 1-2", "images 2-3"]
     assert [fraction for _, fraction in said] == [0, 1 / 3, 2 / 3]
-    alone = retrieve_wind(images[1], images[2], STEPS[1], stride=4)
+    alone = retrieve_wind(images[1], images[2], STEPS[1], windows=WindowSizes(stride=4))
     for name in ("v", "w_stderr", "flag", "y_vector"):
         np.testing.assert_array_equal(winds[name][1], alone[name])
 
 
 def test_pairs_as_asked_for(images):
-    winds = retrieve_winds(images, 0.1, [(0, 2), (1, 3)], stride=4)
+    winds = retrieve_winds(images, 0.1, [(0, 2), (1, 3)], windows=WindowSizes(stride=4))
     np.testing.assert_allclose(mean(winds), (2.5, 2.5), atol=0.05)
     np.testing.assert_allclose(winds["time"], [0.1, 0.2])
     np.testing.assert_array_equal(winds["second_image"], [2, 3])
@@ -54,7 +57,7 @@ def test_pairs_as_asked_for(images):
 
 def test_a_bad_image_costs_its_pairs_alone(images):
     dark = images[1] * np.nan
-    winds = retrieve_winds([images[0], images[1], dark], 0.1, stride=4)
+    winds = retrieve_winds([images[0], images[1], dark], 0.1, windows=WindowSizes(stride=4))
     assert mean(winds)[0] == pytest.approx(10, abs=0.05)
     assert winds["remark"].values.tolist() == [
         "",
@@ -66,8 +69,21 @@ def test_a_bad_image_costs_its_pairs_alone(images):
 
 def test_noise_is_that_of_the_earlier_image(images):
     levels = [0.01, 0.5, None, None]
-    winds = retrieve_winds(images, 0.1, noise=levels, stride=4, min_texture=0)
-    pair = retrieve_wind(images[1], images[2], 0.1, noise=0.5, stride=4, min_texture=0)
+    winds = retrieve_winds(
+        images,
+        0.1,
+        noise=levels,
+        windows=WindowSizes(stride=4),
+        validation=VectorValidation(min_texture=0),
+    )
+    pair = retrieve_wind(
+        images[1],
+        images[2],
+        0.1,
+        noise=0.5,
+        windows=WindowSizes(stride=4),
+        validation=VectorValidation(min_texture=0),
+    )
     np.testing.assert_array_equal(winds["flag"][1], pair["flag"])
     assert (winds["flag"][0] == 0).sum() > (winds["flag"][1] == 0).sum()
 

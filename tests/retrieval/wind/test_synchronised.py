@@ -9,8 +9,9 @@ import xarray as xr
 
 from lidar_mi.retrieval.images.common_grid import on_one_grid
 from lidar_mi.retrieval.images.gridding import on_nodes
+from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.synchronised import carried, mixes_times, of_one_instant
+from lidar_mi.retrieval.wind.synchronised import carried, mixes_times, synchronised
 from tests.support.flows import axes, data_array, plane_waves, texture
 
 DT, V, W = 0.1, 6.0, 12.0
@@ -40,11 +41,17 @@ def test_wind_of_a_curve_that_crosses_itself():
     The mean of some 20 independent windows, whose scatter gives the tolerance.
     """
     scans = [scan(*lissajous(0.09), at) for at in (0.0, DT)]
-    images = of_one_instant(scans, [DT], "Y")
+    images = synchronised(scans, [DT], "Y")
     assert all(image["beam_time"].max() == image["beam_time"].min() for image in images)
     mixed = [on_nodes(one, errors=False) for one in scans]
     found, wrong = (
-        retrieve_wind(*(i["Y"] for i in pair), DT, "multipass", stride=4, standard_errors=False)
+        retrieve_wind(
+            *(i["Y"] for i in pair),
+            DT,
+            "multipass",
+            windows=WindowSizes(stride=4),
+            standard_errors=False,
+        )
         for pair in (images, mixed)
     )
     for name, true in (("v", V), ("w", W)):
@@ -59,10 +66,12 @@ def test_scans_by_angles_from_a_platform_that_moves():
     """Nodes of the second scan are 3 % nearer to each other."""
     first, second = scan(*lissajous(0.09), 0.0), scan(*lissajous(0.09), DT)
     nearer = second.assign_coords({a: (a, 0.97 * second[a].values, {"units": "m"}) for a in "zy"})
-    images = of_one_instant([first, nearer], [DT], "Y")
+    images = synchronised([first, nearer], [DT], "Y")
     np.testing.assert_array_equal(images[1]["y"], nearer["y"])
     pair = on_one_grid(*(image["Y"] for image in images))
-    found = retrieve_wind(*pair, DT, "multipass", stride=4, standard_errors=False)
+    found = retrieve_wind(
+        *pair, DT, "multipass", windows=WindowSizes(stride=4), standard_errors=False
+    )
     for name, true in (("v", V), ("w", W)):
         valid = found[name].where(found["flag"] == 0)
         independent = float(valid.count()) * 4**2 / 8**2
@@ -73,7 +82,7 @@ def test_the_clock_does_not_matter():
     """Times from any zero that is the same in both scans."""
     scans = [scan(*lissajous(0.09), at) for at in (0.0, DT)]
     later = [one.assign(beam_time=one["beam_time"] + 100.0) for one in scans]
-    for one, other in zip(*(of_one_instant(s, [DT], "Y") for s in (scans, later)), strict=True):
+    for one, other in zip(*(synchronised(s, [DT], "Y") for s in (scans, later)), strict=True):
         np.testing.assert_allclose(one["Y"], other["Y"], atol=1e-4)
         later = float((other["beam_time"] - one["beam_time"]).mean())
         assert later == pytest.approx(100.0)
@@ -94,7 +103,7 @@ def test_scans_that_mix_no_times_are_only_resampled():
     y, z = np.meshgrid(Y, Z)
     time = 0.05 * (np.arange(SIZE).reshape(y.shape) / SIZE - 0.5)
     scans = [scan(time, y + 0.2, z - 0.1, at) for at in (0.0, DT)]
-    for one, expected in zip(of_one_instant(scans, [DT], "Y"), scans, strict=True):
+    for one, expected in zip(synchronised(scans, [DT], "Y"), scans, strict=True):
         xr.testing.assert_identical(one, on_nodes(expected))
 
 

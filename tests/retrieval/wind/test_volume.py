@@ -10,6 +10,7 @@ import pytest
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.volumes import (
     CONTRAST,
@@ -226,7 +227,9 @@ def test_errors_reach_the_bound_of_a_known_shift():
     clean = [1 + CONTRAST * texture(places - t * shift) for t in (-0.5, 0.5)]
     for _ in range(25):
         pair = [volume(values + noise * rng.standard_normal(shape)) for values in clean]
-        wind = retrieve_wind_volume(*pair, DT, "correlation", stride=2, noise=noise)
+        wind = retrieve_wind_volume(
+            *pair, DT, "correlation", windows=WindowSizes(stride=2), noise=noise
+        )
         middle = wind.isel({a: wind.sizes[a] // 2 for a in "xzy"})
         found.append([float(middle[name]) * DT / SPACING for name in "uwv"])
         stated.append([float(middle[f"{name}_stderr"]) * DT / SPACING for name in "uwv"])
@@ -264,7 +267,7 @@ def test_volumes_without_wind_information_are_flagged(method):
     assert (found["flag"].values != 0).mean() > 0.95
     holed = advected(shape, lambda x, t: x, 0.01)
     holed[1][5, 6, 7] = np.nan
-    found = retrieve_wind_volume(*holed, DT, method, stride=1)
+    found = retrieve_wind_volume(*holed, DT, method, windows=WindowSizes(stride=1))
     at = found.sel(x=5 * SPACING, z=6 * SPACING, y=7 * SPACING, method="nearest")
     assert int(at["flag"]) & Flag.NON_FINITE_INPUT
 
@@ -297,10 +300,10 @@ ONE = volume(1 + 0.1 * np.random.default_rng(1).standard_normal((10, 10, 10)))
         ({"volume1": ONE - 1.5}, "volume1: gates that are 0, negative"),
         ({"dt": 0.0}, "dt: 0.0 s"),
         ({"method": "cc"}, "method: 'cc' is not one of correlation, variational"),
-        ({"template": 3}, "template: 3 voxels is not an integer >= 4"),
-        ({"search": 9}, "search: 9 voxels is not an integer >= template + 2"),
-        ({"stride": 0}, "stride: 0"),
-        ({"min_correlation": 2.0}, "min_correlation: 2.0"),
+        ({"windows": WindowSizes(template=3)}, "template: 3 voxels is not an integer >= 4"),
+        ({"windows": WindowSizes(search=9)}, "search: 9 voxels is not an integer >= template + 2"),
+        ({"windows": WindowSizes(stride=0)}, "stride: 0"),
+        ({"validation": VectorValidation(min_correlation=2.0)}, "min_correlation: 2.0"),
         ({"noise": -1.0}, "noise: below 0"),
         ({"more": [ONE], "method": "correlation"}, "more: 1 volumes are not allowed"),
     ],

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,8 @@ _DIRECTIONS = {
     "y": ("left", {"axis": "Y"}),
 }
 
-Variable = tuple[Sequence[str], np.ndarray, dict]
+Variable = tuple[Sequence[str], np.ndarray, dict[str, Any]]
+"""Dims, values and attributes."""
 
 
 def spacing(image: xr.DataArray) -> tuple[float, ...]:
@@ -41,14 +43,14 @@ def field(
 
 def centres(image: xr.DataArray, windows: Windows, what: str) -> dict[str, Variable]:
     """Coordinates of the windows' centres, m."""
-    found = {}
-    for number, axis in enumerate(image.dims):
+    found: dict[str, Variable] = {}
+    for number, axis in enumerate(map(str, image.dims)):
         pixel = image.coords.variables[axis].values.astype(float)
         start = np.asarray(windows.starts(number))
         place = (pixel[start] + pixel[start + windows.template - 1]) / 2
         direction, about = _DIRECTIONS[axis]
         about = {"long_name": f"{what} centre, {direction}", "units": "m", **about}
-        found[axis] = axis, place, about
+        found[axis] = (axis,), place, about
     return found
 
 
@@ -110,7 +112,7 @@ def flags(found: Displacement, axes: Sequence[str]) -> Variable:
         "long_name": "reasons to reject the vector, 0 = valid",
         "standard_name": "quality_flag",
         "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint16),
-        "flag_meanings": " ".join(bit.name.lower() for bit in Flag),
+        "flag_meanings": " ".join(str(bit.name).lower() for bit in Flag),
     }
     return tuple(axes), found.flag.cpu().numpy().astype(np.uint16), about
 
@@ -125,16 +127,16 @@ def dataset(
     """The data set, with the scalar quantities of the result."""
     attrs = {"Conventions": "CF-1.11", "title": title, **attributes, "dt_units": "s"}
     # all at once: each variable that a data set takes later copies and aligns it again
-    scalars = {}
+    scalars: dict[str, Any] = {}
     for name, quantity in found.quantities.items():
-        about = {"long_name": quantity.long_name, "units": quantity.units}
+        about: dict[str, str | float] = {"long_name": quantity.long_name, "units": quantity.units}
         scalars[name] = (), quantity.value, about
         about = about | {"long_name": f"standard error of {quantity.long_name}"}
         if quantity.per_rotation:
             about["per_rotation"] = quantity.per_rotation
         scalars[f"{name}_stderr"] = (), quantity.stderr, about
-    result = xr.Dataset(variables | scalars, coords, attrs)
-    result.attrs |= found.attributes
+    result = xr.Dataset({**variables, **scalars}, coords, attrs)
+    result.attrs.update(found.attributes)
     for axis in result.dims:
         result.variables[axis].encoding["_FillValue"] = None
     return result

@@ -1,0 +1,62 @@
+"""The least standard error of a wind from the templates of an image pair."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.images.beam_times import checked_times, vector_times
+from lidar_mi.retrieval.images.bound import displacement_bound
+from lidar_mi.retrieval.images.quality import filled, non_finite
+from lidar_mi.retrieval.wind.dataset import centres, field, spacing
+from lidar_mi.retrieval.wind.options import IMAGE_WINDOWS, WindowSizes
+
+
+def wind_bound(
+    image1: xr.DataArray,
+    image2: xr.DataArray,
+    dt: float,
+    noise: float | xr.DataArray,
+    windows: WindowSizes = IMAGE_WINDOWS,
+    times: Sequence[xr.DataArray] | None = None,
+) -> xr.Dataset:
+    """Least standard error of v and w (m/s) that any unbiased method has from each template alone.
+
+    The Cramer-Rao bound, see `bound.displacement_bound`. Grid and parameters are those of
+    `retrieve_wind`, as is the time difference of a vector, which is that of air at rest. Infinite
+    without texture, NaN near non-finite pixels. A field that is fitted
+    to the images as a whole uses more than a template and may be better. Noise below 0.001 of the
+    median of a map is raised to that.
+
+    Returns
+    -------
+    xr.Dataset, dims (z, y)
+        `v_bound`, `w_bound`.
+
+    Raises
+    ------
+    InputError
+        As `retrieve_wind`.
+    """
+    dt = positive("dt", dt)
+    (image1, image2), known = checked_stack([image1, image2], noise)
+    frame = windows.on(image1.shape)
+    level: float | torch.Tensor | None
+    if isinstance(known, xr.DataArray):
+        level = on_device(known.clip(min=1e-3 * float(known.median())), "cpu")
+    else:
+        level = known
+    pair = [on_device(image, "cpu") for image in (image1, image2)]
+    covariance = displacement_bound(filled(pair[0]), filled(pair[1]), level, frame.template)
+    rows, columns = (torch.as_tensor(frame.starts(axis)) for axis in (0, 1))
+    root = covariance[:2, rows][:, :, columns].sqrt()
+    bound = torch.where(non_finite(pair, frame), torch.nan, root).numpy()
+    tau = checked_times(times, [image1, image2], dt)
+    apart = vector_times(tau, dt, frame, np.zeros((2, *frame.count)), False).difference
+    found = {}
+    for name, values, step in zip("wv", bound, spacing(image1), strict=True):
+        about = f"Cramer-Rao bound of {name} from one template", "m s-1"
+        found[f"{name}_bound"] = field(("z", "y"), values * step / apart, *about)
+    return xr.Dataset(found, centres(image1, frame, "template"))

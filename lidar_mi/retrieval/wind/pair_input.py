@@ -1,0 +1,98 @@
+"""What a retrieval from images is given, checked and as tensors."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.images.beam_times import checked_times
+from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.methods import METHODS, Method
+from lidar_mi.retrieval.wind.options import WindowSizes
+
+
+class PairInput(NamedTuple):
+    """Two images of the same air, or a burst of more.
+
+    Attributes
+    ----------
+    images : list of xr.DataArray, dims (z, y)
+        On one grid.
+    pixels : list of torch.Tensor, shape (z, y)
+        Their values.
+    windows : Windows
+    dt : float
+        From reference time to reference time, s.
+    noise : float or torch.Tensor, optional
+        Standard deviation in image 1.
+    times : list of np.ndarray, shape (z, y), optional
+        When each pixel of two images was seen, s from its image's reference time.
+    blur, blur_px : float
+        Standard deviation of the instrument's blur, m and px.
+    """
+
+    images: list[xr.DataArray]
+    pixels: list[torch.Tensor]
+    windows: Windows
+    dt: float
+    noise: float | torch.Tensor | None
+    times: list[np.ndarray] | None
+    blur: float
+    blur_px: float
+
+
+def method_of(name: str | Method) -> Method:
+    """The method of that name, see `METHODS`."""
+    if isinstance(name, Method):
+        return name
+    if name not in METHODS:
+        raise InputError(f"method: {name!r} is not one of {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def checked_input(
+    images: Sequence[xr.DataArray],
+    dt: float,
+    method: Method,
+    windows: WindowSizes,
+    noise: float | xr.DataArray | None,
+    times: Sequence[xr.DataArray] | None,
+    blur: float,
+    device: str | torch.device,
+) -> PairInput:
+    """Arguments of `retrieve_wind`, each refused by its name if it is not suitable."""
+    dt = positive("dt", dt)
+    stack, level = checked_stack(images, noise)
+    for number, image in enumerate(stack, 1):
+        if not np.isfinite(image.values).any():
+            raise InputError(f"image{number}: no pixel is finite; expected light somewhere")
+    if len(stack) > 2 and "more" not in method.options:
+        takes = ", ".join(name for name, known in METHODS.items() if "more" in known.options)
+        raise InputError(
+            f"more: {len(stack)} images are not allowed with method {method.name!r}; expected two, "
+            f"or method {takes}"
+        )
+    if times is not None and len(stack) > 2:
+        raise InputError(f"times: not allowed with {len(stack)} images; expected two")
+    seen = checked_times(times, stack, dt)
+    frame, blur_px = windows.on(stack[0].shape), _in_pixels(blur, stack[0])
+    pixels = [on_device(image, device) for image in stack]
+    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    return PairInput(stack, pixels, frame, dt, known, seen, blur, blur_px)
+
+
+def _in_pixels(blur: float, image: xr.DataArray) -> float:
+    """From m to px."""
+    if not 0 <= blur < np.inf:
+        raise InputError(f"blur: {blur!r} m is not allowed; expected a standard deviation >= 0")
+    z, y = (np.ptp(image[name].values) / (image.sizes[name] - 1) for name in ("z", "y"))
+    if blur and abs(z / y - 1) > 0.01:
+        raise InputError(
+            f"blur: not allowed with pixels of {y:g} m along y and {z:g} m along z; expected "
+            "square ones"
+        )
+    return float(blur / y)
