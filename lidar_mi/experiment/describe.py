@@ -1,6 +1,6 @@
 """Contents of a file, a folder of results or a named scatterer, as titled tables of text."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import xarray as xr
 from lidar_mi.atmosphere.aerosols import AEROSOLS
 from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
 from lidar_mi.atmosphere.particle_scattering import Notice
-from lidar_mi.atmosphere.scattering import describe
+from lidar_mi.atmosphere.scattering import ScatteringTable, describe
 from lidar_mi.errors import InputError
 from lidar_mi.io.netcdf import load_variable, open_netcdf
 from lidar_mi.io.scattering_table import aerosol_table, read_table
@@ -19,7 +19,7 @@ from lidar_mi.io.vortex_file import read_vortices
 
 MOLECULES = "molecules"
 
-Section = tuple[str, list[tuple[str, ...]]]
+Section = tuple[str, Sequence[tuple[str, ...]]]
 """A title and rows of equal length."""
 
 
@@ -97,7 +97,7 @@ def _vortices(path: Path) -> Iterator[Section]:
         yield f"{path}: vortex pair, {name}, {fit.profile.replace('_', ' ')}", rows
 
 
-def _scatterer(title: str, table) -> Section:
+def _scatterer(title: str, table: ScatteringTable) -> Section:
     return title, list(describe(table).items())
 
 
@@ -235,7 +235,7 @@ _OF_A_FLIGHT = (
 )
 
 
-def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
+def _asked_first(experiment: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
     """The main keys of an experiment, as far as it has them and they have an effect."""
     flies = value_at(experiment, "encounter") is not None
     for key in (
@@ -271,7 +271,7 @@ def value_at(experiment: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def _short(value) -> str:
+def _short(value: object) -> str:
     """A value in a line; numbers with the 7 digits that single precision has."""
     if isinstance(value, (float, np.floating)):
         value = f"{value:.7g}"

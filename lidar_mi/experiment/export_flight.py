@@ -61,7 +61,7 @@ def _points(track: xr.Dataset, source: str) -> xr.Dataset:
     one = track.sel(source=source, drop=True)
     names = [str(name).removeprefix("port_") for name in one if str(name).startswith("port_")]
     shared = one[["x", "time"]].to_dataarray("name").values
-    found: dict[str, list] = {name: [] for name in names}
+    found: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for side in _SIDES:
         for name in names:
             found[name].append(one[f"{side}_{name}"].values)

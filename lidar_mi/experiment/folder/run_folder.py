@@ -340,7 +340,7 @@ def made_by(record: Mapping[str, Any], keys: Keys | None = None) -> str:
     return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
 
 
-def _difference(before: dict, now: dict) -> str | None:
+def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
     """The first difference to an earlier run that affects its images; None: there is none."""
     changed = reading.in_si(before["experiment"]) != reading.in_si(now["experiment"])
     if changed or before.get("files") != now["files"]:
@@ -373,7 +373,7 @@ def _checksum_of(path: Path, size: int, changed: int) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def read_record(folder: str | Path) -> dict:
+def read_record(folder: str | Path) -> dict[str, Any]:
     """Record of a run folder: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
 
     Raises

@@ -81,44 +81,44 @@ class Cost(NamedTuple):
         return START + sum(self)
 
 
-def cost(experiment: Experiment, ahead: Results, preparation: float = 0.0) -> Cost:
+def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> Cost:
     """Processor time of a run on this machine, to a factor of two.
 
     Parameters
     ----------
     experiment : Experiment
-    ahead : mapping
+    results : mapping
         Results of the stages that `lidar_mi.experiment.run.prepare` has computed.
     preparation : float
         Processor time that it took, s.
     """
     here = slowness()
-    rendering = 2 * render_seconds(experiment, ahead) if experiment.wake else 0.0
+    rendering = 2 * render_seconds(experiment, results) if experiment.wake else 0.0
     return Cost(
         preparation,
         rendering,
-        here * _images(experiment, ahead),
+        here * _images(experiment, results),
         here * _rings(experiment),
         here * _lines(experiment),
         here * _figures(experiment),
     )
 
 
-def flight_seconds(first: Experiment, ahead: Results, scans: float) -> float:
+def flight_seconds(first: Experiment, results: Results, scans: float) -> float:
     """Processor time of a flight on this machine, to a factor of two.
 
     Parameters
     ----------
     first : Experiment
         The images of one slab.
-    ahead : mapping
+    results : mapping
         Results of the stages that `lidar_mi.experiment.run.prepare` has computed of it.
     scans : float
         Of the lidar; each is of two slabs. Flights without it take hardly any time.
     """
     here = slowness()
     each = here * (FLIGHT_SLAB + FLIGHT_LINES * _lines(first))
-    lidar = scans * (2 * render_seconds(first, ahead) + each) if scans else 0.0
+    lidar = scans * (2 * render_seconds(first, results) + each) if scans else 0.0
     return START + lidar + here * FLIGHT_FIGURES
 
 
@@ -142,21 +142,21 @@ def probe() -> None:
     rng.poisson(np.full((500, 800), 30.0))
 
 
-def render_seconds(experiment: Experiment, ahead: Results) -> float:
+def render_seconds(experiment: Experiment, results: Results) -> float:
     """Time of one image, from the first one with few samples and with four times as many.
 
     Their difference has no part of what is done once, such as compiling. Where the number of
     samples is to be chosen, with the time of doing so.
     """
-    plan, render = ahead["plans"][0], experiment.render
-    needed = {name: ahead[name] for name in ("truth", "plans", "air", "flows")}
+    plan, render = results["plans"][0], experiment.render
+    needed = {name: results[name] for name in ("truth", "plans", "air", "flows")}
     if render.samples_per_beam == "auto":
         begin = time.process_time()
         number = render.without_detector(plan.gate_count)
         if experiment.detector:
             number = call(chosen_samples, experiment, **needed).number
         choosing = time.process_time() - begin
-        return choosing / 2 + render_seconds(with_number(experiment, number), ahead)
+        return choosing / 2 + render_seconds(with_number(experiment, number), results)
     beams, least = plan.y.size * plan.z.size, 2 * experiment.scan.gate_count
     few = max(2, least, round(_SAMPLES / 4 / (beams * render.max_order)))
     whole = max(render.samples_per_beam, least)
@@ -183,11 +183,11 @@ def with_number(experiment: Experiment, samples: int) -> Experiment:
     return found.read_from(experiment.folder)
 
 
-def _images(experiment: Experiment, ahead: Results) -> float:
+def _images(experiment: Experiment, results: Results) -> float:
     """Winds from images or volumes."""
     if not experiment.wake:
         return 0.0
-    plan = ahead["plans"][0]
+    plan = results["plans"][0]
     pixels = plan.y.size * plan.z.size
     if experiment.volume:
         voxels = pixels * experiment.scan.gate_count
@@ -226,9 +226,10 @@ def _rings(experiment: Experiment) -> float:
 
 def _lines(experiment: Experiment) -> float:
     """All lines of sight; the pulses of a line are summed, however many they are."""
-    if not experiment.sensor:
+    sensor, doppler = experiment.sensor, experiment.doppler
+    if sensor is None or doppler is None:
         return 0.0
-    directions, camera = experiment.sensor.directions, experiment.doppler.camera
+    directions, camera = sensor.directions, doppler.camera
     return RING_PAIR * directions.columns * directions.rows * camera.width * camera.height
 
 

@@ -146,7 +146,7 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
     return found
 
 
-def merged(data: Any, changes: dict) -> dict:
+def merged(data: Any, changes: dict[str, Any]) -> dict[str, Any]:
     """``data`` with ``changes``, section by section; null removes. Both remain unchanged."""
     found = copy.deepcopy(data)
     for key, value in changes.items():
@@ -159,12 +159,12 @@ def merged(data: Any, changes: dict) -> dict:
     return found
 
 
-def read_keys(path: str | Path) -> dict:
+def read_keys(path: str | Path) -> dict[str, Any]:
     """The keys of an experiment file as they stand, over those of its ``base`` if it has one."""
     return _read_keys(Path(path), ())
 
 
-def _read_keys(path: Path, above: tuple[Path, ...]) -> dict:
+def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     """The same of a file that those ``above`` are based on."""
     if path.suffix == ".xml":
         raise InputError(
@@ -198,7 +198,7 @@ def _read_keys(path: Path, above: tuple[Path, ...]) -> dict:
     return merged(_read_keys(file, chain), data)
 
 
-def check(data: dict, origin: str) -> Experiment:
+def check(data: dict[str, Any], origin: str) -> Experiment:
     """An experiment from a nested dictionary; see `load` for the errors."""
     try:
         return Experiment.model_validate(data)
@@ -241,7 +241,7 @@ def _in_si(text: str) -> dict[str, Any]:
         return given
 
 
-def _override(data: dict, text: str) -> None:
+def _override(data: dict[str, Any], text: str) -> None:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise InputError(f"--set {text}: expected KEY=VALUE, such as wake.texture.rms=0.2")

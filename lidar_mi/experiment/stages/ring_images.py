@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -134,7 +135,8 @@ def ring_instrument(doppler: Doppler) -> Rings:
     crest = ccd.quantum_efficiency * (float(image.max()) + background)
     noise = pixel_noise(ccd, modes)
     # crests of the noisiest pixels stay below
-    spread = math.sqrt(noise.variance(crest, crest))
+    light = torch.tensor(crest, dtype=torch.float64)
+    spread = math.sqrt(noise.variance(light, light))
     if not crest + 6 * spread < ccd.saturation:
         raise InputError(
             f"doppler.ccd: a pixel that holds {ccd.saturation:.3g} photoelectrons is not allowed; "
@@ -230,15 +232,18 @@ def render_ring_images(
                 speeds,
                 settings,
                 (seed + (before << 16)) % 2**31,
-                lambda k, done, paths, n=before: log.bar(
-                    f"rendering rings {n + k + 1} of {total}", done / paths
-                ),
+                partial(_show_progress, log, before, total),
                 absent,
                 batches_of(names, store, log),
             )
             for k, image in zip(absent, rendered, strict=True):
                 yield names[k], image
         before += len(names)
+
+
+def _show_progress(log: Log, before: int, total: int, index: int, done: int, paths: int) -> None:
+    """Progress of an image, which others come before."""
+    log.bar(f"rendering rings {before + index + 1} of {total}", done / paths)
 
 
 def images_by_content(

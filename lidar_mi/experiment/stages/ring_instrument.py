@@ -102,7 +102,7 @@ def air_rings(
             lidar.wavelength, kelvin, pressure, lidar.laser_width, known, lidar.line_shape
         )
 
-    model = ring_model(etalon, camera, line, temperature * np.array(TEMPERATURE_NODES))
+    model = ring_model(etalon, camera, line, [temperature * node for node in TEMPERATURE_NODES])
     priors = {}
     if math.isfinite(temperature_std):
         priors["temperature"] = (temperature, temperature_std)

@@ -306,7 +306,8 @@ def mean_squares_without(
         changed = changed.assign(v_los=changed["v_los_true"] + noise, v_los_std=std)
         if "v_los_covariance" in lines and "line_noise" not in causes:
             changed["v_los_covariance"] = lines["v_los_covariance"]
-        flow, settings = known, {}
+        flow = known
+        settings: dict[str, Any] = {}
         if "crossflow" not in causes:
             flow = crossflow
             oblique = _oblique_view(wake, platform, scan, volume)
