@@ -106,7 +106,7 @@ def _table_file(path: Path) -> Iterator[Section]:
 
 
 def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
-    """The whole band of Rayleigh scattering beside the line that a narrow receiver detects."""
+    """The whole band of Rayleigh scattering, and the line that a narrow receiver detects."""
     pressure, temperature = standard_atmosphere(altitude)
     bands = [molecular_scattering(wavelength, pressure, temperature, band) for band in BANDS]
     rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"), strict=True)))]
@@ -194,7 +194,7 @@ def _study(folder: Path) -> Iterator[Section]:
     ]
     if found:
         yield "results", [("", *metrics), *found]
-    yield _files(folder, beside=records)
+    yield _files(folder, without=records)
 
 
 def _run_folder(folder: Path) -> Iterator[Section]:
@@ -214,13 +214,13 @@ def _run_folder(folder: Path) -> Iterator[Section]:
     yield _files(folder)
 
 
-def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
+def _files(folder: Path, without: Iterable[str] = ()) -> Section:
     """Files in a folder, without those in some of its folders."""
     paths = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return "files", [
         (str(name), f"{path.stat().st_size / 1e6:.2f} MB")
         for name, path in paths.items()
-        if name.parts[0] not in beside
+        if name.parts[0] not in without
     ]
 
 

@@ -168,10 +168,12 @@ def _placed_scan(scan: xr.Dataset) -> xr.Dataset:
     dims = ("gate", "z", "y")
     x = middle.broadcast_like(scan["S0"]).transpose(*dims)
     places = {"x": telescope + x, "y": x / centre * scan["y"], "z": x / centre * scan["z"]}
-    kept = scan.drop_vars(["y", "z"]).rename_dims(y="column", z="row")
+    gates = scan.drop_vars(["y", "z"]).rename_dims(y="column", z="row")
     dims = ("gate", "row", "column")
     attrs = {"x": _AHEAD, "y": scan["y"].attrs, "z": scan["z"].attrs}
-    return kept.drop_vars([n for n in kept.data_vars if "gate" not in kept[n].dims]).assign_coords(
+    # sums over the gates have no place along x
+    sums = [name for name, field in gates.data_vars.items() if "gate" not in field.dims]
+    return gates.drop_vars(sums).assign_coords(
         {n: (dims, p.transpose("gate", "z", "y").values, attrs[n]) for n, p in places.items()}
     )
 

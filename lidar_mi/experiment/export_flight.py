@@ -48,8 +48,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
 def _of_slabs(seen: xr.Dataset, *axes: str) -> xr.Dataset:
     """Variables of all nodes of the slabs."""
     names = [name for name, value in seen.data_vars.items() if {"x", *axes} == set(value.dims)]
-    kept = seen[names]
-    return kept.drop_vars([name for name in kept.coords if name not in ("x", *axes)])
+    chosen = seen[names]
+    return chosen.drop_vars([name for name in chosen.coords if name not in ("x", *axes)])
 
 
 def _sources(track: xr.Dataset) -> list[str]:

@@ -65,7 +65,7 @@ def read_electrons(
     ------
     InputError
         A file that is no image, frames of different sizes, a rendered image: its values are
-        relative energies, which no pulse and no noise can be told from.
+        relative energies, from which neither a pulse nor its noise follows.
     """
     found: list[np.ndarray] = []
     for path in paths:
@@ -108,7 +108,7 @@ def calibrate_etalon(
         The nominal instrument: an experiment with a section ``doppler``, its file or the name of a
         shipped one. Laser, etalon, camera and CCD are taken from it.
     flat : array, shape (height, width), optional
-        Mean of frames of even white light, any scale; pixels of 0 are left out.
+        Mean of frames of even white light, any scale; pixels of 0 are masked.
     lines : mapping of float to array, optional
         Frames of further narrow lines by their wavelengths (m; in vacuum, or in the gap's gas times
         ``doppler.etalon.index``, as the laser's): they give the gap. All that does not depend on
@@ -225,7 +225,7 @@ def retrieve_v_los(
     -------
     xr.Dataset, dim frame
         ``v_los`` (m s-1, positive toward the instrument), ``v_los_std`` its random standard error,
-        ``v_los_systematic`` that which the calibration leaves to all frames alike, ``chi_square``,
+        ``v_los_systematic`` that of the calibration, common to all frames, ``chi_square``,
         ``rings``, and ``status``: empty, or why a frame has no speed (NaN).
 
     Raises

@@ -45,7 +45,7 @@ LEAST_SHOWN = 0.5
 
 def sections(
     asked: Experiment,
-    beside: str | Path = ".",
+    search_path: str | Path = ".",
     notice: Notice = silent,
     *,
     timed: bool = False,
@@ -56,7 +56,7 @@ def sections(
     Parameters
     ----------
     asked : Experiment
-    beside : path
+    search_path : path
         Folder in which files named by the experiment are searched first.
     notice : callable
         Called with the name of the running step.
@@ -64,7 +64,7 @@ def sections(
         With the time of the run, which takes a probe of about a second.
     sampled : bool
         Say of Monte Carlo samples, where there is a detector, how many are chosen and what their
-        noise is beside its own, which takes an image of few samples.
+        noise is relative to its own, which takes an image of few samples.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def sections(
         Anything that a run would refuse before it starts.
     """
     start = time.process_time()
-    prepared = experiment.prepare(asked, beside, without_warnings(notice))
+    prepared = experiment.prepare(asked, search_path, without_warnings(notice))
     preparation, results = time.process_time() - start, prepared.results
     chosen: Samples | None = None
     if asked.wake:
@@ -244,7 +244,7 @@ def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
 
 
 def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
-    """What a scan in time asks of the laser and of the scanner, and how far it is flown."""
+    """What a scan in time asks of the laser and of the scanner, and the distance flown."""
     flown = asked.platform.speed * schedule.duration
     return [
         ("duration", f"{schedule.duration:.4g} s"),

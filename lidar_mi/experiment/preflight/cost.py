@@ -1,8 +1,8 @@
 """Time of a run before it is started, calibrated on this machine by a probe of about a second.
 
 Rendering is timed with the experiment's own scene and few samples. All other steps have a cost per
-pixel that was measured beside a fixed piece of work, the probe; the time that the probe takes here
-and now over the time that it took then is the factor between the machines.
+pixel that was measured on one machine, together with a fixed piece of work, the probe. The time of
+the probe here and now over its time there is the factor between the machines.
 """
 
 import functools
@@ -20,7 +20,7 @@ from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMetho
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 PROBE_SECONDS = 0.115
-"""Processor time of `probe` beside which all costs below were measured."""
+"""Processor time of `probe` when all costs below were measured."""
 START = 3.0
 """Seconds: libraries, and kernels that are compiled."""
 IMAGE_METHODS = {
@@ -34,7 +34,7 @@ IMAGE_METHODS = {
 BOUND = (0.05, 5e-6)
 """The bound of a pair, and its true wind."""
 LEVEL = (0.08, 5e-6)
-"""A level of the texture sweep beside its correlation."""
+"""A level of the texture sweep, without its correlation."""
 CAUSES = 5
 """Retrievals of an error budget, per method."""
 VOLUME_METHODS = {VolumeMethod.CORRELATION: (0.5, 1.1e-5), VolumeMethod.VARIATIONAL: (0.5, 3.4e-5)}
@@ -124,7 +124,7 @@ def flight_seconds(first: Experiment, results: Results, scans: float) -> float:
 
 @functools.cache
 def slowness() -> float:
-    """Time of `probe` here over that beside which the costs were measured; once per process."""
+    """Time of `probe` here over `PROBE_SECONDS`; once per process."""
     probe()  # loads libraries
     start = time.process_time()
     for _ in range(_PROBES):

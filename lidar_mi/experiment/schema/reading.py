@@ -17,7 +17,7 @@ from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 from lidar_mi.units import AS_GIVEN
 
-BESIDE_VARIANTS = (
+RESERVED_NAMES = (
     "study.yaml",
     "experiment.yaml",
     "log.txt",
@@ -130,8 +130,8 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
             )
         if str(name) in found:
             raise InputError(f"{place}: not allowed; another variant has this name")
-        if str(name).lower() in BESIDE_VARIANTS:
-            raise InputError(f"{place}: not allowed; a file beside the variants has this name")
+        if str(name).lower() in RESERVED_NAMES:
+            raise InputError(f"{place}: not allowed; a file of the study has this name")
         if not isinstance(changes, dict):
             raise InputError(f"{place}: {changes!r} is not allowed; expected keys to change")
         if "name" in changes:
@@ -190,8 +190,8 @@ def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if not isinstance(base, str) or len(base) > _LONGEST_NAME or "\0" in base:
         shown = repr(base)[:60]
         raise InputError(f"{path}: base: {shown} is not allowed; expected an experiment's name")
-    beside = path.parent / base
-    file = beside if beside.is_file() else experiment_file(base)
+    sibling = path.parent / base
+    file = sibling if sibling.is_file() else experiment_file(base)
     chain = (*above, path.resolve())
     if file.resolve() in chain:
         raise InputError(f"{path}: base: {base} is based on this file; expected another experiment")

@@ -112,7 +112,7 @@ class Texture(Section):
 class Wake(Section):
     """The flow and the tracers in it."""
 
-    file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
+    file: str | None = Field(None, description="NetCDF file; in the experiment's folder or shipped")
     vortex_pair: VortexPair | None = None
     turbine: Turbine | None = None
     time: _Moment | None = Field(None, description="needed when the file holds several")

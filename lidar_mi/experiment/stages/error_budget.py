@@ -164,8 +164,8 @@ def _budgets(
         for cause, case in images.items():
             source = sources.get(cause)
             if known is not None and source:
-                kept = known.sel(source=source, algorithm=method)
-                winds[cause] = kept.assign_attrs(method=method, **settings)
+                retrieved = known.sel(source=source, algorithm=method)
+                winds[cause] = retrieved.assign_attrs(method=method, **settings)
             else:
                 corrected = 0.0 if cause in _SHARP else blur
                 # the flags that count are those of the images as measured
@@ -241,10 +241,10 @@ def _images(
         timed["scan_time"], times["scan_time"] = as_measured(photographs), None
     for cause, platform in platforms_without(sensor.platform).items():
         other = replace(sensor, platform=platform)
-        flown = other.plans(truth)
-        moving = other.slab_images(truth, flows, flown)
-        timed[cause] = as_measured(moving, flown)
-        times[cause] = _without_noise(other, moving, flown, pair)[1]
+        its_plans = other.plans(truth)
+        its_air = other.slab_images(truth, flows, its_plans)
+        timed[cause] = as_measured(its_air, its_plans)
+        times[cause] = _without_noise(other, its_air, its_plans, pair)[1]
     without = images_without(
         measured,
         blurred,

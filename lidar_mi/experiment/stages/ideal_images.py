@@ -81,13 +81,13 @@ def ideal_scan(
     if plan.beams is None:
         return xr.Dataset({"Y": states[0].drop_vars("time").interp(nodes)})
     middle = plan.position + plan.centre
-    told = plan.beams.reported_places(middle)
+    reported = plan.beams.reported_places(middle)
     seen = _at_beams(states, plan.beams.time, plan.beams.true_places(middle))
     fields = {
         "Y": seen,
         "beam_time": plan.beams.time,
-        "y_reported": told[:, 0],
-        "z_reported": told[:, 1],
+        "y_reported": reported[:, 0],
+        "z_reported": reported[:, 1],
     }
     scan = xr.Dataset(
         {name: (("z", "y"), plan.as_image(values)) for name, values in fields.items()}, nodes
