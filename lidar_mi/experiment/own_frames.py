@@ -165,6 +165,7 @@ is determined
     etalon = doppler.assumed.of(doppler.etalon)
     wavelength = doppler.lidar.wavelength
     gap = etalon.tuned_gap(wavelength)
+    # the gap that gives the laser's order_fraction is the same for all lines
     fixed = etalon.model_copy(update={"gap": gap, "order_fraction": None})
     found = [first]
     for one, images in lines.items():

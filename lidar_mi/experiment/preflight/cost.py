@@ -127,6 +127,7 @@ def slowness() -> float:
     """Time of `probe` here over `PROBE_SECONDS`; once per process."""
     probe()  # loads libraries
     start = time.process_time()
+    # the mean of several: other programs disturb a single one
     for _ in range(_PROBES):
         probe()
     return (time.process_time() - start) / (_PROBES * PROBE_SECONDS)
@@ -156,6 +157,7 @@ def render_seconds(experiment: Experiment, results: Results) -> float:
         if experiment.detector:
             number = call(chosen_samples, experiment, **needed).number
         choosing = time.process_time() - begin
+        # callers time two images, which share one choice
         return choosing / 2 + render_seconds(with_number(experiment, number), results)
     beams, least = plan.y.size * plan.z.size, 2 * experiment.scan.gate_count
     few = max(2, least, round(_SAMPLES / 4 / (beams * render.max_order)))
@@ -168,11 +170,13 @@ def render_seconds(experiment: Experiment, results: Results) -> float:
             pass
         return time.process_time() - start
 
+    # the first image also loads and compiles, which is not part of an image's time
     if whole <= 4 * few:
         timed(whole)
         return timed(whole)
     timed(few)
     short, long = timed(few), timed(4 * few)
+    # linear in the samples; disturbed times may make the longer image the faster one
     return short + max(long - short, 0.0) * (whole - few) / (3 * few)
 
 

@@ -231,6 +231,7 @@ def _images(
         return [gain * image + offset for image in images]
 
     advected = None
+    # a single plane that its own flow advects has no out-of-plane motion to leave out
     if truth.extinction[0].sizes["x"] > 1 or sensor.wake.second != "advect":
         advected = as_measured(_advected_by_the_mean(sensor.platform.dt, truth, air))
     photographs = [truth.image(k) for k in (0, 1)]

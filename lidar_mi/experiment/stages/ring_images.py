@@ -175,6 +175,7 @@ def check_rings(doppler: Doppler, rings: Rings) -> None:
     laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
     settings = [(rings.line, doppler.render), (laser, doppler.render)]
     if doppler.path_samples:
+        # single paths are traced through a real lens: another scene to check
         settings[1] = laser, _path_by_path(doppler.render, doppler.path_samples)
     for line, render in settings:
         scene_dict(doppler.etalon, doppler.camera, line, render)

@@ -88,6 +88,7 @@ def fit_pairs(
     pair, noise = list(rendered_pairs(wake, scan, detector, scans).values())[-1]
     times = pixel_times(wake, scan, scans)
     common, rotation = common_error(retrieval, platform, plans)
+    # as functions: a refused fit to the images must not prevent that to the vectors
     ways: dict[Origin, Callable[[], VortexPairFit]] = {
         Origin.IMAGES: lambda: fit_vortices(
             pair[0], pair[1], platform.dt, noise, times=times
