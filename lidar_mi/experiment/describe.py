@@ -1,6 +1,6 @@
 """Contents of a file, a folder of results or a named scatterer, as titled tables of text."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import xarray as xr
 from lidar_mi.atmosphere.aerosols import AEROSOLS
 from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
 from lidar_mi.atmosphere.particle_scattering import Notice
-from lidar_mi.atmosphere.scattering import describe
+from lidar_mi.atmosphere.scattering import ScatteringTable, describe
 from lidar_mi.errors import InputError
 from lidar_mi.io.netcdf import load_variable, open_netcdf
 from lidar_mi.io.scattering_table import aerosol_table, read_table
@@ -19,7 +19,7 @@ from lidar_mi.io.vortex_file import read_vortices
 
 MOLECULES = "molecules"
 
-Section = tuple[str, list[tuple[str, ...]]]
+Section = tuple[str, Sequence[tuple[str, ...]]]
 """A title and rows of equal length."""
 
 
@@ -97,7 +97,7 @@ def _vortices(path: Path) -> Iterator[Section]:
         yield f"{path}: vortex pair, {name}, {fit.profile.replace('_', ' ')}", rows
 
 
-def _scatterer(title: str, table) -> Section:
+def _scatterer(title: str, table: ScatteringTable) -> Section:
     return title, list(describe(table).items())
 
 
@@ -106,7 +106,7 @@ def _table_file(path: Path) -> Iterator[Section]:
 
 
 def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
-    """The whole band of Rayleigh scattering beside the line that a narrow receiver detects."""
+    """The whole band of Rayleigh scattering, and the line that a narrow receiver detects."""
     pressure, temperature = standard_atmosphere(altitude)
     bands = [molecular_scattering(wavelength, pressure, temperature, band) for band in BANDS]
     rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"), strict=True)))]
@@ -194,7 +194,7 @@ def _study(folder: Path) -> Iterator[Section]:
     ]
     if found:
         yield "results", [("", *metrics), *found]
-    yield _files(folder, beside=records)
+    yield _files(folder, without=records)
 
 
 def _run_folder(folder: Path) -> Iterator[Section]:
@@ -214,13 +214,13 @@ def _run_folder(folder: Path) -> Iterator[Section]:
     yield _files(folder)
 
 
-def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
+def _files(folder: Path, without: Iterable[str] = ()) -> Section:
     """Files in a folder, without those in some of its folders."""
     paths = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return "files", [
         (str(name), f"{path.stat().st_size / 1e6:.2f} MB")
         for name, path in paths.items()
-        if name.parts[0] not in beside
+        if name.parts[0] not in without
     ]
 
 
@@ -235,7 +235,7 @@ _OF_A_FLIGHT = (
 )
 
 
-def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
+def _asked_first(experiment: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
     """The main keys of an experiment, as far as it has them and they have an effect."""
     flies = value_at(experiment, "encounter") is not None
     for key in (
@@ -271,7 +271,7 @@ def value_at(experiment: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def _short(value) -> str:
+def _short(value: object) -> str:
     """A value in a line; numbers with the 7 digits that single precision has."""
     if isinstance(value, (float, np.floating)):
         value = f"{value:.7g}"

@@ -1,8 +1,9 @@
 """Results of a run folder in formats that other programs read: VTK, CSV, MATLAB."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -127,7 +128,7 @@ def _one_by_one(name: str, data: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]
         yield from _one_by_one(f"{name}_{label}", data.sel({labels[0]: label}))
 
 
-def _results(folder: Path, record: dict) -> Iterator[tuple[str, xr.Dataset]]:
+def _results(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[str, xr.Dataset]]:
     """Data sets with the coordinates x, y, z, as far as their files are there."""
     for name in IMAGES:
         if (folder / f"{name}.exr").is_file():
@@ -144,7 +145,7 @@ def _results(folder: Path, record: dict) -> Iterator[tuple[str, xr.Dataset]]:
             yield "vortices", _vortices(fits).assign_coords(x=_slab(record))
 
 
-def _slab(record: dict) -> xr.Variable:
+def _slab(record: Mapping[str, Any]) -> xr.Variable:
     """Middle of the slab in which cross-flow winds are retrieved."""
     start, depth = (
         to_si(value_at(record["experiment"], f"scan.{key}"), "m", "500 m")
@@ -167,10 +168,12 @@ def _placed_scan(scan: xr.Dataset) -> xr.Dataset:
     dims = ("gate", "z", "y")
     x = middle.broadcast_like(scan["S0"]).transpose(*dims)
     places = {"x": telescope + x, "y": x / centre * scan["y"], "z": x / centre * scan["z"]}
-    kept = scan.drop_vars(["y", "z"]).rename_dims(y="column", z="row")
+    gates = scan.drop_vars(["y", "z"]).rename_dims(y="column", z="row")
     dims = ("gate", "row", "column")
     attrs = {"x": _AHEAD, "y": scan["y"].attrs, "z": scan["z"].attrs}
-    return kept.drop_vars([n for n in kept.data_vars if "gate" not in kept[n].dims]).assign_coords(
+    # sums over the gates have no place along x
+    sums = [name for name, field in gates.data_vars.items() if "gate" not in field.dims]
+    return gates.drop_vars(sums).assign_coords(
         {n: (dims, p.transpose("gate", "z", "y").values, attrs[n]) for n, p in places.items()}
     )
 
@@ -196,7 +199,7 @@ def _vortices(fits: dict[str, VortexPairFit]) -> xr.Dataset:
     sides = ("port", "starboard")
     pairs = []
     for fit in fits.values():
-        variables: dict[str, tuple] = {}
+        variables: dict[str, tuple[Any, ...]] = {}
         for name, found in fit.quantities.items():
             about = {"units": found.units, "long_name": found.long_name}
             side, _, own = name.partition("_")
@@ -211,5 +214,5 @@ def _vortices(fits: dict[str, VortexPairFit]) -> xr.Dataset:
                 variables[f"{own}_stderr"] = "vortex", errors, {"units": found.units}
         variables["accepted"] = (), int(fit.success), {"units": "1"}
         pairs.append(xr.Dataset(variables))
-    found = xr.concat(pairs, "fit").assign_coords(fit=list(fits), vortex=list(sides))
-    return found.set_coords(["y", "z"])
+    joined = xr.concat(pairs, "fit").assign_coords(fit=list(fits), vortex=list(sides))
+    return joined.set_coords(["y", "z"])

@@ -48,8 +48,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
 def _of_slabs(slabs: xr.Dataset, *axes: str) -> xr.Dataset:
     """Variables of all nodes of the slabs."""
     names = [name for name, value in slabs.data_vars.items() if {"x", *axes} == set(value.dims)]
-    kept = slabs[names]
-    return kept.drop_vars([name for name in kept.coords if name not in ("x", *axes)])
+    chosen = slabs[names]
+    return chosen.drop_vars([name for name in chosen.coords if name not in ("x", *axes)])
 
 
 def _sources(track: xr.Dataset) -> list[str]:
@@ -61,7 +61,7 @@ def _points(track: xr.Dataset, source: str) -> xr.Dataset:
     one = track.sel(source=source, drop=True)
     names = [str(name).removeprefix("port_") for name in one if str(name).startswith("port_")]
     shared = one[["x", "time"]].to_dataarray("name").values
-    found: dict[str, list] = {name: [] for name in names}
+    found: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for side in _SIDES:
         for name in names:
             found[name].append(one[f"{side}_{name}"].values)

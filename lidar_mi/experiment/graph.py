@@ -282,6 +282,7 @@ class Graph:
     def _in_order(self, stages: Sequence[Stage]) -> list[Stage]:
         """Each behind those that it needs, otherwise as given."""
         all_names = {stage.name for stage in stages}
+        # a preflight stage cannot wait for these
         late = {stage.name for stage in stages if not (stage.preflight or stage.on_demand)}
         ordered: list[Stage] = []
         there: set[str] = set()

@@ -50,9 +50,9 @@ def measure(
     if "error_budget" in results:
         for method, budget in results["error_budget"].items():
             metrics |= {budget_key(method, key): value for key, value in budget.items()}
-    if "v_los" in results:
-        settings = experiment.doppler.retrieval
-        metrics |= ring_budget_metrics(results["ring_budget"], settings.averaged)
+    if experiment.doppler is not None and "v_los" in results:
+        averaged = experiment.doppler.retrieval.averaged
+        metrics |= ring_budget_metrics(results["ring_budget"], averaged)
         metrics |= velocity_metrics(results["v_los"])
     if "lines" in results:
         metrics |= _sensor(results)
@@ -114,14 +114,17 @@ def measured(
     Points are lines of sight where velocities along them are required, else valid vectors whose
     windows do not overlap.
     """
-    retrieval, depth = experiment.retrieval, experiment.doppler.lidar.range_bin
+    doppler, sensor = experiment.doppler, experiment.sensor
+    # requirements are read for the sensor alone, which has both lidars
+    assert doppler is not None and sensor is not None
+    retrieval, depth = experiment.retrieval, doppler.lidar.range_bin
     overlap = min(1.0, retrieval.stride / retrieval.template) ** 2
     along = any(row.quantity == "error_v_los" for row in table.rows)
     vectors = math.floor(overlap * metrics["sensor.vectors"])
     return {
         "range": experiment.scan.range + experiment.scan.thickness / 2,
         "points_per_slab": metrics["sensor.lines_retrieved"] if along else vectors,
-        "slabs_per_second": experiment.sensor.slabs_per_second,
+        "slabs_per_second": sensor.slabs_per_second,
         "slab_depth": depth if along else max(depth, experiment.scan.thickness),
         "error_v_los": metrics.get("sensor.rmse_v_los"),
         **{f"error_{n}": metrics.get(f"sensor.outside_cores.rmse_{n}") for n in COMPONENTS},

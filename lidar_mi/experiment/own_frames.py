@@ -27,7 +27,7 @@ from lidar_mi.retrieval.rings.calibration import Calibration, calibrated
 from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
 from lidar_mi.retrieval.rings.calibration_lines import combined
 from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
-from lidar_mi.retrieval.rings.model import RingModel
+from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
 
 
 def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") -> Doppler:
@@ -65,7 +65,7 @@ def read_electrons(
     ------
     InputError
         A file that is no image, frames of different sizes, a rendered image: its values are
-        relative energies, which no pulse and no noise can be told from.
+        relative energies, from which neither a pulse nor its noise follows.
     """
     found: list[np.ndarray] = []
     for path in paths:
@@ -108,7 +108,7 @@ def calibrate_etalon(
         The nominal instrument: an experiment with a section ``doppler``, its file or the name of a
         shipped one. Laser, etalon, camera and CCD are taken from it.
     flat : array, shape (height, width), optional
-        Mean of frames of even white light, any scale; pixels of 0 are left out.
+        Mean of frames of even white light, any scale; pixels of 0 are masked.
     lines : mapping of float to array, optional
         Frames of further narrow lines by their wavelengths (m; in vacuum, or in the gap's gas times
         ``doppler.etalon.index``, as the laser's): they give the gap. All that does not depend on
@@ -165,6 +165,7 @@ is determined
     etalon = doppler.assumed.of(doppler.etalon)
     wavelength = doppler.lidar.wavelength
     gap = etalon.tuned_gap(wavelength)
+    # the gap that gives the laser's order_fraction is the same for all lines
     fixed = etalon.model_copy(update={"gap": gap, "order_fraction": None})
     found = [first]
     for one, images in lines.items():
@@ -225,7 +226,7 @@ def retrieve_v_los(
     -------
     xr.Dataset, dim frame
         ``v_los`` (m s-1, positive toward the instrument), ``v_los_std`` its random standard error,
-        ``v_los_systematic`` that which the calibration leaves to all frames alike, ``chi_square``,
+        ``v_los_systematic`` that of the calibration, common to all frames, ``chi_square``,
         ``rings``, and ``status``: empty, or why a frame has no speed (NaN).
 
     Raises
@@ -244,19 +245,21 @@ def retrieve_v_los(
     (nan, 'image: its gradients have no common centre; expected rings')
     """
     doppler = doppler_of(instrument)
-    models = ring_models(doppler)
+    air, laser = ring_models(doppler)
     response = None
     if calibration is not None:
-        models = tuple(calibrated(model, calibration) for model in models)
+        air, laser = calibrated(air, calibration), calibrated(laser, calibration)
         response = torch.from_numpy(np.asarray(calibration.response, float))
     limit = doppler.retrieval.max_chi_square if max_chi_square is None else max_chi_square
     noise = pixel_noise(doppler.ccd)
 
-    def fitted(name, images, model):
+    def fitted(name: str, images: torch.Tensor, model: RingModel) -> _Fits:
         return _each(images, name, model, noise, response, limit, calibration is not None)
 
     batch = _batch("frames", frames, doppler)
-    received, status = fitted("frames", batch, models[0])
+    received, status = fitted("frames", batch, air)
+    # v_LOS, its random and its systematic standard error
+    parts: list[tuple[torch.Tensor, ...] | None] = []
     if reference is None:
         parts = [
             None if fit is None else (fit.v_los, fit.v_los_std, fit.v_los_systematic)
@@ -269,13 +272,12 @@ def retrieve_v_los(
                 f"reference: {len(own)} frames are not allowed; expected as many as frames, "
                 f"{len(batch)}, or a divisor of that"
             )
-        emitted, faults = fitted("reference", own, models[1])
+        emitted, faults = fitted("reference", own, laser)
         each = len(batch) // len(own)
-        parts = []
         for k, fit in enumerate(received):
-            laser = emitted[k // each]
+            zero = emitted[k // each]
             status[k] = status[k] or faults[k // each]
-            parts.append(None if fit is None or laser is None else difference(fit, laser))
+            parts.append(None if fit is None or zero is None else difference(fit, zero))
     columns = np.full((5, len(batch)), np.nan)
     for k, (part, fit) in enumerate(zip(parts, received, strict=True)):
         if part is not None:
@@ -305,9 +307,18 @@ _VARIABLES = (
 )
 
 
+_Fits = tuple[list[RingFit | None], list[str]]
+
+
 def _each(
-    images, name, model, noise, response, limit, known
-) -> tuple[list[RingFit | None], list[str]]:
+    images: torch.Tensor,
+    name: str,
+    model: RingModel,
+    noise: PixelNoise,
+    response: torch.Tensor | None,
+    limit: float,
+    known: bool,
+) -> _Fits:
     """The fit of every image, or None and why not."""
     found: list[RingFit | None] = []
     status = []

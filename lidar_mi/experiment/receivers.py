@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from lidar_mi.atmosphere.line import backscatter_line, laser_line
+from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.stages.ring_instrument import TEMPERATURE_NODES, pixel_noise
@@ -209,7 +209,9 @@ def detected_fraction(receiver: Receiver) -> float:
     return float((mean - channels.background).sum())
 
 
-def _line(lidar, temperature=None, aerosol=None):
+def _line(
+    lidar: DopplerLidar, temperature: float | None = None, aerosol: float | None = None
+) -> Line:
     """The line at the lidar's altitude, or at another temperature, with another aerosol."""
     pressure, usual = standard_atmosphere(lidar.altitude)
     return backscatter_line(
@@ -222,10 +224,33 @@ def _line(lidar, temperature=None, aerosol=None):
     )
 
 
-def _receiver(lidar, detector, harmonics, delay, modes, pixels=1.0, ratio=False):
-    """A receiver of channels with these harmonics of the frequency."""
+def _receiver(
+    lidar: DopplerLidar,
+    detector: CCD,
+    harmonics: np.ndarray,
+    delay: float,
+    modes: float,
+    pixels: float | np.ndarray = 1.0,
+    ratio: bool = False,
+) -> Receiver:
+    """A receiver of channels with these harmonics of the frequency.
+
+    Parameters
+    ----------
+    harmonics : array, shape (channels, harmonics)
+        Of the transmission, complex.
+    delay : float
+        Inverse of its period, s.
+    modes : float
+        Of the speckle in a channel.
+    pixels : float or array, shape (channels,)
+        Of the detector in a channel.
+    ratio : bool
+        Whether speeds are read from the ratio of two signals.
+    """
     times = np.arange(harmonics.shape[1]) * delay
-    temperatures = standard_atmosphere(lidar.altitude)[1] * np.array(TEMPERATURE_NODES)
+    usual = standard_atmosphere(lidar.altitude)[1]
+    temperatures = [usual * node for node in TEMPERATURE_NODES]
     lines = [_line(lidar, kelvin, 0.0).characteristic(times) for kelvin in temperatures]
     laser = laser_line(lidar.wavelength, lidar.laser_width).characteristic(times)
     # in front of the receiver, so without an etalon
@@ -236,7 +261,7 @@ def _receiver(lidar, detector, harmonics, delay, modes, pixels=1.0, ratio=False)
         molecules=torch.from_numpy(harmonics * np.array(lines)[:, None]),
         aerosol=torch.from_numpy(harmonics * laser),
         period=lidar.wavelength / (2 * delay),
-        temperatures=temperatures,
+        temperatures=np.array(temperatures),
         background=torch.from_numpy(electrons + pixels * dark),
         pixels=torch.as_tensor(pixels),
     )
@@ -246,12 +271,13 @@ def _receiver(lidar, detector, harmonics, delay, modes, pixels=1.0, ratio=False)
     return Receiver(channels, pixel_noise(detector, modes), level, lidar.aerosol_fraction)
 
 
-def _monotone(channels, aerosol):
+def _monotone(channels: ChannelModel, aerosol: float) -> tuple[float, float]:
     """Speeds about 0 between which the ratio of two signals is that of one speed, m/s."""
     speeds = np.linspace(-channels.period / 2, channels.period / 2, _SPEEDS)
     parameters = parameter_vector(channels, aerosol=aerosol).repeat(_SPEEDS, 1)
     parameters[:, 0] = torch.from_numpy(speeds)
-    signal = mean_and_jacobian(channels, parameters)[0] - channels.background
+    background = torch.as_tensor(channels.background)
+    signal = mean_and_jacobian(channels, parameters)[0] - background
     steps = torch.diff(torch.log(signal[:, 1] / signal[:, 0])).numpy()
     middle = _SPEEDS // 2
     if not steps[middle - 1] * steps[middle] > 0:

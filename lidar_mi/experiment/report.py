@@ -56,13 +56,17 @@ def chapters(
     seconds: dict[str, float] = defaultdict(float)
     log("drawing figures")
     # the wind behind a turbine is mostly u, which both lidars measure together
-    first = "lines" if experiment.wake and experiment.wake.turbine else None
+    first = "lines" if _behind_turbine(experiment) else None
     for result, step, chapter in sorted(_CHAPTERS, key=lambda one: one[0] != first):
         if results.get(result) is not None:
             start = time.perf_counter()
             found.append(chapter(experiment, results, metrics, folder, log))
             seconds[step] += time.perf_counter() - start
     return found, seconds
+
+
+def _behind_turbine(experiment: Experiment) -> bool:
+    return experiment.wake is not None and experiment.wake.turbine is not None
 
 
 def _backscatter(
@@ -88,7 +92,9 @@ def _volume(
 def _pointing(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
-    return pointing_chapter(metrics, pointing_figures.draw_all(folder, results["pointing"], log))
+    pointing = results["pointing"]
+    assert pointing is not None  # `chapters` leaves out those of None
+    return pointing_chapter(metrics, pointing_figures.draw_all(folder, pointing, log))
 
 
 def _error_budget(
@@ -102,13 +108,14 @@ def _doppler(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
     doppler = experiment.doppler
+    assert doppler is not None  # whose results these are
     drawn = doppler_figures.draw_all(
         folder,
         doppler,
         results["exposure"],
         results["lit_rings"].photons,
         results["v_los"],
-        metrics,
+        dict(metrics),
         log,
     )
     return doppler_chapter(doppler, metrics, drawn)
@@ -123,7 +130,7 @@ def _sensor(
     vectors = (
         None
         if found is None
-        else map_data(found, COMPONENTS, cores, "u" if experiment.wake.turbine else "")
+        else map_data(found, COMPONENTS, cores, "u" if _behind_turbine(experiment) else "")
     )
     verdicts = judged(experiment, results, metrics)
     return sensor_chapter(experiment, metrics, verdicts, drawn, vectors)

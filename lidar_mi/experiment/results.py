@@ -126,7 +126,7 @@ class Run(Tabular):
 
     def thumbnail(self) -> bytes | None:
         """Image of the backscatter lidar and cross-flow wind, where there are any, as PNG."""
-        if "wind" not in self.results or not self.scans:
+        if self.truth is None or "wind" not in self.results or not self.scans:
             return None
         figure, _ = overview(self.truth, self.scans, self.results["wind"], self.cores)
         return png_bytes(figure)

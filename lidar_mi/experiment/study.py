@@ -5,12 +5,14 @@ report, its figure and all metrics, named VARIANT.METRIC.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
 from lidar_mi.assessment.figures.comparison import draw_comparison
+from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.report.comparison import page
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run as experiment
@@ -25,14 +27,14 @@ from lidar_mi.experiment.folder.run_folder import (
     refuse_strangers,
 )
 from lidar_mi.experiment.folder.run_folder import RECORD as RUN
-from lidar_mi.experiment.log import Log, Notice, silent
-from lidar_mi.experiment.results import Run
+from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.schema.experiment import NAME, Experiment
 from lidar_mi.experiment.schema.reading import settings as settings_of
 from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import write_json
 from lidar_mi.io.text import write_text
 from lidar_mi.io.yaml import read_yaml, to_yaml
+from lidar_mi.progress import Notice
 
 RECORD = "study.yaml"
 
@@ -78,7 +80,7 @@ def run(
             metrics[key], found[key] = done.metrics, done.answer
             # a variant without a wake has rings only, which the table compares
             if done.wind is not None:
-                rows[key] = _shown(done)
+                rows[key] = _shown(done.scans[0], done.wind, done.cores)
         log = Log(notice, folder / LOG)
         log(f"comparing {', '.join(variants)}")
         drawn = draw_comparison(folder / FIGURES, rows, log) if rows else []
@@ -93,7 +95,7 @@ def run(
 
 def read_study(
     folder: str | Path,
-) -> tuple[str, dict[str, dict | None], dict[str, dict[str, float]]]:
+) -> tuple[str, dict[str, dict[str, Any] | None], dict[str, dict[str, float]]]:
     """The contents of a study's folder.
 
     Returns
@@ -144,13 +146,14 @@ def _of(variant: str, notice: Notice) -> Notice:
     return named
 
 
-def _shown(run: Run) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:
+def _shown(
+    scan: xr.Dataset, wind: xr.Dataset, cores: Sequence[Core]
+) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:
     """First image of the instrument, wind by the first method, positions of true cores.
 
     Of winds in three dimensions the layer nearest to the first gate, that of the image.
     """
-    scan = run.scans[0]
-    wind = run.wind.isel(source=-1, algorithm=0)  # behind the detector, where there is one
+    wind = wind.isel(source=-1, algorithm=0)  # behind the detector, where there is one
     wind = wind.isel(x=0) if "x" in wind.dims else wind
-    cores = [(core.y, core.z) for core in run.cores]
-    return scan["Y_noisy" if "Y_noisy" in scan else "Y"], wind, cores
+    places = [(core.y, core.z) for core in cores]
+    return scan["Y_noisy" if "Y_noisy" in scan else "Y"], wind, places

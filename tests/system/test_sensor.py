@@ -265,7 +265,7 @@ def test_two_lines_give_no_vector_which_is_reported(whole, tmp_path, monkeypatch
     assert (
         "Warning: no vector from both lidars is valid; 100 % have the flag beyond_lines" in report
     )
-    assert "no wind from lines of sight alone: no three lines beside each other could" in report
+    assert "no wind from lines of sight alone: no three neighbouring lines could" in report
     # the scan and the vectors that were rejected, but no figures of nothing
     assert (
         "The scan of the Doppler lidar" in report

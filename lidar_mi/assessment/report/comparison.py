@@ -140,8 +140,12 @@ def _row(
 
 
 def _shown(values: Sequence[float | None], unit: str) -> list[str]:
-    style = {"m/s": fixed, "%": lambda fraction: three(100 * fraction)}.get(unit, three)
-    return ["-" if value is None else style(value) for value in values]
+    def shown(value: float) -> str:
+        if unit == "m/s":
+            return fixed(value)
+        return three(100 * value if unit == "%" else value)
+
+    return ["-" if value is None else shown(value) for value in values]
 
 
 def _named(source: str, method: str) -> str:

@@ -69,7 +69,7 @@ class RunFolder:
     ----------
     path : path
     experiment : Experiment
-    beside : path
+    search_path : path
         Folder in which files named by the experiment are looked for first.
     shared : Store, optional
         Images that are shared with other runs: used if they are there, else added.
@@ -87,15 +87,15 @@ class RunFolder:
         self,
         path: str | Path,
         experiment: Experiment,
-        beside: str | Path,
+        search_path: str | Path,
         shared: Store | None = None,
     ):
         self.path = Path(path)
         self.figures = self.path / FIGURES
         self.log = self.path / LOG
-        self._experiment, self._beside = experiment, Path(beside)
-        self._inputs = _inputs(experiment, beside)
-        self.record = new_record(experiment, beside)
+        self._experiment, self._search_path = experiment, Path(search_path)
+        self._inputs = _inputs(experiment, search_path)
+        self.record = new_record(experiment, search_path)
         self.made_by = made_by(self.record)
         self._shared = shared
         self._images = ImageStore(lambda part: self.path, lambda part: self.made_by)
@@ -153,7 +153,7 @@ class RunFolder:
                     f"{field}: {path} lies where this run writes; expected another folder (-o DIR)"
                 )
         # the record of a run is an experiment file, too
-        if changed and self._beside.resolve() == here:
+        if changed and self._search_path.resolve() == here:
             raise InputError(
                 f"{self.path}: holds the experiment that this one was made from; expected another "
                 "folder (-o DIR)"
@@ -302,11 +302,13 @@ def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
         raise InputError(f"{folder}: is no {kind}; expected an empty or a new one (-o DIR)")
 
 
-def new_record(experiment: Experiment, beside: str | Path) -> dict[str, Any]:
+def new_record(experiment: Experiment, search_path: str | Path) -> dict[str, Any]:
     """Record of a run to be: ``experiment`` (resolved), ``files`` (checksums), ``versions``."""
     return {
         "experiment": reading.settings(experiment),
-        "files": {field: _checksum(path) for field, path in _inputs(experiment, beside).items()},
+        "files": {
+            field: _checksum(path) for field, path in _inputs(experiment, search_path).items()
+        },
         "versions": dict(_versions()),
         "metrics": None,
     }
@@ -340,7 +342,7 @@ def made_by(record: Mapping[str, Any], keys: Keys | None = None) -> str:
     return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
 
 
-def _difference(before: dict, now: dict) -> str | None:
+def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
     """The first difference to an earlier run that affects its images; None: there is none."""
     changed = reading.in_si(before["experiment"]) != reading.in_si(now["experiment"])
     if changed or before.get("files") != now["files"]:
@@ -352,14 +354,14 @@ def _difference(before: dict, now: dict) -> str | None:
     return None
 
 
-def _inputs(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
+def _inputs(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
     """The files named by an experiment, by key: a changed file makes another experiment."""
     if experiment.wake is None:
         return {}
-    paths = table_files(experiment.scattering, beside)
+    paths = table_files(experiment.scattering, search_path)
     if experiment.wake.file:
-        paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
-    return paths | timing_files(experiment, beside)
+        paths["wake.file"] = find_file(experiment.wake.file, search_path, "wake.file")
+    return paths | timing_files(experiment, search_path)
 
 
 def _checksum(path: Path) -> str:
@@ -373,7 +375,7 @@ def _checksum_of(path: Path, size: int, changed: int) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def read_record(folder: str | Path) -> dict:
+def read_record(folder: str | Path) -> dict[str, Any]:
     """Record of a run folder: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
 
     Raises

@@ -14,11 +14,14 @@ from lidar_mi.assessment.metrics.requirements import RequirementTable, look_ahea
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.graph import call
-from lidar_mi.experiment.log import Log, Notice, silent
+from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.preflight.cost import cost, with_number
+from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.sensor import Sensor
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_remarks import window_reach
 from lidar_mi.experiment.stages.light_budget import light_budget
 from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
@@ -29,7 +32,7 @@ from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.scan_timing import Schedule
-from lidar_mi.progress import without_warnings
+from lidar_mi.progress import Notice, without_warnings
 from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.rendering.samples import Samples
@@ -42,7 +45,7 @@ LEAST_SHOWN = 0.5
 
 def sections(
     asked: Experiment,
-    beside: str | Path = ".",
+    search_path: str | Path = ".",
     notice: Notice = silent,
     *,
     timed: bool = False,
@@ -53,7 +56,7 @@ def sections(
     Parameters
     ----------
     asked : Experiment
-    beside : path
+    search_path : path
         Folder in which files named by the experiment are searched first.
     notice : callable
         Called with the name of the running step.
@@ -61,7 +64,7 @@ def sections(
         With the time of the run, which takes a probe of about a second.
     sampled : bool
         Say of Monte Carlo samples, where there is a detector, how many are chosen and what their
-        noise is beside its own, which takes an image of few samples.
+        noise is relative to its own, which takes an image of few samples.
 
     Raises
     ------
@@ -69,21 +72,22 @@ def sections(
         Anything that a run would refuse before it starts.
     """
     start = time.process_time()
-    prepared = experiment.prepare(asked, beside, without_warnings(notice))
-    preparation, ahead = time.process_time() - start, prepared.results
+    prepared = experiment.prepare(asked, search_path, without_warnings(notice))
+    preparation, results = time.process_time() - start, prepared.results
     chosen: Samples | None = None
     if asked.wake:
         if sampled and asked.detector:
-            needed = {name: ahead[name] for name in ("truth", "plans", "air", "flows")}
+            needed = {name: results[name] for name in ("truth", "plans", "air", "flows")}
             chosen = call(chosen_samples, asked, **needed, log=Log(notice))
-        yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"], chosen)
+        truth, plan, air = results["truth"], results["plans"][0], results["air"]
+        yield from _backscatter(asked, asked.wake, truth, plan, air, chosen)
         if asked.scan.timing:
-            schedule = scan_schedule(asked.scan, ahead["plans"][0], prepared.search_path)
+            schedule = scan_schedule(asked.scan, plan, prepared.search_path)
             yield "scan of the backscatter lidar", _timing(asked, schedule)
     if asked.doppler:
-        yield _doppler(asked)
+        yield _doppler(asked.doppler)
     if asked.sensor:
-        yield _sensor(asked, ahead["requirements"])
+        yield _sensor(asked.sensor, asked.platform.speed, results["requirements"])
         if asked.sensor.timing:
             yield (
                 "scan of the Doppler lidar",
@@ -92,25 +96,30 @@ def sections(
     if timed:
         notice("timing a few samples and a retrieval", None)
         whole = with_number(asked, chosen.number) if chosen else asked
-        yield "cost of the run, to a factor of 2", _cost(whole, ahead, preparation)
+        yield "cost of the run, to a factor of 2", _cost(whole, results, preparation)
     if prepared.warnings:
         yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
 
 
 def _backscatter(
-    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer, chosen: Samples | None
+    asked: Experiment,
+    wake: Wake,
+    truth: Truth,
+    plan: ScanPlan,
+    air: Scatterer,
+    chosen: Samples | None,
 ) -> Iterator[Section]:
     wind, extinction = truth.wind, truth.extinction[0]
     rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
     rows += [(name, _span(wind[name].values, "m/s")) for name in ("u", "v", "w") if name in wind]
-    if not asked.wake.turbine:
+    if not wake.turbine:
         rows.append(("vortices", sense_of_rotation(wind, find_cores(wind))))
     divergence = relative_divergence(wind)
     if divergence == divergence:
         rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
     rows.append(("extinction", _span(1e3 * extinction.values, "1/km")))
-    rows.append(("texture, rms", f"{asked.wake.texture.rms:.0%}"))
-    title = asked.wake.file or ("vortex_pair" if asked.wake.vortex_pair else "turbine")
+    rows.append(("texture, rms", f"{wake.texture.rms:.0%}"))
+    title = wake.file or ("vortex_pair" if wake.vortex_pair else "turbine")
     yield f"{asked.name}: extinction in the gates ({title}, about the scan's axis)", rows
 
     scan, lidar, platform = asked.scan, asked.lidar, asked.platform
@@ -164,9 +173,9 @@ def _light(
     return rows
 
 
-def _cost(asked: Experiment, ahead: Results, preparation: float) -> list[tuple[str, str]]:
+def _cost(asked: Experiment, results: Results, preparation: float) -> list[tuple[str, str]]:
     """Time of the parts of a run on one core of this machine, and its memory."""
-    found = cost(asked, ahead, preparation)
+    found = cost(asked, results, preparation)
     names = {
         "preparation": "reading, advection of the air",
         "rendering": "rendering (all cores share it)",
@@ -184,11 +193,13 @@ def _cost(asked: Experiment, ahead: Results, preparation: float) -> list[tuple[s
     rows.append(("all, on one core", f"about {duration(found.total)}"))
     beams = in_states = 0
     if asked.wake:
-        plan = ahead["plans"][0]
+        plan = results["plans"][0]
         beams = plan.y.size * plan.z.size
-        in_states = call(values_of_states, asked, flows=ahead["flows"], plans=ahead["plans"])
+        in_states = call(values_of_states, asked, flows=results["flows"], plans=results["plans"])
     expected = call(Footprint, asked).bytes(beams, in_states) / 1e9
-    allowed = ceiling((asked.render if asked.wake else asked.doppler.render).memory) / 1e9
+    # an experiment without a wake has a Doppler lidar
+    render = asked.render if asked.wake or not asked.doppler else asked.doppler.render
+    allowed = ceiling(render.memory) / 1e9
     rows.append(("memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"))
     return rows
 
@@ -212,15 +223,15 @@ def _displacements(asked: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[
     return rows
 
 
-def _doppler(asked: Experiment) -> Section:
-    lidar = asked.doppler.lidar
+def _doppler(doppler: Doppler) -> Section:
+    lidar = doppler.lidar
     return "Doppler lidar", [
         ("laser", _laser(lidar)),
         ("beam's divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
         ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
         ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
         ("photons of a pulse", f"{photons(lidar):.3g}"),
-        ("methods", ", ".join(asked.doppler.retrieval.methods)),
+        ("methods", ", ".join(doppler.retrieval.methods)),
     ]
 
 
@@ -233,7 +244,7 @@ def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
 
 
 def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
-    """What a scan in time asks of the laser and of the scanner, and how far it is flown."""
+    """What a scan in time asks of the laser and of the scanner, and the distance flown."""
     flown = asked.platform.speed * schedule.duration
     return [
         ("duration", f"{schedule.duration:.4g} s"),
@@ -244,11 +255,11 @@ def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
     ]
 
 
-def _sensor(asked: Experiment, tables: Mapping[tuple[str, str], RequirementTable]) -> Section:
-    sensor = asked.sensor
+def _sensor(
+    sensor: Sensor, speed: float, tables: Mapping[tuple[str, str], RequirementTable]
+) -> Section:
     columns, rows = sensor.directions.columns, sensor.directions.rows
     count = columns * rows
-    speed = asked.platform.speed
     judged = [" ".join(key) for key, table in tables.items() if table.applies_at(speed)]
     # further checks are made by a run
     flat = "; all in one plane: no wind from both" if min(columns, rows) == 1 else ""

@@ -1,8 +1,8 @@
 """Time of a run before it is started, calibrated on this machine by a probe of about a second.
 
 Rendering is timed with the experiment's own scene and few samples. All other steps have a cost per
-pixel that was measured beside a fixed piece of work, the probe; the time that the probe takes here
-and now over the time that it took then is the factor between the machines.
+pixel that was measured on one machine, together with a fixed piece of work, the probe. The time of
+the probe here and now over its time there is the factor between the machines.
 """
 
 import functools
@@ -20,7 +20,7 @@ from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMetho
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 PROBE_SECONDS = 0.115
-"""Processor time of `probe` beside which all costs below were measured."""
+"""Processor time of `probe` when all costs below were measured."""
 START = 3.0
 """Seconds: libraries, and kernels that are compiled."""
 IMAGE_METHODS = {
@@ -34,7 +34,7 @@ IMAGE_METHODS = {
 BOUND = (0.05, 5e-6)
 """The bound of a pair, and its true wind."""
 LEVEL = (0.08, 5e-6)
-"""A level of the texture sweep beside its correlation."""
+"""A level of the texture sweep, without its correlation."""
 CAUSES = 5
 """Retrievals of an error budget, per method."""
 VOLUME_METHODS = {VolumeMethod.CORRELATION: (0.5, 1.1e-5), VolumeMethod.VARIATIONAL: (0.5, 3.4e-5)}
@@ -81,52 +81,53 @@ class Cost(NamedTuple):
         return START + sum(self)
 
 
-def cost(experiment: Experiment, ahead: Results, preparation: float = 0.0) -> Cost:
+def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> Cost:
     """Processor time of a run on this machine, to a factor of two.
 
     Parameters
     ----------
     experiment : Experiment
-    ahead : mapping
+    results : mapping
         Results of the stages that `lidar_mi.experiment.run.prepare` has computed.
     preparation : float
         Processor time that it took, s.
     """
     here = slowness()
-    rendering = 2 * render_seconds(experiment, ahead) if experiment.wake else 0.0
+    rendering = 2 * render_seconds(experiment, results) if experiment.wake else 0.0
     return Cost(
         preparation,
         rendering,
-        here * _images(experiment, ahead),
+        here * _images(experiment, results),
         here * _rings(experiment),
         here * _lines(experiment),
         here * _figures(experiment),
     )
 
 
-def flight_seconds(first: Experiment, ahead: Results, scans: float) -> float:
+def flight_seconds(first: Experiment, results: Results, scans: float) -> float:
     """Processor time of a flight on this machine, to a factor of two.
 
     Parameters
     ----------
     first : Experiment
         The images of one slab.
-    ahead : mapping
+    results : mapping
         Results of the stages that `lidar_mi.experiment.run.prepare` has computed of it.
     scans : float
         Of the lidar; each is of two slabs. Flights without it take hardly any time.
     """
     here = slowness()
     each = here * (FLIGHT_SLAB + FLIGHT_LINES * _lines(first))
-    lidar = scans * (2 * render_seconds(first, ahead) + each) if scans else 0.0
+    lidar = scans * (2 * render_seconds(first, results) + each) if scans else 0.0
     return START + lidar + here * FLIGHT_FIGURES
 
 
 @functools.cache
 def slowness() -> float:
-    """Time of `probe` here over that beside which the costs were measured; once per process."""
+    """Time of `probe` here over `PROBE_SECONDS`; once per process."""
     probe()  # loads libraries
     start = time.process_time()
+    # the mean of several: other programs disturb a single one
     for _ in range(_PROBES):
         probe()
     return (time.process_time() - start) / (_PROBES * PROBE_SECONDS)
@@ -142,21 +143,22 @@ def probe() -> None:
     rng.poisson(np.full((500, 800), 30.0))
 
 
-def render_seconds(experiment: Experiment, ahead: Results) -> float:
+def render_seconds(experiment: Experiment, results: Results) -> float:
     """Time of one image, from the first one with few samples and with four times as many.
 
     Their difference has no part of what is done once, such as compiling. Where the number of
     samples is to be chosen, with the time of doing so.
     """
-    plan, render = ahead["plans"][0], experiment.render
-    needed = {name: ahead[name] for name in ("truth", "plans", "air", "flows")}
+    plan, render = results["plans"][0], experiment.render
+    needed = {name: results[name] for name in ("truth", "plans", "air", "flows")}
     if render.samples_per_beam == "auto":
         begin = time.process_time()
         number = render.without_detector(plan.gate_count)
         if experiment.detector:
             number = call(chosen_samples, experiment, **needed).number
         choosing = time.process_time() - begin
-        return choosing / 2 + render_seconds(with_number(experiment, number), ahead)
+        # callers time two images, which share one choice
+        return choosing / 2 + render_seconds(with_number(experiment, number), results)
     beams, least = plan.y.size * plan.z.size, 2 * experiment.scan.gate_count
     few = max(2, least, round(_SAMPLES / 4 / (beams * render.max_order)))
     whole = max(render.samples_per_beam, least)
@@ -168,11 +170,13 @@ def render_seconds(experiment: Experiment, ahead: Results) -> float:
             pass
         return time.process_time() - start
 
+    # the first image also loads and compiles, which is not part of an image's time
     if whole <= 4 * few:
         timed(whole)
         return timed(whole)
     timed(few)
     short, long = timed(few), timed(4 * few)
+    # linear in the samples; disturbed times may make the longer image the faster one
     return short + max(long - short, 0.0) * (whole - few) / (3 * few)
 
 
@@ -183,11 +187,11 @@ def with_number(experiment: Experiment, samples: int) -> Experiment:
     return found.read_from(experiment.folder)
 
 
-def _images(experiment: Experiment, ahead: Results) -> float:
+def _images(experiment: Experiment, results: Results) -> float:
     """Winds from images or volumes."""
     if not experiment.wake:
         return 0.0
-    plan = ahead["plans"][0]
+    plan = results["plans"][0]
     pixels = plan.y.size * plan.z.size
     if experiment.volume:
         voxels = pixels * experiment.scan.gate_count
@@ -226,9 +230,10 @@ def _rings(experiment: Experiment) -> float:
 
 def _lines(experiment: Experiment) -> float:
     """All lines of sight; the pulses of a line are summed, however many they are."""
-    if not experiment.sensor:
+    sensor, doppler = experiment.sensor, experiment.doppler
+    if sensor is None or doppler is None:
         return 0.0
-    directions, camera = experiment.sensor.directions, experiment.doppler.camera
+    directions, camera = sensor.directions, doppler.camera
     return RING_PAIR * directions.columns * directions.rows * camera.width * camera.height
 
 

@@ -1,7 +1,7 @@
 """The keys of the fringe-imaging Doppler lidar."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import AliasChoices, Field, field_validator, model_validator
 
@@ -50,7 +50,7 @@ class RingRetrieval(Section):
     ] = Field(2.0, allow_inf_nan=True, description="images that fit worse are refused")
 
     @model_validator(mode="after")
-    def _each_once(self):
+    def _each_once(self) -> Self:
         for key in ("methods", "centre", "averaged"):
             each_once(key, getattr(self, key))
         if self.slow_images > self.images:
@@ -107,7 +107,7 @@ class Doppler(Section):
         return number
 
     @model_validator(mode="after")
-    def _speeds_make_sense(self):
+    def _speeds_make_sense(self) -> Self:
         each_once("v_los", self.v_los)
         if self.path_samples == 1:
             raise ValueError("path_samples: 1 is not allowed; expected 0 or 2 and more")

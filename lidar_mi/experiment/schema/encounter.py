@@ -76,7 +76,7 @@ class Crow(Section):
 
 
 class WakeInTime(Section):
-    """How the wake changes in time and along its axis, beside its drift."""
+    """How the wake changes in time and along its axis, in addition to its drift."""
 
     decay_time: Annotated[Time, Within(1, 1e9, "a wake's life")] | None = Field(
         None, description="in which circulation falls to 1/e; default: it stays"

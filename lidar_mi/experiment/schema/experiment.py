@@ -5,7 +5,7 @@ Each section has a file; those of the instruments are in `lidar_mi.instrument`.
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Self
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -76,7 +76,7 @@ class Experiment(Tabular, Section):
         return copy
 
     @model_validator(mode="after")
-    def _gates_that_make_a_volume(self):
+    def _gates_that_make_a_volume(self) -> Self:
         if self.volume is None:
             return self
         wake, scan = self.wake, self.scan
@@ -115,7 +115,7 @@ class Experiment(Tabular, Section):
         return self
 
     @model_validator(mode="after")
-    def _both_lidars_for_the_sensor(self):
+    def _both_lidars_for_the_sensor(self) -> Self:
         if self.sensor is None:
             return self
         if self.wake is None or self.doppler is None:
@@ -134,7 +134,7 @@ class Experiment(Tabular, Section):
         return self
 
     @model_validator(mode="after")
-    def _molecules_beside_particles(self):
+    def _molecules_beside_particles(self) -> Self:
         phase = self.scattering.phase
         if (
             self.wake
@@ -148,7 +148,7 @@ class Experiment(Tabular, Section):
         return self
 
     @model_validator(mode="after")
-    def _something_to_do(self):
+    def _something_to_do(self) -> Self:
         if self.wake is None and self.doppler is None:
             raise ValueError("expected wake, doppler or both")
         for key in BACKSCATTER:
@@ -158,7 +158,7 @@ class Experiment(Tabular, Section):
         return self
 
     @model_validator(mode="after")
-    def _telescope_stays_before_the_slab(self):
+    def _telescope_stays_before_the_slab(self) -> Self:
         flown = (self.platform.speed - self.scan.follow) * self.platform.dt
         if flown >= self.scan.range:
             raise ValueError(
@@ -168,7 +168,7 @@ class Experiment(Tabular, Section):
         return self
 
 
-def _rows(section: dict, above: str = "") -> list[tuple[str, str]]:
+def _rows(section: dict[str, Any], above: str = "") -> list[tuple[str, str]]:
     """Dotted keys of a section and their values, numbers to four digits."""
     rows = []
     for key, value in section.items():

@@ -72,13 +72,13 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     return f"{field}: {shown} is not allowed; expected {expected}"
 
 
-def _key(location: tuple) -> list[str]:
+def _key(location: tuple[int | str, ...]) -> list[str]:
     """A fault's location without the kinds of value that pydantic tried there."""
     kinds = ("literal[", "function-")
     return [str(p) for p in location if p != "float" and not str(p).startswith(kinds)]
 
 
-def _metadata_at(model: Any, location: tuple, kind: type) -> Any:
+def _metadata_at(model: Any, location: tuple[int | str, ...], kind: type) -> Any:
     """The part of a kind in the annotation of the key at a location; None if there is none."""
     field: Any = None
     for part in location:
@@ -94,7 +94,7 @@ def _metadata_at(model: Any, location: tuple, kind: type) -> Any:
     return None
 
 
-def _length_at(model: Any, location: tuple) -> int:
+def _length_at(model: Any, location: tuple[int | str, ...]) -> int:
     """How many values a list at a location has; 1: any number."""
     annotation: Any = None
     for part in location:
@@ -107,14 +107,14 @@ def _length_at(model: Any, location: tuple) -> int:
     return 1
 
 
-def _keys_at(model: Any, location: tuple) -> list[str]:
+def _keys_at(model: Any, location: tuple[int | str, ...]) -> list[str]:
     for part in location:
         if model and part in model.model_fields:
             model = _section(model.model_fields[part].annotation)
     return list(model.model_fields)
 
 
-def _section(annotation) -> type[BaseModel] | None:
+def _section(annotation: Any) -> type[BaseModel] | None:
     """The model in an annotation such as ``tuple[Model, ...] | None``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation

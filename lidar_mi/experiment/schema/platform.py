@@ -19,5 +19,5 @@ class Platform(Section):
     ] = 0.1
     motion: Motion | None = Field(None, description="departure from straight and level flight")
     reported: Reported | None = Field(
-        None, description="errors of the pose that is told; default: the true one is known"
+        None, description="errors of the reported pose; default: the true one is known"
     )

@@ -17,7 +17,7 @@ from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 from lidar_mi.units import AS_GIVEN
 
-BESIDE_VARIANTS = (
+RESERVED_NAMES = (
     "study.yaml",
     "experiment.yaml",
     "log.txt",
@@ -130,8 +130,8 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
             )
         if str(name) in found:
             raise InputError(f"{place}: not allowed; another variant has this name")
-        if str(name).lower() in BESIDE_VARIANTS:
-            raise InputError(f"{place}: not allowed; a file beside the variants has this name")
+        if str(name).lower() in RESERVED_NAMES:
+            raise InputError(f"{place}: not allowed; a file of the study has this name")
         if not isinstance(changes, dict):
             raise InputError(f"{place}: {changes!r} is not allowed; expected keys to change")
         if "name" in changes:
@@ -146,7 +146,7 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
     return found
 
 
-def merged(data: Any, changes: dict) -> dict:
+def merged(data: Any, changes: dict[str, Any]) -> dict[str, Any]:
     """``data`` with ``changes``, section by section; null removes. Both remain unchanged."""
     found = copy.deepcopy(data)
     for key, value in changes.items():
@@ -159,12 +159,12 @@ def merged(data: Any, changes: dict) -> dict:
     return found
 
 
-def read_keys(path: str | Path) -> dict:
+def read_keys(path: str | Path) -> dict[str, Any]:
     """The keys of an experiment file as they stand, over those of its ``base`` if it has one."""
     return _read_keys(Path(path), ())
 
 
-def _read_keys(path: Path, above: tuple[Path, ...]) -> dict:
+def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     """The same of a file that those ``above`` are based on."""
     if path.suffix == ".xml":
         raise InputError(
@@ -190,15 +190,15 @@ def _read_keys(path: Path, above: tuple[Path, ...]) -> dict:
     if not isinstance(base, str) or len(base) > _LONGEST_NAME or "\0" in base:
         shown = repr(base)[:60]
         raise InputError(f"{path}: base: {shown} is not allowed; expected an experiment's name")
-    beside = path.parent / base
-    file = beside if beside.is_file() else experiment_file(base)
+    sibling = path.parent / base
+    file = sibling if sibling.is_file() else experiment_file(base)
     chain = (*above, path.resolve())
     if file.resolve() in chain:
         raise InputError(f"{path}: base: {base} is based on this file; expected another experiment")
     return merged(_read_keys(file, chain), data)
 
 
-def check(data: dict, origin: str) -> Experiment:
+def check(data: dict[str, Any], origin: str) -> Experiment:
     """An experiment from a nested dictionary; see `load` for the errors."""
     try:
         return Experiment.model_validate(data)
@@ -241,7 +241,7 @@ def _in_si(text: str) -> dict[str, Any]:
         return given
 
 
-def _override(data: dict, text: str) -> None:
+def _override(data: dict[str, Any], text: str) -> None:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise InputError(f"--set {text}: expected KEY=VALUE, such as wake.texture.rms=0.2")

@@ -1,6 +1,6 @@
 """The keys of the retrieval of cross-flow winds from two images."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -23,7 +23,7 @@ class Pointing(Section):
     )
 
     @model_validator(mode="after")
-    def _free_by_how_much(self):
+    def _free_by_how_much(self) -> Self:
         if self.offset == "free" and not self.stderr:
             raise ValueError(
                 "stderr: 0 rad is not allowed with offset free; expected above 0 rad, the standard "
@@ -56,7 +56,7 @@ class Retrieval(Section):
     )
 
     @model_validator(mode="after")
-    def _budget_compares(self):
+    def _budget_compares(self) -> Self:
         if self.error_budget and self.sources != "all":
             raise ValueError(
                 "sources: 'measured' is not allowed with error_budget; expected all, or "
@@ -65,12 +65,12 @@ class Retrieval(Section):
         return self
 
     @model_validator(mode="after")
-    def _each_once(self):
+    def _each_once(self) -> Self:
         each_once("methods", self.methods)
         return self
 
     @model_validator(mode="after")
-    def _region_holds_template(self):
+    def _region_holds_template(self) -> Self:
         if self.search < self.template + 2:
             raise ValueError(
                 f"search: {self.search} is not allowed; expected at least template + 2 = "

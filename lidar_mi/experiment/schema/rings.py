@@ -1,6 +1,6 @@
 """The keys of a fringe-imaging lidar's reference shot, calibration and assumed instrument."""
 
-from typing import Annotated
+from typing import Annotated, Self, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -9,6 +9,7 @@ from lidar_mi.experiment.schema.section import Section
 from lidar_mi.units import Angle, Frequency, Length, Number, Temperature, Within
 
 _Tilt = Annotated[Angle, Within(-0.5, 0.5, "as of the camera")]
+_Part = TypeVar("_Part", bound=Description)
 _Fraction = Annotated[Number, Within(0, 1, "definition of a fraction")]
 
 
@@ -57,7 +58,7 @@ class Assumed(Section):
     distortion: Annotated[Number, Within(-0.05, 0.05, "as of the camera")] | None = None
     defocus: Annotated[Length, Within(0, 0.01, "as of the camera")] | None = None
 
-    def of(self, described: Description) -> Description:
+    def of(self, described: _Part) -> _Part:
         """A part of the instrument with the assumed values in place of its own."""
         given = self.model_dump(exclude_none=True)
         own = {name: value for name, value in given.items() if name in type(described).model_fields}
@@ -78,7 +79,7 @@ class RingCalibration(Section):
     )
 
     @model_validator(mode="after")
-    def _one_origin(self):
+    def _one_origin(self) -> Self:
         if self.file is not None and "frames" in self.model_fields_set:
             raise ValueError(
                 "frames: not allowed with file; expected one of them: simulated frames, or a file"

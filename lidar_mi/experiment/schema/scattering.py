@@ -1,6 +1,6 @@
 """The keys of what scatters the light."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AliasChoices, Field, model_validator
 
@@ -66,7 +66,7 @@ class Scattering(_Scatterer):
         return data
 
     @model_validator(mode="after")
-    def _parts_of_a_mixture(self):
+    def _parts_of_a_mixture(self) -> Self:
         if (self.phase == "mixture") != (self.parts is not None):
             value = None if self.parts is None else f"{len(self.parts)} parts"
             raise ValueError(f"parts: {value} is not allowed with phase {self.phase}")

@@ -1,6 +1,6 @@
 """The keys of both lidars as one sensor."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -39,7 +39,7 @@ class Sensor(Section):
     ] = Field(10.0, description="time of exposure to the beams")
 
     @model_validator(mode="after")
-    def _pulses_of_a_line(self):
+    def _pulses_of_a_line(self) -> Self:
         if self.timing and self.timing.pulses_per_beam != 1:
             raise ValueError(
                 f"timing.pulses_per_beam: {self.timing.pulses_per_beam} is not allowed with "

@@ -1,6 +1,6 @@
 """The keys of the retrieval of winds from two volumes."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
@@ -23,6 +23,6 @@ class Volume(Section):
     min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = 0.5
 
     @model_validator(mode="after")
-    def _each_once(self):
+    def _each_once(self) -> Self:
         each_once("methods", self.methods)
         return self

@@ -1,6 +1,6 @@
 """The keys of the observed air: flow, extinction, texture."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -112,7 +112,7 @@ class Texture(Section):
 class Wake(Section):
     """The flow and the tracers in it."""
 
-    file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
+    file: str | None = Field(None, description="NetCDF file; in the experiment's folder or shipped")
     vortex_pair: VortexPair | None = None
     turbine: Turbine | None = None
     time: _Moment | None = Field(None, description="needed when the file holds several")
@@ -144,7 +144,7 @@ class Wake(Section):
             ) from None
 
     @model_validator(mode="after")
-    def _one_source(self):
+    def _one_source(self) -> Self:
         sources = [name for name in ("file", "vortex_pair", "turbine") if getattr(self, name)]
         if len(sources) != 1:
             raise ValueError("expected one of file, vortex_pair and turbine")

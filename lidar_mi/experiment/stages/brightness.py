@@ -107,8 +107,8 @@ def overlap(lidar: BackscatterLidar, distance: float) -> float:
     seen = math.tan(lidar.fov_half) * distance
     sigma = float(lidar.radius_at(distance)) / 2
     # of a Gaussian in the plane, the fraction beyond r is exp(-r^2 / 2 sigma^2): its quantiles
-    share = (np.arange(1000) + 0.5) / 1000
-    gap = sigma * np.sqrt(-2 * np.log(share))
+    beyond = (np.arange(1000) + 0.5) / 1000
+    gap = sigma * np.sqrt(-2 * np.log(beyond))
     area = math.pi * lidar.aperture_radius**2
     return float(_lens(gap, seen, lidar.aperture_radius).mean() / area)
 
@@ -116,10 +116,10 @@ def overlap(lidar: BackscatterLidar, distance: float) -> float:
 def _lens(gap: np.ndarray, first: float, second: float) -> np.ndarray:
     """Area that two circles of given radii have in common, their centres being ``gap`` apart."""
     small, large = min(first, second), max(first, second)
-    apart = np.clip(gap, large - small + 1e-12 * large, large + small)
+    separation = np.clip(gap, large - small + 1e-12 * large, large + small)
     # angles at both centres to where the circles meet
-    at_small = (apart**2 + small**2 - large**2) / (2 * apart * small)
-    at_large = (apart**2 + large**2 - small**2) / (2 * apart * large)
+    at_small = (separation**2 + small**2 - large**2) / (2 * separation * small)
+    at_large = (separation**2 + large**2 - small**2) / (2 * separation * large)
     at_small, at_large = (np.arccos(np.clip(c, -1, 1)) for c in (at_small, at_large))
     area = small**2 * (at_small - np.sin(2 * at_small) / 2)
     area = area + large**2 * (at_large - np.sin(2 * at_large) / 2)

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores
@@ -24,6 +24,7 @@ from lidar_mi.experiment.schema.retrieval import Retrieval
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images
+from lidar_mi.experiment.stages.image_pair import noise_without
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import (
     known_blur,
@@ -41,6 +42,7 @@ from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.images.common_grid import resample_pair
+from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.synchronised import synchronised
 
@@ -152,26 +154,28 @@ def _budgets(
     cores = find_cores(truth.wind) if cores is None else cores
     methods = retrieval.methods
     dt, sizes = sensor.platform.dt, window_sizes(retrieval)
-    settings = {"dt": dt, **window_settings(retrieval)}
+    settings: dict[str, Any] = {"dt": dt, **window_settings(retrieval)}
     blur = known_blur(retrieval, sensor.lidar, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if sensor.detector:
         sources |= {"measured": Source.NOISY, "detector_noise": Source.BACKSCATTER}
-    found = {}
+    found: dict[str, dict[str, float]] = {}
     for index, method in enumerate(methods):
         progress(f"retrieving without each cause of error, {method}", index / len(methods))
         winds = {}
         for cause, case in images.items():
             source = sources.get(cause)
             if known is not None and source:
-                kept = known.sel(source=source, algorithm=method)
-                winds[cause] = kept.assign_attrs(method=method, dt=dt, **asdict(sizes))
+                retrieved = known.sel(source=source, algorithm=method)
+                winds[cause] = retrieved.assign_attrs(method=method, dt=dt, **asdict(sizes))
             else:
                 corrected = 0.0 if cause in _SHARP else blur
                 # the flags that count are those of the images as measured
+                flags: dict[str, Any]
                 flags = dict.fromkeys(("checks", "standard_errors"), cause == "measured")
                 winds[cause] = retrieve_wind(
-                    *case.pair,
+                    case.pair[0],
+                    case.pair[1],
                     method=method,
                     noise=case.noise,
                     blur=corrected,
@@ -182,19 +186,21 @@ def _budgets(
         measured, perfect = winds.pop("measured"), winds.pop("perfect")
         # windows that move rigidly are photographs from where they were reported
         if all(plan.beams is None for plan in plans):
-            stiff = moved_rigidly(
-                measured,
-                images["measured"].pair,
-                blurred,
-                truth.wind,
-                lambda pair, stride, method=method: retrieve_wind(
-                    *pair,
+
+            def at_stride(
+                pair: Sequence[xr.DataArray], stride: int, method: ImageMethod = method
+            ) -> xr.Dataset:
+                return retrieve_wind(
+                    pair[0],
+                    pair[1],
                     method=method,
                     checks=False,
                     standard_errors=False,
                     **settings | {"windows": replace(sizes, stride=stride)},
-                ),
-            )
+                )
+
+            pair = images["measured"].pair
+            stiff = moved_rigidly(measured, pair, blurred, truth.wind, at_stride)
             winds |= {} if stiff is None else {"shear": stiff}
         found[method] = error_budget(measured, winds, truth.wind, cores, perfect, flagged)
     return found
@@ -227,19 +233,21 @@ def _images(
         return [gain * image + offset for image in images]
 
     advected = None
+    # a single plane that its own flow advects has no out-of-plane motion to leave out
     if truth.extinction[0].sizes["x"] > 1 or sensor.wake.second != "advect":
         advected = as_measured(_advected_by_the_mean(sensor.platform.dt, truth, air))
     photographs = [truth.image(k) for k in (0, 1)]
     blurred = as_measured(air)
-    timed, times = {}, {}
+    timed: dict[str, list[xr.DataArray]] = {}
+    times: dict[str, Times] = {}
     if any("time" in image.dims for image in air):
         timed["scan_time"], times["scan_time"] = as_measured(photographs), None
     for cause, platform in platforms_without(sensor.platform).items():
         other = replace(sensor, platform=platform)
-        flown = other.plans(truth)
-        moving = other.slab_images(truth, flows, flown)
-        timed[cause] = as_measured(moving, flown)
-        times[cause] = _without_noise(other, moving, flown, pair)[1]
+        its_plans = other.plans(truth)
+        its_air = other.slab_images(truth, flows, its_plans)
+        timed[cause] = as_measured(its_air, its_plans)
+        times[cause] = _without_noise(other, its_air, its_plans, pair)[1]
     without = images_without(
         measured,
         blurred,
@@ -249,7 +257,7 @@ def _images(
         timed,
     )
     # without the simulation's noise the detector's remains, if there is one
-    counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if sensor.detector else 0.0
+    counts = noise_without(level, noise) if sensor.detector else 0.0
     levels = {"detector_noise": noise, "monte_carlo": counts}
     known = pixel_times(sensor.wake, sensor.scan, scans)
     on_grid = _on_grid(sensor.scan, photographs, pair)
@@ -311,7 +319,7 @@ def _without_noise(
     scans = synchronised(scans, [sensor.platform.dt], "Y")
     images = [one["Y"] for one in scans]
     if scan.aim == "angles":
-        images = list(resample_pair(*images, sensor.wake.spacing))
+        images = list(resample_pair(images[0], images[1], sensor.wake.spacing))
     return images, pixel_times(sensor.wake, scan, scans)
 
 

@@ -34,6 +34,7 @@ def slab_images(
     gates = truth.wind.attrs["gates"]
     images = []
     for which, plan in enumerate(plans):
+        # the truth's image is of the scan's reference time, that of all beams here
         if plan.beams is None or flows is None or scan.air == "frozen":
             images.append(truth.image(which))
             continue
@@ -81,13 +82,13 @@ def ideal_scan(
     if plan.beams is None:
         return xr.Dataset({"Y": states[0].drop_vars("time").interp(nodes)})
     middle = plan.position + plan.centre
-    told = plan.beams.reported_places(middle)
+    reported = plan.beams.reported_places(middle)
     seen = _at_beams(states, plan.beams.time, plan.beams.true_places(middle))
     fields = {
         "Y": seen,
         "beam_time": plan.beams.time,
-        "y_reported": told[:, 0],
-        "z_reported": told[:, 1],
+        "y_reported": reported[:, 0],
+        "z_reported": reported[:, 1],
     }
     scan = xr.Dataset(
         {name: (("z", "y"), plan.as_image(values)) for name, values in fields.items()}, nodes
@@ -107,6 +108,7 @@ def _at_beams(states: xr.DataArray, time: np.ndarray, places: np.ndarray) -> np.
     times = states["time"].values
     seen = np.zeros(len(time))
     for state, one in zip(states.values, np.eye(len(times)), strict=True):
+        # interpolation of a unit vector gives the weight of its state at every beam
         weight = np.interp(time, times, one)
         met = weight > 0
         if met.any():

@@ -8,9 +8,9 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
+from lidar_mi.description import Description
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.section import Section
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.brightness import overlap
@@ -50,7 +50,7 @@ def image_remarks(
     ]
 
 
-def first_set(sections: Mapping[str, Section], *keys: str) -> str:
+def first_set(sections: Mapping[str, Description], *keys: str) -> str:
     """The first of some dotted keys that an experiment sets itself; the last, if it sets none."""
     for key in keys:
         name, _, rest = key.partition(".")

@@ -99,8 +99,8 @@ def line_frames(
     light, first = photons(doppler.lidar), scan * _A_SCAN
     air = []
     for number, speed, distance in zip(lines, speeds, ranges, strict=True):
-        farther = doppler.lidar.model_copy(update={"range": float(distance)})
-        mean = images.at(speed) * (photons(farther) / light)
+        lidar = doppler.lidar.model_copy(update={"range": float(distance)})
+        mean = images.at(speed) * (photons(lidar) / light)
         # random streams different from those of the images of the Doppler lidar's chapter
         streams = [first + _LINES + number]
         air.append(exposed_frames(doppler, rings, mean, pulses, seed, streams))

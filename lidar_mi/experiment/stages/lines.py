@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -175,7 +176,8 @@ def measure_lines(
         retrieved[:, chunk] = speeds_to_laser(
             air, laser[own], doppler, assumed_rings, noises, RingMethod.ANNULAR, RingCentre.FREE
         )
-    return with_speeds(lines, *retrieved, doppler, sensor.pulses, seed)
+    v_los, std, systematic, laser_std = retrieved
+    return with_speeds(lines, v_los, std, systematic, laser_std, doppler, sensor.pulses, seed)
 
 
 def line_noises(doppler: Doppler, pulses: int, rings: Rings) -> list[PixelNoise]:
@@ -217,7 +219,7 @@ def with_speeds(
     streams = [seed, _DRIFTS + scan]
     drift, drift_std = drifts(doppler, pulses, streams, range(len(v_los)), PULSES)
     # all at once: each variable that a data set takes later copies and aligns it again
-    found = {
+    found: dict[str, tuple[Any, ...]] = {
         "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),
         "v_los_std": ("line", np.hypot(std, drift_std), lines.variables["v_los_std"].attrs),
         "v_los_systematic": (

@@ -328,7 +328,7 @@ def with_samples(render: RenderSettings, number: int) -> RenderSettings:
 
 
 def samples_text(render: RenderSettings, chosen: Samples) -> str:
-    """A number of samples, and what their noise is beside that of the detector."""
+    """A number of samples, and what their noise is relative to that of the detector."""
     text = (
         f"{chosen.number} Monte Carlo samples per beam, with {chosen.fraction:.2g} times the "
         f"variance of the detector noise (median {chosen.median:.2g}, 90 % of the beams below "
@@ -360,7 +360,7 @@ def batches_of(
             found = store.unfinished(name)
             if not found or found.pop("samples", samples) != samples:
                 return None
-            log(f"resuming {name}: {found['passes']} passes are kept from an earlier run")
+            log(f"resuming {name}: {found['passes']} passes are stored from an earlier run")
             return found
 
         def save(arrays: dict[str, Any]) -> None:
@@ -408,7 +408,7 @@ def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:
 
 
 def gridded_scans(platform: Platform, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """The scans, on regular nodes where beams were reported beside them; see `synchronised`."""
+    """The scans, on regular nodes where beams were reported elsewhere; see `synchronised`."""
     if any("y_reported" not in scan for scan in detected):
         return list(detected)
     # times in double precision, so that those of a node are not rounded twice

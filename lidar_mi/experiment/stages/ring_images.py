@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -134,7 +135,8 @@ def ring_instrument(doppler: Doppler) -> Rings:
     crest = ccd.quantum_efficiency * (float(image.max()) + background)
     noise = pixel_noise(ccd, modes)
     # crests of the noisiest pixels stay below
-    spread = math.sqrt(noise.variance(crest, crest))
+    light = torch.tensor(crest, dtype=torch.float64)
+    spread = math.sqrt(noise.variance(light, light))
     if not crest + 6 * spread < ccd.saturation:
         raise InputError(
             f"doppler.ccd: a pixel that holds {ccd.saturation:.3g} photoelectrons is not allowed; "
@@ -173,6 +175,7 @@ def check_rings(doppler: Doppler, rings: Rings) -> None:
     laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
     settings = [(rings.line, doppler.render), (laser, doppler.render)]
     if doppler.path_samples:
+        # single paths are traced through a real lens: another scene to check
         settings[1] = laser, _path_by_path(doppler.render, doppler.path_samples)
     for line, render in settings:
         scene_dict(doppler.etalon, doppler.camera, line, render)
@@ -230,15 +233,18 @@ def render_ring_images(
                 speeds,
                 settings,
                 (seed + (before << 16)) % 2**31,
-                lambda k, done, paths, n=before: log.bar(
-                    f"rendering rings {n + k + 1} of {total}", done / paths
-                ),
+                partial(_show_progress, log, before, total),
                 absent,
                 batches_of(names, store, log),
             )
             for k, image in zip(absent, rendered, strict=True):
                 yield names[k], image
         before += len(names)
+
+
+def _show_progress(log: Log, before: int, total: int, index: int, done: int, paths: int) -> None:
+    """Progress of an image, which others come before."""
+    log.bar(f"rendering rings {before + index + 1} of {total}", done / paths)
 
 
 def images_by_content(

@@ -61,7 +61,7 @@ def ring_model(
         wavelength=wavelength,
         order_at_centre=etalon.order_at_centre(wavelength),
         harmonics=table,
-        temperatures=temperatures,
+        temperatures=np.asarray(temperatures, float),
         falloff=2 * diagonal2 / camera.illumination_radius**2,
         tilt=camera.tilt,
         distortion=camera.distortion,
@@ -102,7 +102,7 @@ def air_rings(
             lidar.wavelength, kelvin, pressure, lidar.laser_width, known, lidar.line_shape
         )
 
-    model = ring_model(etalon, camera, line, temperature * np.array(TEMPERATURE_NODES))
+    model = ring_model(etalon, camera, line, [temperature * node for node in TEMPERATURE_NODES])
     priors = {}
     if math.isfinite(temperature_std):
         priors["temperature"] = (temperature, temperature_std)

@@ -1,7 +1,7 @@
 """From images of rings to the wind along the line of sight, by every method."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -33,8 +33,8 @@ from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.retrieval.rings.bound import cramer_rao_of
 from lidar_mi.retrieval.rings.centre import circular_average
-from lidar_mi.retrieval.rings.likelihood_fit import difference, fit_rings
-from lidar_mi.retrieval.rings.model import RingModel
+from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
+from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
 from lidar_mi.retrieval.rings.peaks import (
     COORDINATES,
     find_centre,
@@ -106,7 +106,7 @@ def ring_budget(doppler: Doppler, rings: Rings, lit_rings: RingImages, log: Log)
     )
 
 
-def _bounds(doppler: Doppler, rings: Rings) -> dict[RingCentre, tuple[float, float]]:
+def _bounds(doppler: Doppler, rings: Rings) -> dict[str, tuple[float, float]]:
     """Cramer-Rao bounds of one image at the first speed and of its reference, m/s, by centre."""
     efficiency, centres = doppler.ccd.quantum_efficiency, doppler.retrieval.centre
     floor = efficiency * rings.background + doppler.ccd.dark_current * doppler.ccd.integration_time
@@ -282,7 +282,15 @@ def velocities(
 
 
 def speeds_to_laser(
-    frames, laser, doppler, rings, noises, method, centre, *, refused=None
+    frames: torch.Tensor,
+    laser: torch.Tensor,
+    doppler: Doppler,
+    rings: Rings,
+    noises: Sequence[PixelNoise],
+    method: str,
+    centre: str,
+    *,
+    refused: Callable[[str], object] | None = None,
 ) -> np.ndarray:
     """v_LOS of frames less that of the laser's, and its standard deviations.
 
@@ -316,7 +324,15 @@ def speeds_to_laser(
     return np.stack([part.numpy() for part in (*parts, emitted.v_los_std)])
 
 
-def _fit(frames, doppler, model, response, noise, method, centre):
+def _fit(
+    frames: torch.Tensor,
+    doppler: Doppler,
+    model: RingModel,
+    response: torch.Tensor | None,
+    noise: PixelNoise,
+    method: str,
+    centre: str,
+) -> RingFit:
     return fit_rings(
         frames,
         model,
@@ -332,7 +348,10 @@ def _fit(frames, doppler, model, response, noise, method, centre):
 def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, float]:
     """Innermost ring's radius (px) by the given peak methods; NaN where one fails."""
     methods = [name for name in doppler.retrieval.methods if name in PEAKS]
-    places, averages, radii, near = {}, {}, {}, None
+    places: dict[str, tuple[float, float]] = {}
+    averages: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+    radii: dict[str, float] = {}
+    near: float | None = None
     for name in methods:
         way, coordinate = PEAKS[name]
         finder = "known" if centre == RingCentre.KNOWN else "ml" if way == "ml" else "ca"
@@ -360,17 +379,17 @@ def _peak_bias(doppler: Doppler, rendered: RingImages) -> np.ndarray:
     images = [p["S0"].values.astype(float) for p in (rendered.received[0], rendered.emitted)]
     averages = [circular_average(image, camera.centre_pixel) for image in images]
 
-    def error(coordinate, piece):
+    def error(coordinate: str, piece: float) -> float:
         try:
-            radii = [
+            received, emitted = (
                 ring_radius(
                     image, camera.centre_pixel, "ca", coordinate, piece=piece, average=average
                 )
                 for image, average in zip(images, averages, strict=True)
-            ]
+            )
         except InputError:
             return math.nan
-        v = velocity_from_radii(*radii, camera.focal_length, camera.pixel)
+        v = velocity_from_radii(received, emitted, camera.focal_length, camera.pixel)
         return v - doppler.v_los[0]
 
     return np.array([[error(c, p) for p in PIECES] for c in COORDINATES])

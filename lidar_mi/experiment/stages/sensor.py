@@ -86,7 +86,7 @@ def doppler_alone(lines: xr.Dataset, log: Log) -> dict[str, xr.Dataset]:
     try:
         triples = wind_from_triples(lines)
         if not (triples["flag"] == 0).any():
-            raise InputError("no three lines beside each other could be read")
+            raise InputError("no three neighbouring lines could be read")
         around = wind_from_neighbours(lines, min(_AROUND, lines.sizes["line"]))
     except InputError as error:
         log.remark(f"no wind from lines of sight alone: {error}")
@@ -306,7 +306,8 @@ def mean_squares_without(
         changed = changed.assign(v_los=changed["v_los_true"] + noise, v_los_std=std)
         if "v_los_covariance" in lines and "line_noise" not in causes:
             changed["v_los_covariance"] = lines["v_los_covariance"]
-        flow, settings = known, {}
+        flow = known
+        settings: dict[str, Any] = {}
         if "crossflow" not in causes:
             flow = crossflow
             oblique = _oblique_view(wake, platform, scan, volume)
@@ -324,5 +325,5 @@ def mean_squares_without(
     causes = ["line_noise", "range_bin", "crossflow"]
     if sensor.errors != PlatformErrors():
         causes.append("pointing")
-    left = {"": full} | {cause: square((cause,)) for cause in causes}
-    return left | {"sampling": square(causes)}
+    errors = {"": full} | {cause: square((cause,)) for cause in causes}
+    return errors | {"sampling": square(causes)}

@@ -87,6 +87,7 @@ def pulses_needed(
     stated = lines["v_los_std"].where(lines["v_los"].notnull(), drop=True)
     if not limits or not stated.size:
         return None
+    # the error of a single pulse: that of a mean of n pulses is 1 / sqrt(n) of it
     one = math.sqrt(sensor.pulses * float((stated.values**2).mean()))
     return pulses_for_error(one, min(limits))
 
@@ -111,6 +112,7 @@ def _eye_safety(
         exposure,
         burst=burst,
     )
+    # metrics are JSON, which has no infinity
     distances = {
         name: getattr(safety, name)
         for name in ("hazard_distance", "aided_hazard_distance")

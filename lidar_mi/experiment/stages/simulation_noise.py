@@ -68,7 +68,8 @@ def simulation_noise(
     changes = []
     for method in retrieval.methods:
         found = retrieve_wind(
-            *pair,
+            pair[0],
+            pair[1],
             dt=platform.dt,
             method=method,
             noise=noise,

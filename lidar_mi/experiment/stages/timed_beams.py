@@ -46,6 +46,7 @@ def timed_plans(
     for number, plan in enumerate(plans):
         schedule = scan_schedule(scan, plan, search_path)
         _fits("scan.timing", schedule, platform.dt, "platform.dt")
+        # a stream for each scan: what one draws does not depend on the other
         jitter = np.random.default_rng([seed, 3, 4, number + 1])
         found.append(
             replace(
@@ -148,6 +149,7 @@ def _schedule(
     search_path: Path,
 ) -> Schedule:
     if timing is None:
+        # only the platform moves: all beams at the reference time
         timing = ScanTiming(pattern="serpentine", duration=0.0)
     table = _directions(timing.table, f"{key}.table", search_path) if timing.table else None
     try:
@@ -165,6 +167,7 @@ def _directions(name: str, key: str, search_path: Path) -> Directions:
 
 
 def _fits(key: str, schedule: Schedule, interval: float, name: str) -> None:
+    # rounding may put an equal duration above the interval
     if schedule.duration > interval * (1 + 1e-9):
         raise InputError(
             f"{key}: a scan of {schedule.duration:.4g} s is not allowed; expected at most "

@@ -19,6 +19,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.experiment.stages.image_pair import Pair, both, combined_noise
 from lidar_mi.experiment.stages.rendering import environment_extinction
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
@@ -37,13 +38,13 @@ class Volumes:
 
     Attributes
     ----------
-    pairs : dict of str to list of two xr.DataArray, dims (x, z, y)
+    pairs : dict of str to pair of xr.DataArray, dims (x, z, y)
         Attenuated backscatter at both times, m^-1 sr^-1, by `Source`.
     noise : dict of str to xr.DataArray, dims (x, z, y)
         Standard error of the first volume of each, same unit.
     """
 
-    pairs: dict[str, list[xr.DataArray]]
+    pairs: dict[str, Pair]
     noise: dict[str, xr.DataArray]
 
 
@@ -183,21 +184,21 @@ def scan_volumes(
     """Both scans as volumes on one grid in the air, without and with a detector's noise."""
     nodes, way = grid(wake, scan, plans), environment_extinction(wake)
 
-    def of_scan(number: int, s0: xr.DataArray) -> xr.DataArray:
-        return scan_volume(s0, plans[number], lidar, way, nodes)
+    def of_scan(number: int, name: str) -> xr.DataArray:
+        return scan_volume(scans[number][name], plans[number], lidar, way, nodes)
 
     def level(error: xr.DataArray) -> xr.DataArray:
-        error = attenuated_backscatter(
+        values = attenuated_backscatter(
             error.transpose("gate", "z", "y").values, plans[0], lidar.aperture_area, way
         )
-        return noise_map(error, plans[0], nodes)
+        return noise_map(values, plans[0], nodes)
 
     first = scans[0]
-    pairs = {Source.BACKSCATTER: [of_scan(k, one["S0"]) for k, one in enumerate(scans)]}
-    noise = {Source.BACKSCATTER: level(first["S0_stderr"])}
+    pairs: dict[str, Pair] = {Source.BACKSCATTER: both(lambda k: of_scan(k, "S0"))}
+    noise: dict[str, xr.DataArray] = {Source.BACKSCATTER: level(first["S0_stderr"])}
     if detector:
-        pairs[Source.NOISY] = [of_scan(k, one["S0_noisy"]) for k, one in enumerate(scans)]
-        noise[Source.NOISY] = level(np.hypot(first["S0_stderr"], first["S0_noise_std"]))
+        pairs[Source.NOISY] = both(lambda k: of_scan(k, "S0_noisy"))
+        noise[Source.NOISY] = level(combined_noise(first["S0_stderr"], first["S0_noise_std"]))
     return Volumes(pairs, noise)
 
 
@@ -225,7 +226,8 @@ def volume_winds(
             log.bar(f"retrieving winds by {method}", number / len(volume.methods))
             methods.append(
                 retrieve_wind_volume(
-                    *pair,
+                    pair[0],
+                    pair[1],
                     platform.dt,
                     method,
                     windows=WindowSizes(volume.template, volume.search, volume.stride),

@@ -4,7 +4,7 @@ The fit gives the parameters of the wake vortices, and a model of the wind that 
 anywhere, for use by a controller.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import xarray as xr
@@ -88,14 +88,16 @@ def fit_pairs(
     pair, noise = list(rendered_pairs(wake, scan, detector, scans).values())[-1]
     times = pixel_times(wake, scan, scans)
     common, rotation = common_error(retrieval, platform, plans)
-    ways = {
+    # as functions: a refused fit to the images must not prevent that to the vectors
+    ways: dict[Origin, Callable[[], VortexPairFit]] = {
         Origin.IMAGES: lambda: fit_vortices(
-            *pair, platform.dt, noise, times=times
+            pair[0], pair[1], platform.dt, noise, times=times
         ).with_common_error(common, common, rotation)
     }
     if with_vectors:
         ways[Origin.VECTORS] = lambda: _from_vectors(vectors)
-    fits, refused = {}, {}
+    fits: dict[str, VortexPairFit] = {}
+    refused: dict[str, str] = {}
     for origin, way in ways.items():
         try:
             found = way()
@@ -107,8 +109,8 @@ def fit_pairs(
         else:
             refused[str(origin)] = "; ".join(found.reasons)
 
-    for origin, reason in refused.items():
-        log.remark(f"no vortex pair from the {ORIGIN_NAMES[Origin(origin)]}: {reason}")
+    for name, reason in refused.items():
+        log.remark(f"no vortex pair from the {ORIGIN_NAMES[Origin(name)]}: {reason}")
     return VortexFits(fits, refused, method)
 
 

@@ -13,6 +13,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
 from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.experiment.stages.image_pair import Noise, Pair, both, combined_noise
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.detector import Detector
@@ -80,11 +81,12 @@ def cross_flow_winds(
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
         # the truth's images are photographs
         seen = times if source in RENDERED else None
-        bound = wind_bound(*pair, platform.dt, noise, window_sizes(retrieval), seen)
-        methods = []
+        bound = wind_bound(pair[0], pair[1], platform.dt, noise, window_sizes(retrieval), seen)
+        methods: list[xr.Dataset] = []
         for method in retrieval.methods:
             wind = retrieve_wind(
-                *pair,
+                pair[0],
+                pair[1],
                 dt=platform.dt,
                 method=method,
                 **window_settings(retrieval),
@@ -139,55 +141,59 @@ def _image_pairs(
     truth: Truth,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
-) -> dict[str, tuple[list[xr.DataArray], Any]]:
+) -> dict[str, tuple[Pair, Noise]]:
     """Both images and their noise by source: of the truth, then of the lidar."""
     rendered = rendered_pairs(wake, scan, detector, scans)
     if retrieval.sources == "measured":
         return dict([rendered.popitem()])
-    exact = {
-        Source.EXTINCTION: [truth.image(k) for k in (0, 1)],
-        Source.WITHOUT_TEXTURE: [truth.image(k, smooth=True) for k in (0, 1)],
-        Source.BLURRED: [blur_by_beam(truth.image(k), lidar, plans[k].centre) for k in (0, 1)],
+    exact: dict[str, Pair] = {
+        Source.EXTINCTION: both(truth.image),
+        Source.WITHOUT_TEXTURE: both(lambda k: truth.image(k, smooth=True)),
+        Source.BLURRED: both(lambda k: blur_by_beam(truth.image(k), lidar, plans[k].centre)),
     }
     if scan.aim == "angles":
         grid = rendered[Source.BACKSCATTER][0][0]
         exact = {
-            name: [image.interp(y=grid["y"], z=grid["z"]) for image in pair]
-            for name, pair in exact.items()
+            name: (first.interp(y=grid["y"], z=grid["z"]), second.interp(y=grid["y"], z=grid["z"]))
+            for name, (first, second) in exact.items()
         }
+    # the truth's images have no noise
     return {name: (pair, 0.0) for name, pair in exact.items()} | rendered
 
 
 def rendered_pairs(
     wake: Wake, scan: Scan, detector: Detector | None, scans: Sequence[xr.Dataset]
-) -> dict[str, tuple[list[xr.DataArray], Any]]:
+) -> dict[str, tuple[Pair, Noise]]:
     """Images that winds are retrieved from, on one grid, and their noise (a map or its level).
 
     By source: the rendered backscatter, and with a detector the same with its noise.
     """
     noise = attenuated_backscatter_stderr(scans[0])
-    pairs = {Source.BACKSCATTER: ([one["Y"] for one in scans], with_resampling(noise, scans, "Y"))}
+    images = both(lambda k: scans[k]["Y"])
+    maps: dict[str, tuple[Pair, xr.DataArray]]
+    maps = {Source.BACKSCATTER: (images, with_resampling(noise, scans, "Y"))}
     if detector:
-        noisy = np.hypot(noise, scans[0]["Y_noise_std"])
+        noisy = combined_noise(noise, scans[0]["Y_noise_std"])
         noisy = with_resampling(noisy, scans, "Y_noisy")
-        pairs[Source.NOISY] = [one["Y_noisy"] for one in scans], noisy
+        maps[Source.NOISY] = both(lambda k: scans[k]["Y_noisy"]), noisy
     if scan.aim == "angles":
         # noise cannot be interpolated: its rms level is used, as a few pixels have most of it
         # where photons are few
-        pairs = {
+        return {
             name: (resample_pair(*pair, wake.spacing), float((level**2).mean() ** 0.5))
-            for name, (pair, level) in pairs.items()
+            for name, (pair, level) in maps.items()
         }
-    return pairs
+    return {name: (pair, level) for name, (pair, level) in maps.items()}
 
 
 def resampled_noise(scans: Sequence[xr.Dataset]) -> dict[str, tuple[xr.DataArray, xr.DataArray]]:
     """Noise of images of scattered beams without and with what resampling adds, by source."""
-    noise, found = attenuated_backscatter_stderr(scans[0]), {}
+    noise = attenuated_backscatter_stderr(scans[0])
+    found: dict[str, tuple[xr.DataArray, xr.DataArray]] = {}
     if "Y_resampling_std" in scans[0]:
         found[Source.BACKSCATTER] = noise, with_resampling(noise, scans, "Y")
     if "Y_noisy_resampling_std" in scans[0]:
-        noise = np.hypot(noise, scans[0]["Y_noise_std"])
+        noise = combined_noise(noise, scans[0]["Y_noise_std"])
         found[Source.NOISY] = noise, with_resampling(noise, scans, "Y_noisy")
     return found
 
@@ -199,7 +205,7 @@ def with_resampling(noise: xr.DataArray, scans: Sequence[xr.Dataset], name: str)
     if not squares:
         return noise
     added = sum(square.fillna(0.0).values for square in squares) / len(scans)
-    return np.sqrt(noise**2 + added)
+    return (noise**2 + added) ** 0.5
 
 
 def pixel_times(wake: Wake, scan: Scan, scans: Sequence[xr.Dataset]) -> list[xr.DataArray] | None:

@@ -83,9 +83,9 @@ def air_in_time(
 ) -> xr.DataArray:
     """The extinction of scan ``which`` at the times of its beams, m^-1, dims (time, x, y, z).
 
-    The truth of the scan's reference time, carried by the same flow that carries the air from t1 to
-    t2. Of a wake with a second state, between both times, the mean of both carried to the time,
-    each weighted with its nearness.
+    The truth of the scan's reference time, advected by the same flow as the air from t1 to t2. Of a
+    wake with a state at t2, between both times, the mean of both states advected to the time, each
+    weighted with its nearness.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def air_in_time(
     molecules = wake.extinction.molecules
     taus = state_times(wake, scan, volume, flows, times)
 
-    def carried(state: int) -> xr.DataArray:
+    def advected(state: int) -> xr.DataArray:
         # molecules are everywhere, and no undershoot of a spline may remove them
         field = truth.extinction[state] - molecules
         passed = taus + (which - state) * dt
@@ -117,9 +117,9 @@ def air_in_time(
         return moved.assign_coords(time=taus).astype(np.float32)
 
     if flows[1] is None:
-        return carried(which)
+        return advected(which)
     nearness = xr.DataArray(np.clip((taus + which * dt) / dt, 0, 1), {"time": taus}, "time")
-    return ((1 - nearness) * carried(0) + nearness * carried(1)).astype(np.float32)
+    return ((1 - nearness) * advected(0) + nearness * advected(1)).astype(np.float32)
 
 
 def _along(wake: Wake, scan: Scan, volume: Volume | None, flow: xr.Dataset) -> xr.DataArray | None:

@@ -64,11 +64,11 @@ def test_no_variant_is_called_like_a_file_beside_it(tmp_path):
         resumable_folder.REPORT,
         resumable_folder.FIGURES,
     }
-    assert ours == set(reading.BESIDE_VARIANTS)
+    assert ours == set(reading.RESERVED_NAMES)
     for name in (*ours, "Report.HTML"):
         path = tmp_path / "a.yaml"
         path.write_text(f"name: a\nwake: {{vortex_pair: {{}}}}\nvariants: {{{name}: {{}}}}\n")
-        with pytest.raises(InputError, match="a file beside the variants has this name"):
+        with pytest.raises(InputError, match="a file of the study has this name"):
             reading.load_variants(path)
 
 
