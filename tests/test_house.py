@@ -5,6 +5,7 @@ outside io, a module that only forwards, a test that imports another.
 """
 
 import ast
+import importlib
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -312,6 +313,13 @@ def test_every_folder_of_a_room_with_floors_has_one():
 
 def test_fixed_exceptions_leave_the_list():
     assert NOT_YET <= {one for rule in RULES for one in rule()}
+
+
+def test_every_module_imports():
+    """Types alone may name what is missing at run time."""
+    for name in MODULES:
+        if not name.endswith("__main__"):  # which runs the command
+            importlib.import_module(f"lidar_mi.{name}".removesuffix(".__init__"))
 
 
 def test_this_package_was_read():
