@@ -97,10 +97,10 @@ def first_pass(
     coarse, *smaller = _sizes(windows)
     d, replaced = _on(grid, *_of_images(images, coarse))
     width = windows.template / 2
-    score = _alike(spline, grid, d, width)
+    score = _correlation(spline, grid, d, width)
     for size in smaller:
         other, filled = _on(grid, *_of_images(images, size))
-        found = _alike(spline, grid, other, width)
+        found = _correlation(spline, grid, other, width)
         better = found > score + _BETTER
         d, replaced, score = (
             torch.where(better, new, old)
@@ -129,7 +129,7 @@ def _on(
     return grid.interpolated(d, known), replaced
 
 
-def _alike(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> torch.Tensor:
+def _correlation(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> torch.Tensor:
     """Correlation, over Gaussians, of two images that are warped to mid-time by displacements."""
     places = [
         torch.stack([p - part / 2, p + part / 2]) for p, part in zip(grid.places(), d, strict=True)
@@ -238,14 +238,14 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     number = (around.long()[:, :, None] + place.clamp(1, side - 2)).unbind(1)
     terms = quadratic @ flat.gather(0, (number[0] * side + number[1]) * side + number[2])
     slope = terms[1:4].T
-    bend = slope.new_zeros(len(slope), 3, 3)
+    curvature = slope.new_zeros(len(slope), 3, 3)
     for (a, b), term in zip(pairs, terms[4:], strict=True):
-        bend[:, a, b] = bend[:, b, a] = term
-    peaked = torch.linalg.eigvalsh(bend)[:, -1] < 0
-    bend = torch.where(peaked[:, None, None], bend, -torch.eye(3).to(bend))
-    rest = -torch.linalg.solve(bend, slope[..., None])[..., 0]
-    rest = torch.where((peaked & (rest.abs() < 1).all(1))[:, None], rest, 0.0).T
-    d = torch.where(rim | ~(flat.amax(0) > -1), torch.nan, place - reach + rest)
+        curvature[:, a, b] = curvature[:, b, a] = term
+    peaked = torch.linalg.eigvalsh(curvature)[:, -1] < 0
+    curvature = torch.where(peaked[:, None, None], curvature, -torch.eye(3).to(curvature))
+    offset = -torch.linalg.solve(curvature, slope[..., None])[..., 0]
+    offset = torch.where((peaked & (offset.abs() < 1).all(1))[:, None], offset, 0.0).T
+    d = torch.where(rim | ~(flat.amax(0) > -1), torch.nan, place - reach + offset)
     return d.reshape(3, *scores.shape[1:])
 
 

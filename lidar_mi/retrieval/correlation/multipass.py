@@ -28,7 +28,7 @@ from lidar_mi.retrieval.images.windows import Windows, averaged, image_pair, win
 # have smoothed, and the Gaussian mean of it, in vectors: the curvature changes its sign in cores.
 # Normalised errors in volumes of the simulated wake then have variances of 1.0 to 1.8, and of 0.6
 # to 0.9 in those of a pair with cores of 6 voxels.
-_BENT, _NEAR = 2.0, 1.0
+_CURVATURE_FACTOR, _NEAR = 2.0, 1.0
 
 
 def multipass(
@@ -170,12 +170,12 @@ def _curved(fit: "_Fit", sigma: float, stride: int, reach: int) -> torch.Tensor:
     Without what the noise of the gradients adds: of white noise a gradient has 1 / (2 sigma^2) of
     the displacement's variance.
     """
-    bent, by_noise = curvature(fit.gradient, reach)
+    laplacian, by_noise = curvature(fit.gradient, reach)
     variance = fit.covariance.diagonal().movedim(-1, 0)
-    square = bent.square() - by_noise * variance / (2 * sigma**2)
-    everywhere = torch.ones_like(bent[0], dtype=torch.bool)
+    square = laplacian.square() - by_noise * variance / (2 * sigma**2)
+    everywhere = torch.ones_like(laplacian[0], dtype=torch.bool)
     near = torch.stack([averaged(part, everywhere, _NEAR) for part in square])
-    return _BENT * (sigma**2 / 2 / stride) ** 2 * near.clamp(min=0.0)
+    return _CURVATURE_FACTOR * (sigma**2 / 2 / stride) ** 2 * near.clamp(min=0.0)
 
 
 def curvature(gradient: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -191,11 +191,11 @@ def curvature(gradient: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.T
         n = part.shape[axis]
         place = torch.arange(n, device=part.device)
         ends = [(place + move).clamp(0, n - 1) for move in (reach, -reach)]
-        apart = ends[0] - ends[1]
-        span = apart.clamp(min=1).to(part).reshape(-1, *[1] * (part.ndim - 1 - axis))
+        separation = ends[0] - ends[1]
+        span = separation.clamp(min=1).to(part).reshape(-1, *[1] * (part.ndim - 1 - axis))
         change = part.index_select(axis, ends[0]) - part.index_select(axis, ends[1])
         total += change / span
-        by_noise += 2 * (apart.reshape(span.shape) > 0) / span**2
+        by_noise += 2 * (separation.reshape(span.shape) > 0) / span**2
     return total, by_noise
 
 
@@ -386,10 +386,10 @@ def _solved(
     right = torch.cat([wanted[..., None], unit[:, :: dims + 1].expand(*wanted.shape, dims)], -1)
     answer = torch.cholesky_solve(right, root)
     solution, inverse = answer[..., 0], answer[..., 1:]
-    left = misfit - (2 * wanted - (normal @ solution[..., None])[..., 0]).mul(solution).sum(-1)
+    residual = misfit - (2 * wanted - (normal @ solution[..., None])[..., 0]).mul(solution).sum(-1)
     stated = pair.variance * relative / number
-    left = torch.maximum(left / number / pair.spline.passed, stated)
-    covariance = inverse.mT @ _normal(twice, dims) @ inverse * left[..., None, None]
+    residual = torch.maximum(residual / number / pair.spline.passed, stated)
+    covariance = inverse.mT @ _normal(twice, dims) @ inverse * residual[..., None, None]
     solution = solution.unflatten(-1, (dims, dims + 1)).movedim((-2, -1), (0, 1))
     return (
         solution[:, 0],

@@ -12,7 +12,7 @@ from lidar_mi.retrieval.images.windows import Windows, linear_weights, separable
 
 FALSE_ALARM = 1e-3
 """Probability that images without a pattern count as having one."""
-# Side of the blocks, px, whose sums are nearly independent, their least number, the rim left out.
+# Side of the blocks, px, whose sums are nearly independent, their least number, the masked rim.
 _BLOCK, _FEW_BLOCKS, _RIM = 24, 8, 12
 # Px; slower air shows nothing.
 _SLOWEST = 0.25

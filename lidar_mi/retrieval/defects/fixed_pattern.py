@@ -24,11 +24,11 @@ _NEIGHBOURS = 2
 _CLIPPED = 2.5, 3.0, 4.0
 # Correlation of neighbours in a profile: that of independent gains is -0.3, of texture positive.
 _SMOOTH = 0.2
-# Times that motion and gains are estimated in turn.
-_TURNS = 2
-# Px; where the air moves by less, the pattern of pixels is not apart from texture.
-_APART = 1.5
-# Side of the blocks, px, whose means are independent; the rim that is left out.
+# Iterations over motion and gains.
+_ITERATIONS = 2
+# Px; where the air moves by less, the pattern of pixels cannot be separated from texture.
+_LEAST_DISPLACEMENT = 1.5
+# Side of the blocks, px, whose means are independent; the rim that is masked.
 _BLOCK, _RIM = 16, 8
 # Fewer blocks say too little of their scatter.
 _FEW_BLOCKS = 5
@@ -103,8 +103,8 @@ def fixed_pattern(
 
     The gains p follow from what the motion d does not explain,
     r1(x) - r2(x + d) = p(y) - p(y + d_y), by least squares with a prior variance, the covariance
-    of the profiles. Motion and gains are estimated in turn. Gains alike over more than the local
-    mean are not found.
+    of the profiles. Motion and gains are estimated iteratively. Gains that are alike over more
+    than the local mean are not found.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def fixed_pattern(
         return FixedPattern(_gain({}, images[0]))
     gains = {axis: found[axis][1] for axis in prior}
     unknown = {}
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         now = [working(image) / _gain(gains, image) for image in images]
         d = motion_around(now[0], now[1], windows)[0].cpu().numpy()
         for axis in prior:
@@ -247,7 +247,7 @@ def _pixels(relative: Sequence[np.ndarray], d: torch.Tensor, false_alarm: float)
     allows, and the correlation 0.25. The gains are not removed: an estimate from two images takes
     up errors of the motion, and draws vectors to that motion.
     """
-    known = d.square().sum(0) >= _APART**2
+    known = d.square().sum(0) >= _LEAST_DISPLACEMENT**2
     known[:_RIM] = known[-_RIM:] = False
     known[:, :_RIM] = known[:, -_RIM:] = False
     if not bool(known.any()):

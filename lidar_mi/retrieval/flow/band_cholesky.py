@@ -149,8 +149,8 @@ def _places(rows: int, columns: int) -> tuple[torch.Tensor, tuple[np.ndarray, np
     n, below = 2 * rows, _bandwidth(rows)
     in_block = 2 * (shift_y * rows + other.clip(0, rows - 1)) + b
     blocks = torch.as_tensor((y * (1 + REACH) * n + in_block) * n + 2 * z + a).int()
-    apart = 2 * (shift_y * rows + shift_z - REACH) + b - a
-    known = (other >= 0) & (other < rows) & (y + shift_y < columns) & (apart >= 0)
+    below_diagonal = 2 * (shift_y * rows + shift_z - REACH) + b - a
+    known = (other >= 0) & (other < rows) & (y + shift_y < columns) & (below_diagonal >= 0)
     known = np.broadcast_to(known, sizes)
-    target = (2 * (y * rows + z) + a) * (below + 1) + apart
+    target = (2 * (y * rows + z) + a) * (below + 1) + below_diagonal
     return blocks, (np.flatnonzero(known), np.broadcast_to(target, sizes)[known])

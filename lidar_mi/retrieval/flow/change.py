@@ -59,7 +59,7 @@ def displaced(wave: torch.Tensor, structure: torch.Tensor) -> torch.Tensor:
     in space, its spectral density T gives that of a slice, S(k) = integral T(|(k, q)|) dq, and
     that of the gradient, F(k) = integral q^2 T(|(k, q)|) dq, over the wavenumbers q across the
     plane. Then dF/dk = -k S, so that F(k) is the integral of k' S(k') from k on. It holds more in
-    long waves than the gradients in the plane do. As in `warping.mismatch`, the density is half
+    long waves than the gradients in the plane do. As in `spline.mismatch`, the density is half
     that of the difference of two images.
 
     Parameters
@@ -120,7 +120,7 @@ def unexplained(
     ----------
     spline : Spline
     density : torch.Tensor, shape (shells,)
-        Of the differences, from `warping.mismatch`.
+        Of the differences, from `spline.mismatch`.
     structure : torch.Tensor, shape (shells,)
         From `of_structure`.
     strain : float

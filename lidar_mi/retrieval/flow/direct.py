@@ -21,12 +21,12 @@ _ROUNDING = 1e-14
 # Residual over the right hand side that a step with a factor in single precision may leave.
 _SINGLE = 1e-3
 # Products with a form until conjugate gradients from a similar one are given up.
-_TURNS = 12
+_MOST_PRODUCTS = 12
 
 
 # Least information over second derivative at which steps take the information: each then leaves
 # less than half of the distance.
-_ALIKE = 0.7
+_LEAST_INFORMATION = 0.7
 
 
 class Posterior(NamedTuple):
@@ -118,14 +118,14 @@ def solved_in_single(
     gradient = mesh.transposed(linear.gradient) + prior_term.gradient
     whole = (data_form if informative(linear) else curvature)(linear, mesh) + prior_term.whole
     if near is not None:
-        step = solved_near(near, whole, gradient, _SINGLE, _TURNS)
+        step = solved_near(near, whole, gradient, _SINGLE, _MOST_PRODUCTS)
         if step is not None:
             return coefficients + step
     root = cholesky(whole.float())
     if root is not None:
         step = root.solve(gradient)
-        left = gradient - _band(mesh).apply(whole, step)
-        if bool(left.norm() <= _SINGLE * gradient.norm()):
+        residual = gradient - _band(mesh).apply(whole, step)
+        if bool(residual.norm() <= _SINGLE * gradient.norm()):
             return coefficients + step
     return coefficients + _in_double(whole).solve(gradient)
 
@@ -156,7 +156,7 @@ def in_single(band: Band, form: torch.Tensor) -> Factor | None:
 
 def informative(linear: Linear) -> bool:
     """Whether information and second derivative are alike: steps by either converge."""
-    return bool((linear.information >= _ALIKE * linear.weight).all())
+    return bool((linear.information >= _LEAST_INFORMATION * linear.weight).all())
 
 
 def prior_and_gradient(
@@ -172,7 +172,7 @@ def prior_and_gradient(
 
 
 def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
-    """Quadratic form of what the images tell, of all cells along z or of some (`band.form`)."""
+    """Quadratic form of the images' information, of all cells along z or some (`band.form`)."""
     return form_of_slopes(linear.information, linear.damped, mesh, cells)
 
 

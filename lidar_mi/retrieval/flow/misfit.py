@@ -10,7 +10,7 @@ from lidar_mi.retrieval.flow.coherent_change import (
     mean_square_displacement,
 )
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
-from lidar_mi.retrieval.images.band_limit import WORTH_WHITENING, flat_if_nearly, wavenumbers
+from lidar_mi.retrieval.images.band_limit import LEAST_REDUCTION, flat_if_nearly, wavenumbers
 from lidar_mi.retrieval.images.intensity import rms
 from lidar_mi.retrieval.images.spline import Spline, band_limited, filter_of, mismatch, spectrum_of
 from lidar_mi.retrieval.images.windows import averaged
@@ -125,8 +125,8 @@ def with_local_noise(
             settings = images.spline.settings
             spectrum = spectrum_of(images.stack, weight.sqrt(), settings)
             # a filter that is not flat adds to what blur in strain makes
-            worth = np.inf if images.noise_known and blurred > _BLURRED else WORTH_WHITENING
-            density = flat_if_nearly(spectrum, density, settings.threshold, worth)
+            reduction = np.inf if images.noise_known and blurred > _BLURRED else LEAST_REDUCTION
+            density = flat_if_nearly(spectrum, density, settings.threshold, reduction)
     spline, level = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
     )

@@ -168,7 +168,7 @@ class ExpectedFlow:
         Of the air at the pixels at mid-time in both images, px.
     first : tuple of torch.Tensor, shape (1, z, y)
         Value and slopes of the first image there.
-    prior_term : Pull
+    prior_term : PriorTerm
     root : BandCholesky
         Factor of the precision of the flow, by the information that the first image shows.
     covariance : torch.Tensor, shape (2, 2, *windows.count)
@@ -297,7 +297,7 @@ def _mesh(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Mesh:
-    """Kept for the next slab: to make its splines takes longer than to use them."""
+    """Stored for the next slab: to make its splines takes longer than to use them."""
     return Mesh(axes, places(windows, torch.empty(0, dtype=dtype, device=device)))
 
 
@@ -339,7 +339,9 @@ def _completed(
         known = known & informative([noise])
     pair = normalised(stack)
     second = pair[1:].nan_to_num(0.0).float()
-    both = images.spline.beside(filtered_spline(second, _filter(start), start.settings.filter))
+    both = images.spline.stacked_with(
+        filtered_spline(second, _filter(start), start.settings.filter)
+    )
     return images._replace(spline=both, usable=known, stack=pair)
 
 

@@ -214,7 +214,7 @@ class Prior(NamedTuple):
         all_of_it = self._divergent(before)
         fraction = all_of_it / before.strength
         largest = settings.largest_change_divergence
-        everywhere, beside = (
+        everywhere, in_cores = (
             float(
                 bounded(
                     (part * all_of_it * informed).mean(), (part * all_of_it * energy).mean(), most
@@ -226,7 +226,7 @@ class Prior(NamedTuple):
         # images of weak texture without measurable divergence are no evidence that there is none
         most = settings.largest_ratio / float((1 / self.local[0]).mean())
         change = float(_secant(trend, before.trend, math.log(largest)).exp())
-        return Divergence(min(before.strength * change, most), before.ratio * beside, trend)
+        return Divergence(min(before.strength * change, most), before.ratio * in_cores, trend)
 
 
 def _secant(

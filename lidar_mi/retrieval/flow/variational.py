@@ -58,7 +58,7 @@ def variational(
         sum_k sum_x (I_k(x + path(u, t_k)) - mean_k)^2 / (2 s^2)
             + 1/2 integral L(x) vorticity^2 + divergence^2 / (1 / D + 1 / (q L(x))),
 
-    with the images band-limited (`warping.band_limited`) and warped to mid-time along the curved
+    with the images band-limited (`spline.band_limited`) and warped to mid-time along the curved
     paths of the flow, so that no texture has to be known; residuals beyond 3 s count linearly.
     The prior's strength L(x), which may vary over about a template, D and q are those of the
     largest evidence: the energy of vorticity and of divergence is as large as the prior

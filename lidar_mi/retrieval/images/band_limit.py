@@ -16,7 +16,7 @@ _SHELL_WAVES = 200
 # Least number of shells per cycle per pixel.
 _SHELLS = 16
 # Fraction by which whitening must lessen the variance of displacements.
-WORTH_WHITENING = 0.1
+LEAST_REDUCTION = 0.1
 
 
 class Filter(NamedTuple):
@@ -76,7 +76,7 @@ def power_spectrum(
         Odd lengths of the Fourier transforms.
     settings : FilterSettings
     weight, known
-        See `warping.band_limited`.
+        See `spline.band_limited`.
     """
     shape = tuple(images.shape[1:])
     _, shell = radii(tuple(sizes), shape, images.dtype, images.device)
@@ -105,7 +105,7 @@ def best_filter(
         Of the images.
     settings : FilterSettings
     noise, mismatch, blur
-        See `warping.band_limited`.
+        See `spline.band_limited`.
     """
     density, uncertainty, shape, sizes = spectrum
     radius, shell = radii(sizes, shape, density.dtype, density.device)
@@ -157,7 +157,7 @@ def flat_if_nearly(
     spectrum: PowerSpectrum,
     mismatch: torch.Tensor,
     threshold: float,
-    worth: float = WORTH_WHITENING,
+    least_reduction: float = LEAST_REDUCTION,
 ) -> torch.Tensor:
     """The mismatch, at one level if whitening it would lessen errors by little.
 
@@ -174,10 +174,10 @@ def flat_if_nearly(
     spectrum : PowerSpectrum
         Of the images.
     mismatch : torch.Tensor, shape (shells,)
-        See `warping.band_limited`.
+        See `spline.band_limited`.
     threshold : float
         Standard errors by which a shell must exceed the mismatch to count as texture.
-    worth : float
+    least_reduction : float
         Fraction by which whitening must lessen the variance.
 
     Returns
@@ -200,7 +200,7 @@ def flat_if_nearly(
         (steep * g.square() * noise).sum() / (steep * g).sum().square()
         for g in (response, response / noise)
     )
-    if flat > (1 + worth) * white:
+    if flat > (1 + least_reduction) * white:
         return mismatch
     return torch.where(mismatch.isfinite(), level, torch.inf)
 
@@ -256,7 +256,7 @@ def radii(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Frequency of each wave of a real Fourier transform, cycles per px, and its shell.
 
-    They depend on the grid alone: those of images are kept for the next images.
+    They depend on the grid alone: those of images are stored for the next images.
     """
     return (_radii if len(sizes) == 2 else _radii.__wrapped__)(sizes, shape, dtype, device)
 

@@ -56,7 +56,7 @@ class Spline(NamedTuple):
         """That of one of the images."""
         return self._replace(coefficients=self.coefficients[number : number + 1])
 
-    def beside(self, other: "Spline") -> "Spline":
+    def stacked_with(self, other: "Spline") -> "Spline":
         """With the images of another one after the same filter."""
         return self._replace(coefficients=torch.cat([self.coefficients, other.coefficients]))
 
@@ -325,7 +325,7 @@ def filtered_splines(
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
     )
-    # of images kept for the next ones, as the shells are
+    # stored of images for the next ones, as the shells are
     factor = _through_nodes if len(dims) == 2 else _through_nodes.__wrapped__
     through = factor(tuple(sizes), finer, images.dtype, images.device)
     keep = [slice(finer * (n + 2 * margin)) for n in shape]
@@ -355,17 +355,17 @@ def _through_nodes(
     return factor
 
 
-def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> torch.Tensor:
+def mismatch(spline: Spline, residual: torch.Tensor, number: int | None = None) -> torch.Tensor:
     """Spectral density, by shells, of the differences of warped images, before their filter.
 
     Parameters
     ----------
     spline : Spline
         That the warped images were sampled from.
-    rest : torch.Tensor, shape (images, ...)
+    residual : torch.Tensor, shape (images, ...)
         Each warped image less the mean of all; zero where not all are valid.
     number : int, optional
-        Of warped images, where `rest` is only some. Left out: as many as `rest`.
+        Of warped images, where `residual` is only some. Left out: as many as `residual`.
 
     Returns
     -------
@@ -373,10 +373,10 @@ def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> t
         As `band_limited` takes it. Infinite where the filter passed nothing.
     """
     sizes = transform_sizes(spline.shape, spline.settings)
-    _, shell = radii(tuple(sizes), spline.shape, rest.dtype, rest.device)
-    number = number or len(rest)
-    rest = rest * (number / (number - 1)) ** 0.5
-    density, _ = shell_means(rest, shell, sizes, spline.settings.smoothing)
+    _, shell = radii(tuple(sizes), spline.shape, residual.dtype, residual.device)
+    number = number or len(residual)
+    residual = residual * (number / (number - 1)) ** 0.5
+    density, _ = shell_means(residual, shell, sizes, spline.settings.smoothing)
     passed = spline.gain.square()
     return torch.where(passed > 1e-3, density / passed, torch.inf)
 

@@ -386,7 +386,7 @@ def _start(
     cells = waves.cells
     fraction = orders(model, cells.r2)[1]
     # the phase of the first harmonic is the fraction of the order, for any finesse
-    turns = torch.stack(
+    basis = torch.stack(
         [
             torch.ones_like(fraction),
             torch.cos(2 * torch.pi * fraction),
@@ -394,8 +394,8 @@ def _start(
         ]
     )
     weight = cells.count
-    inverse = torch.linalg.pinv((turns * weight) @ turns.T, hermitian=True)
-    found = (means * weight) @ turns.T @ inverse
+    inverse = torch.linalg.pinv((basis * weight) @ basis.T, hermitian=True)
+    found = (means * weight) @ basis.T @ inverse
     # the noise at the image's mean
     spread = noise.variance(found[:, :1].clamp(min=0), found[:, :1].clamp(min=0))
     size = found[:, 1:].norm(dim=1)

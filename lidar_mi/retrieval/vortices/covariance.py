@@ -248,6 +248,6 @@ def _slope(misfit: torch.Tensor, change: torch.Tensor, weight: torch.Tensor) -> 
     if not float(square) > 0:
         return 0.0
     slope = float((weight * change * misfit).sum() / square)
-    rest = misfit - slope * change
-    error = float((weight * change * rest).square().sum().sqrt() / square)
+    residual = misfit - slope * change
+    error = float((weight * change * residual).square().sum().sqrt() / square)
     return slope if slope > _SIGNIFICANT * error else 0.0

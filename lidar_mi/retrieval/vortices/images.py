@@ -355,7 +355,8 @@ class Builder:
             return self._splines(self.pair, self.filter(self.level))
         first, second = self.of_first, self._splines(self.pair[1:], self.of_first.filter)
         return first._replace(
-            sharp=first.sharp.beside(second.sharp), whole=first.whole.beside(second.whole)
+            sharp=first.sharp.stacked_with(second.sharp),
+            whole=first.whole.stacked_with(second.whole),
         )
 
     def _splines(self, images: torch.Tensor, chosen: Filter) -> Splines:
@@ -364,7 +365,7 @@ class Builder:
         return Splines(sharp, whole, chosen, self.spectrum)
 
     def filter(self, noise: float | None, mismatch: torch.Tensor | None = None) -> Filter:
-        """The filter of both images, as `warping.band_limited` chooses it."""
+        """The filter of both images, as `spline.band_limited` chooses it."""
         checked_noise(noise)
         return best_filter(self.spectrum, FilterSettings(), noise, mismatch)
 
@@ -442,9 +443,9 @@ class Builder:
         gain = white.spline.gain * (1.0 if images.whitening is None else images.whitening.gain)
         before = images.spline._replace(gain=gain)
         # places of more noise count less, so that the spectrum is that of one field
-        rest = valid * misfit.residual / shape.sqrt() / 2
-        # the other image's rest is the same with the other sign
-        density = mismatch(before, rest[None], number=2)
+        reduced = valid * misfit.residual / shape.sqrt() / 2
+        # the other image's residual is the same with the other sign
+        density = mismatch(before, reduced[None], number=2)
         density = density.clamp(min=max(least, fraction * level) / 2)
         level = max(least, level)
         chosen = self.filter((level / 2) ** 0.5, density)

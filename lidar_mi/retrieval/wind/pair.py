@@ -244,6 +244,6 @@ def _flags_among_neighbours(
 
 def _flags_of_unrelated(clean: CleanImages, given: PairInput, method: Method) -> torch.Tensor:
     """Flags where the images show different air, of a fitted field where they do everywhere."""
-    apart = unrelated(clean.filled[:2], given.windows, method.reach > 1, given.noise)
-    apart = apart if method.local else apart.all().expand_as(apart)
-    return (Flag.UNRELATED * apart).to(torch.int16)
+    different = unrelated(clean.filled[:2], given.windows, method.reach > 1, given.noise)
+    different = different if method.local else different.all().expand_as(different)
+    return (Flag.UNRELATED * different).to(torch.int16)

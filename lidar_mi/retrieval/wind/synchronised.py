@@ -1,4 +1,4 @@
-"""Images of one instant from scans that take time: every beam's value carried along by the air."""
+"""Images of one instant from scans that take time: every beam's value advected by the air."""
 
 from collections.abc import Callable, Sequence
 
@@ -36,12 +36,12 @@ def synchronised(
 
     A curve that crosses itself, such as a Lissajous figure, returns to the neighbourhood of a beam
     after up to the whole scan, and the air has moved by then: values of different air would be
-    averaged. Beams are therefore carried with the air to the mean time m of all scans' beams,
+    averaged. Beams are therefore advected with the air to the mean time m of all scans' beams,
 
         place(m) = place(t) - integral of the wind from m to t along the path (midpoint rule),
 
     and resampled from there. The wind is that of `multipass` between two images in succession,
-    resampled as they are at first and then from carried beams, twice. An error of this wind counts
+    resampled as they are at first and then from advected beams, twice. An error of this wind counts
     with the time of the beams over dt: 5 % of 12 m/s and 45 ms are 3 cm.
 
     Parameters
@@ -57,7 +57,7 @@ def synchronised(
     Returns
     -------
     list of xr.Dataset
-        On their nodes. ``beam_time`` is m all over where beams were carried.
+        On their nodes. ``beam_time`` is m all over where beams were advected.
     """
     if not any(mixes_times(scan, min(np.abs(steps))) for scan in scans):
         return [on_nodes(scan) for scan in scans]
@@ -68,12 +68,12 @@ def synchronised(
     for _ in range(_ROUNDS - 1):
         winds = _winds(images, steps, image)
         images = [
-            _at_time(0.0, on_nodes(carried(scan, wind), errors=False))
+            _at_time(0.0, on_nodes(advected(scan, wind), errors=False))
             for scan, wind in zip(needed, winds, strict=True)
         ]
     winds = _winds(images, steps, image)
     return [
-        _at_time(middle, on_nodes(carried(scan, wind)))
+        _at_time(middle, on_nodes(advected(scan, wind)))
         for scan, wind in zip(scans, winds, strict=True)
     ]
 
@@ -98,7 +98,7 @@ def mixes_times(scan: xr.Dataset, dt: float) -> bool:
     return float(np.median(left.std(1))) > _MIXED * dt
 
 
-def carried(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
+def advected(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
     """The scan with its beams at the places of their air at the time 0.
 
     Parameters
