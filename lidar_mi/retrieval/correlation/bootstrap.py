@@ -140,10 +140,10 @@ def bootstrap_covariance(
     repeats : int
         1 or 2 retrievals: the residual is moved to opposite sides.
     textured : torch.Tensor of bool, shape windows.count, optional
-        Windows whose errors count; left out: all. Errors of windows that hold nothing say nothing
+        Windows whose errors count; default: all. Errors of windows that hold nothing say nothing
         of their neighbours.
     clear : torch.Tensor of bool, shape windows.count, optional
-        Windows that pass thresholds of texture half as high again; left out: all.
+        Windows that pass thresholds of texture half as high again; default: all.
     stated : torch.Tensor, shape (z, y), optional
         Variance of the residual by changes whose errors are stated elsewhere: it is taken away from
         the residual's, of which a tenth remains at least.

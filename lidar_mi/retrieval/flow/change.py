@@ -48,6 +48,7 @@ def of_structure(spline: Spline, stack: torch.Tensor, noise: float) -> torch.Ten
     sizes = transform_sizes(spline.shape, settings)
     _, shell = radii(tuple(sizes), spline.shape, stack.dtype, stack.device)
     density, uncertainty = shell_means(stack, shell, sizes, settings.smoothing, known)
+    # the means of shells of noise alone scatter about noise^2
     structure = density > noise**2 * (1 + settings.threshold * uncertainty)
     return torch.where(structure, density - noise**2, 0.0)
 
@@ -102,6 +103,7 @@ def mean_square_strain(slopes: Sequence[torch.Tensor]) -> float:
     """
     along_z, along_y = slopes
     stretched, sheared = along_z[0] - along_y[1], along_z[1] + along_y[0]
+    # strain e along one axis, -e across: e^2 = (stretched^2 + sheared^2) / 4
     return float((stretched.square() + sheared.square()).mean()) / 4
 
 
@@ -135,12 +137,14 @@ def unexplained(
     blurred : float
         Fraction of the differences that blur in strained air makes instead.
     """
+    # shells beyond half a cycle per pixel are cut by the corners of the spectrum
     full = torch.arange(len(density), device=density.device) < min(spline.shape) // 2
     wave = wavenumbers(density, spline.shape)
     moved, smeared = displaced(wave, structure), strained(wave, structure)
     use = density.isfinite() & (moved > 0) & (wave > math.pi / knots) & full
     if int(use.sum()) < 3:
         return 0.0, 0.0
+    # smoothed shells share the waves of their neighbours
     waves = _independent_waves(spline, density) / spline.settings.smoothing
     found, across, blurred, number = (
         part[use].double().cpu().numpy() for part in (density, moved, smeared, waves)

@@ -46,6 +46,7 @@ class Posterior(NamedTuple):
         before = self.band.covariance(self.band.factor(self.stiff))
         removed = before - self.band.covariance(self.root)
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
+        # at the largest evidence the two are equal (MacKay's fixed point)
         return variances(removed, self.prior), energy
 
     def response(self, gradient: torch.Tensor) -> torch.Tensor:
@@ -74,6 +75,7 @@ def solved(
     band = _band(mesh)
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
+    # standard errors follow the information; steps with less than the second derivative overshoot
     step = root if informative(linear) else band.factor(curvature(linear, mesh) + stiff)
     return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
 
@@ -97,6 +99,7 @@ def prior_term_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> Pri
     """That of a prior at a flow."""
     stiff = prior_form(prior)
     with_diagonal(stiff, ridge)
+    # the gradient is without what is against rounding: the minimum stays where it is
     whole = stiff.clone()
     with_diagonal(whole, rounding(stiff))
     return PriorTerm(stiff, whole, stiff).at(prior, coefficients)
@@ -167,6 +170,7 @@ def prior_and_gradient(
     with_diagonal(stiff, ridge)
     band = _band(mesh)
     gradient = mesh.transposed(linear.gradient) - band.apply(stiff, coefficients)
+    # after the gradient: the steps are shorter, and end at the same flow
     with_diagonal(stiff, rounding(stiff))
     return stiff, gradient
 
@@ -195,11 +199,13 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
     mesh = prior.mesh
     rows = mesh.axes[0].knots if cells is None else cells.stop - cells.start + REACH
     total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
+    # kinds of motion share products of derivatives: each product is summed once
     pairs: dict[tuple[tuple[int, int], tuple[int, int]], list[tuple[int, int, int, float]]] = {}
     for kind, terms in enumerate(_kinds(prior)):
         for a, first, one in terms:
             for b, second, other in terms:
                 pairs.setdefault((first, second), []).append((kind, a, b, one * other))
+    # the integral over the plane is a sum over the cells of the mesh
     weight = prior.cell * prior.strength
     for (first, second), members in pairs.items():
         parts = form(weight, mesh, first, second, cells)

@@ -94,7 +94,7 @@ class Linear(NamedTuple):
     damped : torch.Tensor, shape (components, ...)
         The same without what is `coarse`: slopes that tell of the flow.
     coarse : torch.Tensor, shape (z, y), or None
-        Fraction of the long waves of differences and slopes that is left out at each pixel, as
+        Fraction of the long waves of differences and slopes that is removed at each pixel, as
         structure is not advected there: the residual is as white as the noise.
     gradient : torch.Tensor, shape (components, ...)
         Of the log-likelihood with respect to the flow at each pixel.
@@ -142,6 +142,7 @@ def prepared(
     )
     level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
+    # mid-time is that of the whole burst
     time = time - time.mean()
     return Images(
         spline,
@@ -175,6 +176,7 @@ def linearised_there(
     """`linearised`, with the images' values and slopes at the places of `path`."""
     value, *slopes = sampled
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
+    # over air that is in all images: bright air that enters would change the brightness of all
     value, gain = normalised_intensity(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])
     residual = (value - value.mean(0)) * images.weight.sqrt()
@@ -185,8 +187,10 @@ def linearised_there(
     if not images.noise_updated:
         variance = max(variance, misfit_variance(misfit[valid], len(value)) / passed)
     off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
+    # beyond `robust` standard deviations residuals enter linearly (Huber)
     weight = images.weight * (settings.robust / off.clamp(min=settings.robust)) * valid
     time = images.time.reshape(-1, *[1] * mesh.dims)
+    # an image moves by its time times the flow: the derivative weights it by that
     difference = (time * (value - value.mean(0))).sum(0)
     informed = images.spline.efficiency * weight / variance
     coarse: torch.Tensor | None = None
@@ -309,6 +313,7 @@ def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int)
     for k in range(2, terms + 1):
         along: Sequence[torch.Tensor] = (
             mesh.slopes(coefficients)
+            # slopes of the splines are exact; in the small further terms differences suffice
             if k == 2
             else torch.gradient(term, dim=tuple(range(1, term.ndim)))
         )

@@ -71,7 +71,7 @@ def with_local_noise(
         makes images differ by it.
     residual_of : callable, optional
         What the fit leaves of a difference of images in a plane, see
-        `coherent_change.residual_operator`. Left out: of volumes.
+        `coherent_change.residual_operator`. None of volumes.
     """
     again, overstated = images.noise_updated, False
     coherent = images.coherent

@@ -98,7 +98,7 @@ class Flow:
         change : torch.Tensor, shape (2, z, y)
             Of the flow after this shift, px in dt, as by a model of both.
         offset : (float, float), optional
-            See `Flow`. Left out: the last one and the shift.
+            See `Flow`. Default: the last one and the shift.
         """
         axes, like = self.prior.mesh.axes, self.coefficients
         pixels = _of_pixels(axes, self.windows, like)

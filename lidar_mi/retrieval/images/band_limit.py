@@ -130,14 +130,18 @@ def best_filter(
     if mismatch is not None and noise is not None:
         level = torch.as_tensor(noise**2).to(floor)
     if blur:
+        # the inverse of the Gaussian's transform, limited, as noise is amplified as well
         sharper = torch.exp((blur * wavenumbers(response, shape)).square() / 2).clamp(
             max=settings.sharpening
         )
+        # the Wiener filter S / (S + N / 2) / B itself: the root is taken below
         response = torch.where(response > 0, (response * sharper).square(), 0.0)
     passed = _mean(response[shell], sizes)
+    # times sqrt(noise^2 / N) the filter whitens the mismatch (Hannan & Thomson 1973)
     white = level / floor if mismatch is not None else torch.ones_like(response)
     gain = (response * white).sqrt()
     # power of the filtered slopes with noise, the part of it from texture, and its variance
+    # the mean of two images has half the variance of their noise
     both = texture + floor / 2
     steep = radius**2 * gain[shell] ** 2
     power, informed, spread = (
@@ -149,6 +153,7 @@ def best_filter(
         passed,
         power / informed if informed > 0 else 1.0,
         informed / spread if informed > 0 else 1.0,
+        # slopes per px have radians, frequencies have cycles
         (2 * math.pi) ** 2 * _mean(steep * (floor / 2).expand(len(gain))[shell], sizes),
     )
 
@@ -196,6 +201,7 @@ def flat_if_nearly(
     response = texture / (texture + noise / 2)
     steep = number * wavenumbers(density, shape)[above].square() * texture
     level = (steep * response.square() * noise).sum() / (steep * response.square()).sum()
+    # g here is the square of the docstring's: the weight of a wave
     flat, white = (
         (steep * g.square() * noise).sum() / (steep * g).sum().square()
         for g in (response, response / noise)
@@ -293,7 +299,9 @@ def shell_means(
     window = torch.ones((), dtype=images.dtype, device=images.device)
     for n in shape:
         hann = torch.hann_window(n + 2, periodic=False, dtype=images.dtype, device=images.device)
+        # without the zeros at its ends, which would discard the outer pixels
         window = window[..., None] * hann[1:-1]
+    # as the window weights it: the windowed field then has no wave of frequency 0
     mean = (images * window).sum(dims, keepdim=True) / window.sum()
     power = torch.fft.rfftn((images - mean) * window, s=list(sizes), dim=dims)
     power = power.abs().square().mean(0)
@@ -346,8 +354,10 @@ def faded(
         n = images.shape[axis]
         place = torch.arange(-margin, size - margin, device=images.device)
         beyond = torch.maximum(-place, place - (n - 1)).clamp(0, margin).to(images)
+        # a raised cosine: no step of value or slope at either end
         fade = (1 + torch.cos(torch.pi * beyond / margin)) / 2
         edge = place.clamp(0, n - 1)
+        # mirrored about the outer pixels, which are not repeated: the period is 2 n - 2
         place = place % max(2 * n - 2, 1)
         mirrored = images.index_select(axis, torch.minimum(place, (2 * n - 2 - place) % (2 * n)))
         if antisymmetric:

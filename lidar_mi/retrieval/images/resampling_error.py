@@ -45,6 +45,7 @@ class Variogram(NamedTuple):
         """Of the structure, for distances (..., 2) in spacings and times (...), s."""
         square = (separation**2).sum(-1) + (self.speed * delay) ** 2
         a = self.exponent
+        # 1 - (1 + x)^-a, exact also next to 0
         return self.strength * -np.expm1(-a * np.log1p(square / (2 * a * self.length**2)))
 
 
@@ -92,6 +93,7 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
     def misfit(p: np.ndarray) -> np.ndarray:
         made = model(p)
         expected = made(np.stack([h, 0 * h], -1), tau) + made.noise
+        # relative: squared differences scatter in proportion to their mean
         return np.sqrt(number) * (seen / expected - 1)
 
     start = np.array([1.0, np.log(3.0), 2.0, 1.0, 0.05])
@@ -166,6 +168,7 @@ def leave_one_out(
     means = [np.bincount(index, part) for part in (square, noisy, expected)]
     seen, by_noise, by_air = (part[number > 0] / number[number > 0] for part in means)
     seen = np.maximum(seen, 1e-300)
+    # divided by what was seen: bins of close beams, which show the noise, count as much as others
     matrix = np.stack([by_noise / seen, by_air / seen], 1)
     scale = np.maximum(matrix.max(0), 1e-300)
     (noise, strength), _ = nnls(matrix / scale, np.ones(len(seen)))

@@ -63,6 +63,7 @@ class Spline(NamedTuple):
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
         """A field on the images' pixels after the images' filter; it is zero beyond them."""
         margin = self.settings.margin
+        # one margin is enough: what passes one edge of the periodic transform enters at the other
         sizes = [even_fast_len(n + margin) for n in self.shape]
         dims = tuple(range(-len(sizes), 0))
         # sizes of another parity may reach one shell further
@@ -102,6 +103,7 @@ class Spline(NamedTuple):
             value, *slopes = _read_images(self.coefficients, at[0], at[1])
         else:
             value, *slopes = _read_volumes(self.coefficients, *at)
+        # per px from per node
         return value, *(self.settings.nodes * slope for slope in slopes)
 
     def values(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -114,6 +116,7 @@ class Spline(NamedTuple):
         """Places on the images, counted in nodes."""
         finer, margin = self.settings.nodes, self.settings.margin
         return [
+            # the first of the four coefficients of a place is that of one node before it
             finer * (p.clamp(0, size - 1) + margin) - 1
             for p, size in zip(place, self.shape, strict=True)
         ]
@@ -144,6 +147,7 @@ def _read_images(
     knot, *along = (torch.empty_like(z) for _ in range(1 + len(weight_y)))
     for i in range(4):
         for j in range(4):
+            # a view that begins further on saves an addition to every number
             torch.index_select(flat[i * width + j :], 0, corner, out=knot.view(-1))
             for part, weight in zip(along, weight_y, strict=True):
                 if j:
@@ -236,7 +240,7 @@ def band_limited(
         Non-finite pixels take the value of the nearest finite one, as a step to any other would
         be structure at rest. They do not count in the power spectrum.
     noise : float, optional
-        Standard deviation of the images' white noise. Left out: from the lowest shell of the
+        Standard deviation of the images' white noise. Default: from the lowest shell of the
         power spectrum.
     mismatch : torch.Tensor, shape (shells,), optional
         Spectral density N of the differences of warped images, see `mismatch`. The filter is then
@@ -249,7 +253,7 @@ def band_limited(
         filter, S / (S + N / 2) / B with the Gaussian's transform B and the spectral density S of
         the blurred images.
     settings : FilterSettings, optional
-        Left out: those of images.
+        Default: those of images.
 
     Returns
     -------
@@ -321,6 +325,7 @@ def filtered_splines(
     sizes = transform_sizes(shape, settings)
     dims = tuple(range(1, images.ndim))
     shell = radii(tuple(sizes), shape, images.dtype, images.device)[1]
+    # images fade to 0 beyond their edges, that is to their mean
     mean = images.mean(dims, keepdim=True)
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
@@ -351,6 +356,7 @@ def _through_nodes(
     """Coefficients over values of a spline through nodes, `finer` of them a pixel, by its waves."""
     factor = torch.ones((), dtype=dtype, device=device)
     for axis in frequencies(sizes, factor):
+        # a cubic B-spline is 1/6, 4/6, 1/6 at its nodes: (2 + cos) / 3 in its waves
         factor = factor * 3 / (2 + torch.cos(2 * torch.pi * axis / finer))
     return factor
 
@@ -365,7 +371,7 @@ def mismatch(spline: Spline, residual: torch.Tensor, number: int | None = None) 
     residual : torch.Tensor, shape (images, ...)
         Each warped image less the mean of all; zero where not all are valid.
     number : int, optional
-        Of warped images, where `residual` is only some. Left out: as many as `residual`.
+        Of warped images, where `residual` is only some. Default: as many as `residual`.
 
     Returns
     -------
@@ -375,9 +381,11 @@ def mismatch(spline: Spline, residual: torch.Tensor, number: int | None = None) 
     sizes = transform_sizes(spline.shape, spline.settings)
     _, shell = radii(tuple(sizes), spline.shape, residual.dtype, residual.device)
     number = number or len(residual)
+    # the mean of all has taken one degree of freedom
     residual = residual * (number / (number - 1)) ** 0.5
     density, _ = shell_means(residual, shell, sizes, spline.settings.smoothing)
     passed = spline.gain.square()
+    # where the filter passes next to nothing, the quotient would be rounding
     return torch.where(passed > 1e-3, density / passed, torch.inf)
 
 
@@ -385,7 +393,9 @@ def _refined(spectrum: torch.Tensor, sizes: Sequence[int], finer: int) -> torch.
     """Fields of odd sizes (axes but the first) from their spectra, on a grid that is finer."""
     # axis by axis: the axes not yet refined are small
     for axis, n in enumerate(sizes[:-1], 1):
+        # of odd length: no wave at the end of the spectrum has to be divided between both signs
         low, high = spectrum.split([n // 2 + 1, n // 2], axis)
         shape = [*spectrum.shape[:axis], (finer - 1) * n, *spectrum.shape[axis + 1 :]]
         spectrum = torch.fft.ifft(torch.cat([low, low.new_zeros(shape), high], axis), dim=axis)
+    # inverse transforms divide by the finer sizes
     return finer ** len(sizes) * torch.fft.irfft(spectrum, n=finer * sizes[-1])

@@ -322,6 +322,7 @@ def _calibration(
     # the frames' mean speed depends on the shared parameters: v = v_0 - g . shared
     slope = -state.speed_by_shared.mean(0).numpy()
     zero = float(slope @ covariance @ slope + own_variance.sum() / count**2)
+    # what the speeds scatter by beyond their own errors
     drift = math.sqrt(max(0.0, speed.var(ddof=1) - own_variance.mean()))
     places = [names.index(name) for name in INSTRUMENT]
     systematic = np.empty((1 + len(INSTRUMENT),) * 2)

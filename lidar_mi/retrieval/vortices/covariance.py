@@ -80,6 +80,7 @@ def parameter_covariance(
     inverse = _inverse(found)
     covariance = (inverse @ spread @ inverse)[:10, :10]
     attenuation = _attenuation(found)
+    # a bias of unknown size: fully correlated between the parameters
     covariance = covariance + torch.outer(attenuation, attenuation)
     if not found.converged:
         remaining = _remaining_step(found)
@@ -187,6 +188,7 @@ def _remaining_step(found: Solution) -> torch.Tensor:
 def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
     """Whether the remaining step is more than the other standard error of any parameter."""
     square = _remaining_step(found).cpu().numpy() ** 2
+    # the remaining step is part of the covariance: it is compared with the rest
     return not (square < np.diagonal(covariance) - square).all()
 
 

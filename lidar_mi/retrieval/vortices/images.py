@@ -153,6 +153,7 @@ class Images:
         # filtered after the difference: shear and a filter of the images do not commute
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
+        # a mean wind displaces the air by itself times dt
         slope = jacobian[8:10] / self.dt
         misfit = Misfit(residual, jacobian, slope, valid, self.variance, self.scatter)
         return self.whitened(misfit)
@@ -220,6 +221,7 @@ class Images:
 
     def _near_cores(self, parameters: torch.Tensor) -> tuple[slice, slice]:
         """Rows and columns within some core radii of one of the vortices or between them."""
+        # core radii are fitted by their logarithms
         reach = _NEAR_CORES * float(parameters[[1, 5]].exp().max())
         box = []
         for places, axis in ((parameters[[3, 7]], 1), (parameters[[2, 6]], 0)):
@@ -243,6 +245,7 @@ class Images:
         """A misfit of the images without the whitening filter, after it if there is one."""
         if self.whitening is None:
             return misfit
+        # a filter of the images would not commute with their shear
         jacobian = self.whitening.filtered(misfit.jacobian * misfit.valid)
         residual = self.whitening.filtered(misfit.residual)
         slope = jacobian[8:10] / self.dt
@@ -387,13 +390,16 @@ class Builder:
             size = 2 * int(np.ceil(4 * blur)) + 1
             rows, columns = (min(size, 2 * n - 1) for n in self.pair.shape[1:])
             soft = gaussian_blur2d(self.pair[None], (rows, columns), (blur, blur), "replicate")[0]
+            # the blur has removed what a filter against noise would remove
             spline = band_limited(list(soft), 0.0)[0]
             spline = spline._replace(coefficients=spline.coefficients.to(self.pair))
+            # sum of the squared weights of a Gaussian
             passed = 1 / (4 * np.pi * blur**2)
         places = [
             torch.as_tensor(axis[step // 2 :: step]).to(self.pair) for axis in (self.z, self.y)
         ]
         vertical, lateral = torch.meshgrid(*places, indexing="ij")
+        # of the difference of two images
         variance = torch.full_like(lateral, 2 * noise**2)
         if self.map is not None:
             # the filter spreads noise over a few pixels, and with few samples one pixel's estimate
