@@ -41,7 +41,7 @@ _REGION, _LEVEL, _SHEAR, _ROUGHNESS, _AROUND = 1.5, 1.25, 0.35, 0.7, 4.5
 # two components of five windows, it is known to 45 %.
 _FEWEST = 5.0
 # Fraction of textured windows in which the known motion must be recovered: a method that fails in
-# most of them has errors that the others do not tell.
+# most of them has errors that the others do not show.
 _FOUND = 0.5
 # Fraction of textured windows that must be clearly so: else most of them are by chance.
 _CLEAR = 0.5
@@ -109,8 +109,8 @@ def bootstrap_covariance(
       vectors are rougher than the errors of the known motion, larger errors are stated.
 
     Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
-    that are passed the tests of texture by chance, and their errors tell nothing.
-    Where the known motion is recovered in less than half of them, neither do the errors of these.
+    that are passed the tests of texture by chance, and their errors are no evidence.
+    Where the known motion is recovered in less than half of them, nor are the errors of these.
 
     These predictors and numbers were chosen on seeds 41 to 46 of the cases of
     ``validation/coverage.py``. With one iterate of the sharpening, the standard errors of "cc" are
@@ -158,7 +158,7 @@ def bootstrap_covariance(
         Gaussian of 1.5 templates) have a known error, and where fewer than half of the textured
         windows around are clear, or have one.
     """
-    # vectors of windows that overlap by more than half would cost more and tell little
+    # vectors of windows that overlap by more than half would cost more and add little
     every = max(1, windows.template // 2 // windows.stride)
     coarse = replace(windows, stride=every * windows.stride)
 
@@ -185,7 +185,7 @@ def bootstrap_covariance(
     # of air that came in nothing is known
     compared = second.isfinite() & inside
     residual = torch.where(compared, second - advected, 0.0)
-    # smoothed, as a noise that few samples tell is itself noisy; one where none is known
+    # smoothed, as a noise from few samples is itself noisy; 1 where none is known
     _, weight = known_and_weight(images, noise)
     known_noise = 1 / weight.to(residual)
 

@@ -27,7 +27,7 @@ def weight_shift(
     texture of 3 px correlation length advected by two vortices (2.7 m/s rms) its error is
     3.3 m/s where cross-correlation has 0.9; a match by centre alone has 5.7. It performs well
     where a template holds one compact blob on little background. Unlike correlation it depends on
-    the offset of the images (a background adds mass at rest, which shifts the centres to the
+    the offset of the images (a background adds mass at offset, which shifts the centres to the
     middle) and on their relative brightness.
 
     Most of its errors are candidates confused, of up to the size of the search region, and not
@@ -105,8 +105,8 @@ def _best_match(
     best, index = misfit.min(0)
     shift_z, shift_y, rim = windows.unravel(index)
     matched = best.isfinite()
-    rest = [part.flatten(0, 1).gather(0, index[None])[0] for part in (centre_z, centre_y)]
-    d = torch.stack([shift_z, shift_y]) + torch.stack(rest)
+    offset = [part.flatten(0, 1).gather(0, index[None])[0] for part in (centre_z, centre_y)]
+    d = torch.stack([shift_z, shift_y]) + torch.stack(offset)
     d = torch.where(matched & ~rim, d, torch.nan)
     flag = Flag.PEAK_ON_RIM * (matched & rim) + Flag.NO_MATCH * ~matched
     return Displacement(d, best.sqrt(), flag.to(torch.int16))

@@ -36,7 +36,7 @@ _FEW_BLOCKS = 5
 _LEAST = 0.25
 # Of the local contrast, from which gains of pixels make errors larger than stated.
 _SPOILS = 0.2
-# The same of what is left of lines: that is detected, or that their estimate leaves open.
+# The same of residual lines: that are detected, or that the error of their estimate allows.
 _LEFT = 0.1, 0.16
 
 
@@ -126,8 +126,8 @@ def fixed_pattern(
         d = motion_around(now[0], now[1], windows)[0].cpu().numpy()
         for axis in prior:
             others = _gain({other: p for other, p in gains.items() if other != axis}, now[0])
-            rest = [_relative(working(image) / others) for image in images]
-            gains[axis], unknown[axis] = _solved(rest, d, axis, prior[axis])
+            values = [_relative(working(image) / others) for image in images]
+            gains[axis], unknown[axis] = _solved(values, d, axis, prior[axis])
     gain = _gain(gains, images[0])
     relative = [_relative(working(image) / gain) for image in images]
     left = max(_lines(_turned(relative, axis), false_alarm)[0] for axis in prior)
@@ -228,13 +228,13 @@ def _solved(
     values = np.concatenate([np.ones_like(part), part - 1, -part])
     place = np.tile(number, 3), np.concatenate([here, low, low + 1])
     matrix = sparse.csr_matrix((values, place), shape=(off.size, size))
-    normal, right, rest = (matrix.T @ matrix).toarray(), matrix.T @ off, off
+    normal, right, residual = (matrix.T @ matrix).toarray(), matrix.T @ off, off
     for _ in range(2):
         # what the gains do not explain; neighbours, over a correlation length of 2 px, share it
-        weight = 4 * np.mean(rest**2) / prior
+        weight = 4 * np.mean(residual**2) / prior
         inverse = np.linalg.inv(normal + weight * np.eye(size))
         gains = inverse @ right
-        rest = off - matrix @ gains
+        residual = off - matrix @ gains
     return gains - gains.mean(), prior * weight * float(np.trace(inverse)) / size
 
 

@@ -20,7 +20,7 @@ _AROUND = 8.0
 _EMPTY = 1e-3
 # Times that pixels are peeled off: areas of four pixels across vanish.
 _PEELS = 4
-# Px about a place, or about where the air carries it, in which an impulse is looked for.
+# Px about a place, or about where the air advects it, in which an impulse is looked for.
 _NEAR = 2
 # Impulses at one place must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
@@ -106,7 +106,7 @@ def _faintest(values: torch.Tensor) -> float:
 
 
 def _peeled(image: torch.Tensor, spread: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
-    """Impulses of an image, and of what is left without them."""
+    """Impulses of an image, and of what remains without them."""
     found = torch.zeros_like(image, dtype=torch.bool)
     for _ in range(_PEELS):
         remaining = torch.where(found, torch.nan, image)

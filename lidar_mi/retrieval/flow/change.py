@@ -79,7 +79,7 @@ def displaced(wave: torch.Tensor, structure: torch.Tensor) -> torch.Tensor:
 def strained(wave: torch.Tensor, structure: torch.Tensor) -> torch.Tensor:
     """Spectral density of differences made by a blur of 1 px where air is strained by 1 in dt.
 
-    Air carries structure, and not the blur of the instrument: seen along with the air, a blur of
+    Air advects structure, and not the blur of the instrument: seen along with the air, a blur of
     variance b^2 is stretched by the rate of strain E from image to image, which makes them differ
     by b^2 dt E_ij d2I / dx_i dx_j. For isotropic structure and a strain e along one axis, -e along
     the other, the density is b^4 e^2 dt^2 k^4 S(k) / 4; half that of the difference of two images,

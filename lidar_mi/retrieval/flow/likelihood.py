@@ -20,8 +20,8 @@ _INTERPOLATION = 1e-5
 # A noise that is given and below this fraction of that of the spectra (of the variances) is only a
 # lower limit: what differs are the air and what splines cannot interpolate.
 _LEAST_KNOWN = 0.1
-# Width of the means that tell texture from noise, in cells between knots: at 0.8 too few pixels,
-# at 3 the rim of smoke counts as texture next to it.
+# Width of the means that separate texture from noise, in cells between knots: at 0.8 too few
+# pixels, at 3 the rim of smoke counts as texture next to it.
 _FRACTION_WIDTH = 1.5
 # Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
 _STRUCTURE = 3.0
@@ -92,7 +92,7 @@ class Linear(NamedTuple):
     slope : torch.Tensor, shape (components, ...)
         Of the mean of the warped images.
     damped : torch.Tensor, shape (components, ...)
-        The same without what is `coarse`: slopes that tell of the flow.
+        The same without what is `coarse`: slopes that inform the flow.
     coarse : torch.Tensor, shape (z, y), or None
         Fraction of the long waves of differences and slopes that is removed at each pixel, as
         structure is not advected there: the residual is as white as the noise.
@@ -101,7 +101,7 @@ class Linear(NamedTuple):
     weight : torch.Tensor
         Of the products of slopes in the second derivative.
     information : torch.Tensor
-        Of the same in what the images tell of the flow: slopes of noise tell nothing.
+        Of the same in the information on the flow: slopes of noise have none.
     variance : float
         Of the noise.
     warped : torch.Tensor, shape (images, ...)
@@ -230,7 +230,7 @@ def without_coarse(
 def information_of_first(
     images: Images, mesh: Mesh, places: torch.Tensor, sampled: Sequence[torch.Tensor], number: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """What images in a plane will tell of a flow, as far as the first of them shows.
+    """Information of images in a plane on a flow, as far as the first of them shows it.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def _fraction_of_texture(
     """Fraction of texture in the mean square of the slopes at each pixel of a plane, 0 to 1.
 
     Noise has slopes too, and next to bright smoke there are no others. With slopes J = T + N of
-    texture and noise the differences of two images tell of the flow by T J, and scatter by
+    texture and noise the differences of two images depend on the flow by T J, and scatter by
     s^2 J^2. Their information on it is (T J)^2 / (s^2 J^2), on average the square of this fraction
     times J^2 / s^2. Both mean squares are Gaussian means over 1.5 cells of the flow's splines.
     Where the noise is not known, `noise`, the square of the misfit over that assumed, is its

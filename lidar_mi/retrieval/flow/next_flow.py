@@ -256,6 +256,7 @@ def next_flow(
     if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
     at_centres = _of_centres(prior.mesh.axes, windows, coefficients)
+    # errors learnt from other images follow the misfit of these
     covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
@@ -361,7 +362,7 @@ def _energy(prior: Prior, coefficients: torch.Tensor) -> float:
 def _misfit(linear: Linear, step: torch.Tensor, images: Images) -> float:
     """Mean square of the residuals after a step (2, z, y) in px, over that of the noise."""
     along = (linear.slope * step.to(linear.slope)).sum(0)
-    rest = linear.warped + images.time.reshape(-1, 1, 1) * along
-    rest = (rest - rest.mean(0)) * images.weight.sqrt()
-    square = misfit_variance(rest.square().sum(0)[linear.valid].double(), len(rest))
+    residual = linear.warped + images.time.reshape(-1, 1, 1) * along
+    residual = (residual - residual.mean(0)) * images.weight.sqrt()
+    square = misfit_variance(residual.square().sum(0)[linear.valid].double(), len(residual))
     return square / (max(images.spline.passed, 1e-6) * linear.variance)

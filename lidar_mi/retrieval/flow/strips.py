@@ -197,7 +197,7 @@ def solved(
         )
         return change
 
-    # a rough solution suffices: the next round takes another step
+    # a loose solution suffices: the next round takes another step
     change, loose = response(gradient, solver.tolerance), partial(response, tolerance=solver.loose)
     return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, loose)
 

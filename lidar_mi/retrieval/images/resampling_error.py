@@ -18,7 +18,7 @@ _LOCAL, _NOISE_BINS = 75, 24
 _LOST = 4.0
 # Fraction of the vectors beyond which all are flagged.
 _MOST = 2 / 3
-# Nearest beams that tell of their density.
+# Nearest beams that their density is from.
 _AREA = 12
 # Length of the structure for which beams are weighted, in spacings.
 _LENGTH = 1.5

@@ -294,6 +294,7 @@ def gap_from_lines(
     sorted_heights = rings.height[by_height]
     orders = [by_height]
     if (sorted_heights[1:] > 0.8 * sorted_heights[:-1]).any():
+        # lines of about one height may be either way round
         orders.append(by_height[::-1])
     found, refused = [], None
     for one in orders:

@@ -306,6 +306,7 @@ class Track:
     def _inductions(self) -> np.ndarray:
         """Drift without the mean wind in the smoothed slabs, (2, number), m/s."""
         states = np.array([state for state, _ in self._smoothed]).T
+        # the rest of the drift is mutual induction
         states[MEAN_WIND] = 0
         return oblique_drift(torch.as_tensor(states), self.profile).numpy()
 
@@ -348,6 +349,7 @@ def first_track(
     covariance[MEASURED:, MEASURED:] = settings.unlike_slope**2 * np.eye(
         len(SLOPES)
     ) + settings.slope**2 * np.kron(np.ones((2, 2)), np.eye(2))
+    # there is no slab before that it could have come from
     nothing = np.zeros_like(covariance)
     slab = Slab(float(x), float(time), state, covariance, state, nothing, nothing)
     return Track((slab,), pair, settings)

@@ -214,7 +214,7 @@ def _without_pattern(
     if found.covariance is None:
         return found, Standing(), 0
     pattern = standing(images[:2], found, windows)
-    # parameters beside the vectors would stay biased
+    # parameters that are fitted in addition to the vectors would stay biased
     if pattern.spoils or (pattern.fraction and found.quantities):
         return found, pattern, Flag.AT_REST.value
     return pattern.corrected(found), pattern, 0

@@ -81,8 +81,9 @@ def synchronised(
 def mixes_times(scan: xr.Dataset, dt: float) -> bool:
     """Whether beams next to each other look at the air at very different times.
 
-    Times that are linear in place, as in a raster, are resampled exactly. Of nine beams, what a
-    plane leaves of their times is compared with dt: more than 1 % in the median.
+    Times that are linear in place, as in a raster, are resampled exactly. The
+    residuals of the times of nine beams about a plane are compared with dt: more than 1 % in the
+    median.
     """
     if "beam_time" not in scan or scan.attrs.get("frozen_air"):
         return False
@@ -94,8 +95,8 @@ def mixes_times(scan: xr.Dataset, dt: float) -> bool:
     around, times = places[near], time[near]
     around, times = around - around.mean(1, keepdims=True), times - times.mean(1, keepdims=True)
     slope = np.linalg.pinv(around) @ times[..., None]
-    left = times - (around @ slope)[..., 0]
-    return float(np.median(left.std(1))) > _MIXED * dt
+    residual = times - (around @ slope)[..., 0]
+    return float(np.median(residual.std(1))) > _MIXED * dt
 
 
 def advected(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
