@@ -27,7 +27,7 @@ def weight_shift(
     texture of 3 px correlation length advected by two vortices (2.7 m/s rms) its error is
     3.3 m/s where cross-correlation has 0.9; a match by centre alone has 5.7. It performs well
     where a template holds one compact blob on little background. Unlike correlation it depends on
-    the offset of the images (a background adds mass at offset, which shifts the centres to the
+    the offset of the images (a background adds mass at rest, which shifts the centres to the
     middle) and on their relative brightness.
 
     Most of its errors are candidates confused, of up to the size of the search region, and not
