@@ -2,7 +2,7 @@
 
 If the second scan points off by a small angle in pitch or yaw, its image is displaced as a whole,
 by range times angle, and every vector errs by that displacement over the time between the scans.
-An unknown roll turns the image: the error grows with the distance from the axis of the roll.
+An unknown roll rotates the image: the error grows with the distance from the axis of the roll.
 """
 
 from typing import Literal

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 class Quantity:
     """A number with its standard error, unit and name.
 
-    ``per_rotation`` is its change per rad/s by which the image turns about the origin between the
-    scans (a roll of the platform that nobody knows), 0 if there is none.
+    ``per_rotation`` is its change per rad/s by which the image rotates about the origin between the
+    scans (an unknown roll of the platform), 0 if there is none.
     """
 
     value: float

@@ -160,7 +160,7 @@ def mean_and_jacobian(
     v, level, temperature, aerosol = parameters.T[..., None]
     n = torch.arange(model.aerosol.shape[1], dtype=torch.float64)
     rate = 2 * math.pi / model.period * n
-    turns = torch.polar((1 + n.clamp(max=1)).expand(len(v), -1), v * rate)
+    phases = torch.polar((1 + n.clamp(max=1)).expand(len(v), -1), v * rate)
     nodes, slopes = model.weights(temperature[:, 0])
 
     def fractions(waves: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -171,8 +171,8 @@ def mean_and_jacobian(
     def mixed(clear: torch.Tensor, dusty: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         return (1 - aerosol) * torch.einsum("it,itc->ic", weights, clear) + aerosol * dusty
 
-    clear, dusty = fractions(turns)
-    by_speed = fractions(1j * rate * turns)
+    clear, dusty = fractions(phases)
+    by_speed = fractions(1j * rate * phases)
     shape = mixed(clear, dusty, nodes)
     return level * shape + model.background, torch.stack(
         [

@@ -33,28 +33,28 @@ from lidar_mi.retrieval.images.windows import (
 )
 
 # Templates by which the residual is moved along z and y, away from the texture that it is of.
-_APART = ((2, 2), (-2, 2))
+_SEPARATIONS = ((2, 2), (-2, 2))
 # Standard deviations of Gaussian means over the template: of squared errors, of the residual's
 # level, of squared gradients, of squared second differences, of the fraction of clear texture.
-_REGION, _LEVEL, _SHEAR, _ROUGH, _AROUND = 1.5, 1.25, 0.35, 0.7, 4.5
+_REGION, _LEVEL, _SHEAR, _ROUGHNESS, _AROUND = 1.5, 1.25, 0.35, 0.7, 4.5
 # Independent windows of known error within those means (`_REGION`) that a variance needs: of the
 # two components of five windows, it is known to 45 %.
 _FEWEST = 5.0
 # Fraction of textured windows in which the known motion must be recovered: a method that fails in
-# most of them has errors that the others do not tell.
+# most of them has errors that the others do not show.
 _FOUND = 0.5
 # Fraction of textured windows that must be clearly so: else most of them are by chance.
 _CLEAR = 0.5
 # Steps to the largest likelihood of the variances. A thousand change standard errors by 3 % or less
 # in the median, of single vectors by up to a quarter: of factors that vanish, slowly.
 _ITERATIONS = 50
-# Least standard error, px: splines do not carry an image more exactly.
+# Least standard error, px: splines do not advect an image more exactly.
 _LEAST = 1e-3
 # Times that what a window's average takes away is added.
 _SHARPENINGS = 2
 # Least fraction of the residual's variance that is not stated elsewhere.
 _REMAINING = 0.1
-# Of the splines that carry an image or a volume.
+# Of the splines that advect an image or a volume.
 _FILTERS = {2: FilterSettings(), 3: VOLUME_FILTER}
 # Steps of a path, rounds of the place at mid-time.
 _STEPS, _ROUNDS = 4, 3
@@ -84,8 +84,8 @@ def bootstrap_covariance(
       of the true wind over a window of n px, as by a Gaussian G of standard deviation n / sqrt(12).
       d + (1 - G) d + (1 - G)^2 d is the second iterate of its inverse (van Cittert 1931, Z. Phys.
       69, 298-308).
-    - Image 1 is carried along paths in that wind.
-    - The residual, image 2 less image 1 so carried, is moved by two templates along both axes,
+    - Image 1 is advected along paths in that wind.
+    - The residual, image 2 less image 1 so advected, is moved by two templates along both axes,
       scaled to the level (over Gaussians of 1.25 templates, times the noise where that is known of
       each pixel) at its new place, and added. So noise and changes keep their size and correlation
       length, but are independent of the texture.
@@ -109,12 +109,12 @@ def bootstrap_covariance(
       vectors are rougher than the errors of the known motion, larger errors are stated.
 
     Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
-    that are passed the tests of texture by chance, and their errors tell nothing.
-    Where the known motion is recovered in less than half of them, neither do the errors of these.
+    that are passed the tests of texture by chance, and their errors are no evidence.
+    Where the known motion is recovered in less than half of them, nor are the errors of these.
 
     These predictors and numbers were chosen on seeds 41 to 46 of the cases of
     ``validation/coverage.py``. With one iterate of the sharpening, the standard errors of "cc" are
-    4 to 7 % smaller. Where air is carried exactly, with <> over 1 template the variance of
+    4 to 7 % smaller. Where air is advected exactly, with <> over 1 template the variance of
     normalised errors is 10 to 15 % larger, and with the level over 3 templates "multipass" has 2 to
     3 points more errors within one standard error. In rendered images, whose noise grows with
     brightness, a level that does not vary as the noise makes standard errors of "cc" and
@@ -140,10 +140,10 @@ def bootstrap_covariance(
     repeats : int
         1 or 2 retrievals: the residual is moved to opposite sides.
     textured : torch.Tensor of bool, shape windows.count, optional
-        Windows whose errors count; left out: all. Errors of windows that hold nothing say nothing
+        Windows whose errors count; default: all. Errors of windows that hold nothing say nothing
         of their neighbours.
     clear : torch.Tensor of bool, shape windows.count, optional
-        Windows that pass thresholds of texture half as high again; left out: all.
+        Windows that pass thresholds of texture half as high again; default: all.
     stated : torch.Tensor, shape (z, y), optional
         Variance of the residual by changes whose errors are stated elsewhere: it is taken away from
         the residual's, of which a tenth remains at least.
@@ -158,7 +158,7 @@ def bootstrap_covariance(
         Gaussian of 1.5 templates) have a known error, and where fewer than half of the textured
         windows around are clear, or have one.
     """
-    # vectors of windows that overlap by more than half would cost more and tell little
+    # vectors of windows that overlap by more than half would cost more and add little
     every = max(1, windows.template // 2 // windows.stride)
     coarse = replace(windows, stride=every * windows.stride)
 
@@ -181,48 +181,50 @@ def bootstrap_covariance(
 
     wind = at_mid_time(flow, coarse, centred)
     first, second = normalised(images)
-    carried, inside = _carried(first, wind)
+    advected, inside = _advected(first, wind)
     # of air that came in nothing is known
-    alike = second.isfinite() & inside
-    rest = torch.where(alike, second - carried, 0.0)
-    # smoothed, as a noise that few samples tell is itself noisy; one where none is known
+    compared = second.isfinite() & inside
+    residual = torch.where(compared, second - advected, 0.0)
+    # smoothed, as a noise from few samples is itself noisy; 1 where none is known
     _, weight = known_and_weight(images, noise)
-    known_noise = 1 / weight.to(rest)
+    known_noise = 1 / weight.to(residual)
 
     def about(variance: torch.Tensor) -> torch.Tensor:
-        mean = averaged(variance / known_noise, alike, _LEVEL * windows.template)
+        mean = averaged(variance / known_noise, compared, _LEVEL * windows.template)
         return known_noise * mean
 
-    square = about(rest.square())
-    level = square.sqrt().clamp(min=torch.finfo(rest.dtype).tiny)
+    square = about(residual.square())
+    level = square.sqrt().clamp(min=torch.finfo(residual.dtype).tiny)
     added = level
     if stated is not None:
         added = (square - about(stated)).clamp(min=_REMAINING * square).sqrt()
-    told = coarse.of_templates(known_noise) * _inverse_texture(filled_in(first), coarse)
-    same = [torch.ones_like(flow), told]
+    cramer_rao = coarse.of_templates(known_noise) * _inverse_texture(filled_in(first), coarse)
+    same = [torch.ones_like(flow), cramer_rao]
     if centred:
         shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
         same.append(shear.square().expand_as(flow))
         valid = known & ~replaced & some(_unflagged(found))
-        own = [_roughness(vectors, valid, _ROUGH * per_template)]
+        own = [_roughness(vectors, valid, _ROUGHNESS * per_template)]
     else:
         same.append((flow - vectors).square())
         own = []
     predictors = torch.stack([*same, *own])
     tried, number, recovered = [], torch.zeros_like(flow[0]), torch.zeros_like(flow[0])
     width = _REGION * per_template
-    for apart in _APART[:repeats]:
-        moved = (rest / level).roll([windows.template * part for part in apart], (-2, -1))
+    for separation in _SEPARATIONS[:repeats]:
+        moved = (residual / level).roll([windows.template * part for part in separation], (-2, -1))
         moved = torch.where(second.isfinite(), added * moved, torch.nan)
-        again = retrieve(first, carried + moved, stride=coarse.stride)
+        again = retrieve(first, advected + moved, stride=coarse.stride)
         outlier = median_outliers(again.d, 3, max(1, round(per_template / 2)))
         use = _unflagged(again) & ~outlier & known
         if not bool(use.any()):
             continue
         error = again.d - _read(wind, _places(again.d, coarse, centred))
-        # the wind carried is as rough as the vectors: their mean stands for the true one
-        rough = [_roughness(_continued(error, use) + smooth, use, _ROUGH * per_template)] * len(own)
-        tried.append((error, use, torch.stack([*same, *rough])))
+        # the advecting wind is as rough as the vectors: their mean stands for the true one
+        roughness = [
+            _roughness(_continued(error, use) + smooth, use, _ROUGHNESS * per_template)
+        ] * len(own)
+        tried.append((error, use, torch.stack([*same, *roughness])))
         number += _in_a_mean(windows) * averaged(use.to(number), everywhere, width)
         recovered += averaged(use.to(number), known, _AROUND * per_template) / repeats
     if not tried:
@@ -329,7 +331,9 @@ def _roughness(flow: torch.Tensor, use: torch.Tensor, width: float) -> torch.Ten
     Of vectors that are in use with their neighbours two vectors away, which have pixels of their
     own.
     """
-    bend = torch.stack([_slope(_slope(flow, axis), axis) for axis in range(1, flow.ndim)]).sum(0)
+    curvature = torch.stack([_slope(_slope(flow, axis), axis) for axis in range(1, flow.ndim)]).sum(
+        0
+    )
     wide = pad(use, (2, 2) * use.ndim, value=True)
     around = [use]
     for axis, n in enumerate(use.shape):
@@ -337,7 +341,7 @@ def _roughness(flow: torch.Tensor, use: torch.Tensor, width: float) -> torch.Ten
         for start in (0, 4):
             inside[axis] = slice(start, start + n)
             around.append(wide[tuple(inside)])
-    mean = averaged(bend.square().mean(0), torch.stack(around).all(0), width)
+    mean = averaged(curvature.square().mean(0), torch.stack(around).all(0), width)
     return mean.expand_as(flow)
 
 
@@ -367,7 +371,7 @@ def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Te
     return wind
 
 
-def _carried(image: torch.Tensor, wind: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _advected(image: torch.Tensor, wind: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The image along paths in a steady wind (axes, ...), px per time step, one time step later.
 
     And where there is any.

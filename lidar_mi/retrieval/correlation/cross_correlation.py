@@ -75,6 +75,7 @@ def cross_correlation(
     windows = Windows(tuple(image1.shape), template, search, stride)
     chosen = _choose(algorithm, windows)
     bad = non_finite([image1, image2], windows)
+    # before the conversion to the working precision, which hides how the numbers were rounded
     floors = [_rounding(image) for image in (image1, image2)]
     image1, image2 = working(filled(image1)), working(filled(image2))
     found = Displacement.empty(windows, image1)
@@ -185,7 +186,9 @@ def _correlate(
 def _inverse_deviation(square: torch.Tensor, mean: torch.Tensor, floor: float) -> torch.Tensor:
     """1 / standard deviation from <x^2> and <x>; 0 where it is within rounding."""
     variance = square - mean**2
+    # <x^2> - <x>^2 cancels: its rounding error is that of <x^2>
     limit = floor + 16 * torch.finfo(square.dtype).eps * square
+    # 1 / sqrt(inf) = 0: without contrast no correlation
     return torch.where(variance > limit, variance, torch.inf).rsqrt()
 
 
@@ -220,6 +223,7 @@ def _covariance_fft(image1: torch.Tensor, image2: torch.Tensor, windows: Windows
     inner = image1[lead:, lead:][tuple(slice(size - m + n) for size in windows.shape)]
     fixed = extract_tensor_patches(inner[None, None], n, windows.stride)[0, :, 0]
     fixed = fixed - fixed.mean((-2, -1), keepdim=True)
+    # against a template of mean 0 an offset does not matter, but costs digits
     region = region - region.mean((-2, -1), keepdim=True)
     spectrum = torch.fft.rfft2(fixed / n**2, s=(side, side)).conj()
     spectrum = spectrum * torch.fft.rfft2(region, s=(side, side))
@@ -234,6 +238,7 @@ def _peak(coefficient: torch.Tensor, windows: Windows, min_correlation: float) -
     flat = coefficient.flatten(0, 1)
     best, index = flat.max(dim=0)
     shift_z, shift_y, rim = windows.unravel(index)
+    # exactly 0 only where template or candidates have no contrast
     matched = best != 0
     inside = matched & ~rim
     centre = torch.where(inside, index, shifts + 1)  # any inner place, where neighbours exist

@@ -97,10 +97,11 @@ def first_pass(
     coarse, *smaller = _sizes(windows)
     d, replaced = _on(grid, *_of_images(images, coarse))
     width = windows.template / 2
-    score = _alike(spline, grid, d, width)
+    # sheared texture decorrelates in large windows: smaller ones compete with them
+    score = _correlation(spline, grid, d, width)
     for size in smaller:
         other, filled = _on(grid, *_of_images(images, size))
-        found = _alike(spline, grid, other, width)
+        found = _correlation(spline, grid, other, width)
         better = found > score + _BETTER
         d, replaced, score = (
             torch.where(better, new, old)
@@ -129,7 +130,7 @@ def _on(
     return grid.interpolated(d, known), replaced
 
 
-def _alike(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> torch.Tensor:
+def _correlation(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> torch.Tensor:
     """Correlation, over Gaussians, of two images that are warped to mid-time by displacements."""
     places = [
         torch.stack([p - part / 2, p + part / 2]) for p, part in zip(grid.places(), d, strict=True)
@@ -140,6 +141,7 @@ def _alike(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> torch.T
         averaged(field, inside, width) for field in (one, two, one**2, two**2, one * two)
     )
     contrast = (square1 - mean1**2) * (square2 - mean2**2)
+    # without texture rounding may leave a negative variance
     return (cross - mean1 * mean2) / contrast.clamp(min=1e-12 * float(contrast.abs().max())).sqrt()
 
 
@@ -156,6 +158,7 @@ def _of_images(
     """Displacements of windows of images, NaN where the correlation is flagged, and centres."""
     sizes = windows.template, windows.search, windows.stride
     found = cross_correlation(images[0], images[1], *sizes)
+    # whole pixels suffice to start from
     usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
     d = torch.where(usable, found.d, torch.nan)
     return d, [windows.centres(axis).to(d.device) for axis in (0, 1)]
@@ -213,6 +216,7 @@ def volume_scores(
         mean2, square2, cross, mean1, square1 = (sums(part) / inside for part in parts)
         contrast = (square1 - mean1**2) * (square2 - mean2**2)
         score = (cross - mean1 * mean2) / contrast.clamp(min=1e-12).sqrt()
+        # half of a window must have a partner
         scores.append(torch.where(inside > 0.5, score, -1.0))
     whole = torch.where(contrast1 > 1e-10, torch.cat(scores), torch.nan)
     centres = [
@@ -235,17 +239,20 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     quadratic = torch.linalg.pinv(
         torch.cat([torch.ones_like(around[:, :1]), around, torch.stack(squares, 1)], 1)
     )
+    # inner places, which have all 26 neighbours
     number = (around.long()[:, :, None] + place.clamp(1, side - 2)).unbind(1)
     terms = quadratic @ flat.gather(0, (number[0] * side + number[1]) * side + number[2])
     slope = terms[1:4].T
-    bend = slope.new_zeros(len(slope), 3, 3)
+    curvature = slope.new_zeros(len(slope), 3, 3)
     for (a, b), term in zip(pairs, terms[4:], strict=True):
-        bend[:, a, b] = bend[:, b, a] = term
-    peaked = torch.linalg.eigvalsh(bend)[:, -1] < 0
-    bend = torch.where(peaked[:, None, None], bend, -torch.eye(3).to(bend))
-    rest = -torch.linalg.solve(bend, slope[..., None])[..., 0]
-    rest = torch.where((peaked & (rest.abs() < 1).all(1))[:, None], rest, 0.0).T
-    d = torch.where(rim | ~(flat.amax(0) > -1), torch.nan, place - reach + rest)
+        curvature[:, a, b] = curvature[:, b, a] = term
+    peaked = torch.linalg.eigvalsh(curvature)[:, -1] < 0
+    # a saddle has no top: it is replaced by what can be solved, and its offset by 0
+    curvature = torch.where(peaked[:, None, None], curvature, -torch.eye(3).to(curvature))
+    offset = -torch.linalg.solve(curvature, slope[..., None])[..., 0]
+    # the quadratic holds between neighbours only
+    offset = torch.where((peaked & (offset.abs() < 1).all(1))[:, None], offset, 0.0).T
+    d = torch.where(rim | ~(flat.amax(0) > -1), torch.nan, place - reach + offset)
     return d.reshape(3, *scores.shape[1:])
 
 
@@ -260,6 +267,7 @@ def _cubic_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
         inner = (1.25 * x - 2.25) * x * x + 1
         outer = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
         weight = torch.where(x <= 1, inner, outer)
+        # beyond the ends the last value goes on
         column = (low.long() + shift).clamp(0, len(known) - 1)
         matrix.scatter_add_(1, column[:, None], weight[:, None])
     return matrix

@@ -28,7 +28,7 @@ from lidar_mi.retrieval.images.windows import Windows, averaged, image_pair, win
 # have smoothed, and the Gaussian mean of it, in vectors: the curvature changes its sign in cores.
 # Normalised errors in volumes of the simulated wake then have variances of 1.0 to 1.8, and of 0.6
 # to 0.9 in those of a pair with cores of 6 voxels.
-_BENT, _NEAR = 2.0, 1.0
+_CURVATURE_FACTOR, _NEAR = 2.0, 1.0
 
 
 def multipass(
@@ -68,9 +68,9 @@ def multipass(
         Vectors whose deformed windows correlate less are flagged; -1 to 1.
     noise : float or torch.Tensor, optional
         Standard deviation of the images' white noise. A map does not weight the pixels; standard
-        errors are those of the mean in a window. Left out: from the images' spectra.
+        errors are those of the mean in a window. Default: from the images' spectra.
     settings : MultipassSettings, optional
-        Left out: those of images or of volumes.
+        Default: those of images or of volumes.
     partly : bool
         Whether windows that hold non-finite pixels have a displacement from the others, if these
         are more than half of the weight. They are flagged all the same.
@@ -101,6 +101,7 @@ def multipass(
     pair = Pair(
         spline,
         informative([image1, image2]),
+        # of the difference of two images
         2 * noise**2 * spline.excess,
         _relative_variance(grid_of_noise, grid),
         settings.gradient,
@@ -108,6 +109,7 @@ def multipass(
     )
     flow, replaced = first_pass([image1, image2], spline, windows, grid)
     for width in settings.widths[:-1]:
+        # windows average over their width: vectors much closer than that say the same
         step = max(1, round(settings.spacing * width * sigma))
         places = [torch.arange(0, n, step, device=image1.device) for n in grid.shape]
         fit = _fit(pair, flow, grid, places, width * sigma)
@@ -122,11 +124,13 @@ def multipass(
         replaced = grid.interpolated(wrong[None], places)[0] > 0.5
     places = grid.windows(windows)
     fit = _fit(pair, flow, grid, places, settings.widths[-1] * sigma)
+    # the fit gives the chord of a curved path
     d = travelled(fit.displacement, fit.gradient)
     curved = _curved(fit, sigma, stride, max(1, round(template / 2 / stride)))
     curved = torch.diag_embed(curved.movedim(0, -1)).movedim((-2, -1), (0, 1))
     matched = (fit.score > 0) & (fit.fraction_valid > 0.5)
     at = torch.meshgrid(*places, indexing="ij")
+    # linearised about a displacement, the fit does not hold that far from it
     off = (d - torch.stack([part[at] for part in flow])).norm(dim=0) > max(settings.jump, sigma)
     bad = non_finite([image1, image2], windows)
     flag = (
@@ -159,7 +163,9 @@ def travelled(d: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
     g = gradient.flatten(2).permute(2, 0, 1)
     chord = d.flatten(1).T[..., None]
     square = g @ g
+    # 2 artanh(x / 2) / x = 1 + x^2 / 12 + x^4 / 80 + ...
     arc = chord + square @ (chord / 12 + square @ chord / 80)
+    # the series converges where |G| < 2
     small = g.square().sum((1, 2)) < 1.5**2
     return torch.where(small[:, None, None], arc, chord)[..., 0].T.reshape(d.shape)
 
@@ -170,12 +176,13 @@ def _curved(fit: "_Fit", sigma: float, stride: int, reach: int) -> torch.Tensor:
     Without what the noise of the gradients adds: of white noise a gradient has 1 / (2 sigma^2) of
     the displacement's variance.
     """
-    bent, by_noise = curvature(fit.gradient, reach)
+    laplacian, by_noise = curvature(fit.gradient, reach)
     variance = fit.covariance.diagonal().movedim(-1, 0)
-    square = bent.square() - by_noise * variance / (2 * sigma**2)
-    everywhere = torch.ones_like(bent[0], dtype=torch.bool)
+    square = laplacian.square() - by_noise * variance / (2 * sigma**2)
+    everywhere = torch.ones_like(laplacian[0], dtype=torch.bool)
     near = torch.stack([averaged(part, everywhere, _NEAR) for part in square])
-    return _BENT * (sigma**2 / 2 / stride) ** 2 * near.clamp(min=0.0)
+    # a Gaussian window changes a displacement by sigma^2 / 2 times its Laplacian (here per vector)
+    return _CURVATURE_FACTOR * (sigma**2 / 2 / stride) ** 2 * near.clamp(min=0.0)
 
 
 def curvature(gradient: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -191,11 +198,12 @@ def curvature(gradient: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.T
         n = part.shape[axis]
         place = torch.arange(n, device=part.device)
         ends = [(place + move).clamp(0, n - 1) for move in (reach, -reach)]
-        apart = ends[0] - ends[1]
-        span = apart.clamp(min=1).to(part).reshape(-1, *[1] * (part.ndim - 1 - axis))
+        separation = ends[0] - ends[1]
+        span = separation.clamp(min=1).to(part).reshape(-1, *[1] * (part.ndim - 1 - axis))
         change = part.index_select(axis, ends[0]) - part.index_select(axis, ends[1])
         total += change / span
-        by_noise += 2 * (apart.reshape(span.shape) > 0) / span**2
+        # a difference of two values has twice their variance
+        by_noise += 2 * (separation.reshape(span.shape) > 0) / span**2
     return total, by_noise
 
 
@@ -254,9 +262,12 @@ def _fit(
     deviation a priori regularises it where there is little texture.
     """
     dims = len(places)
+    # weights further away are 1 % of the largest or less
     reach = math.ceil(3 * sigma)
+    # in units of sigma: displacement and gradient have columns of one size
     x = torch.arange(-reach, reach + 1, dtype=flow.dtype, device=flow.device) / sigma
     gaussian = torch.exp(-(x**2) / 2)
+    # the covariance of a weighted fit has the squares of the weights
     kernels = [[w * x**power for power in range(3)] for w in (gaussian, gaussian**2)]
     steps = [int(at[1] - at[0]) if len(at) > 1 else 1 for at in places]
     # products of slopes, then those with the shift, then the fields summed without moments
@@ -292,6 +303,7 @@ def _products(
 
     Zero where one of the images is not valid.
     """
+    # symmetric in time, so that vectors are those at mid-time
     at = [torch.stack([p - d / 2, p + d / 2]) for p, d in zip(places, flow, strict=True)]
     value, *slopes = pair.spline.sample(*at)
     valid = (pair.spline.holds(*at) & nearest(pair.usable, at)).all(0)
@@ -377,8 +389,10 @@ def _solved(
     spread = normal.diagonal(dim1=-2, dim2=-1)
     rounding = torch.finfo(pair.spline.coefficients.dtype).eps * (square1 * square2).sqrt()
     textured = (spread.amin(-1) > 0) & (scale > rounding)
+    # gradients have a prior, the displacement itself has none
     prior = torch.tensor([0.0, *[1.0] * dims] * dims, dtype=spread.dtype, device=spread.device)
     prior = prior * pair.variance / (pair.gradient * sigma) ** 2
+    # without texture the matrix is singular: such windows get a solution that is not used
     floor = 1e-9 * spread.mean(-1, keepdim=True) + ~textured[..., None]
     normal = normal + torch.diag_embed(prior + floor)
     root = torch.linalg.cholesky(normal)
@@ -386,10 +400,13 @@ def _solved(
     right = torch.cat([wanted[..., None], unit[:, :: dims + 1].expand(*wanted.shape, dims)], -1)
     answer = torch.cholesky_solve(right, root)
     solution, inverse = answer[..., 0], answer[..., 1:]
-    left = misfit - (2 * wanted - (normal @ solution[..., None])[..., 0]).mul(solution).sum(-1)
+    # |r|^2 - 2 b.s + s.N s, the squared residual of the solution s, from the sums alone
+    residual = misfit - (2 * wanted - (normal @ solution[..., None])[..., 0]).mul(solution).sum(-1)
     stated = pair.variance * relative / number
-    left = torch.maximum(left / number / pair.spline.passed, stated)
-    covariance = inverse.mT @ _normal(twice, dims) @ inverse * left[..., None, None]
+    # the filter passes only this fraction of the variance of white noise
+    residual = torch.maximum(residual / number / pair.spline.passed, stated)
+    # the sandwich: Gaussian weights are not inverse variances of the noise
+    covariance = inverse.mT @ _normal(twice, dims) @ inverse * residual[..., None, None]
     solution = solution.unflatten(-1, (dims, dims + 1)).movedim((-2, -1), (0, 1))
     return (
         solution[:, 0],

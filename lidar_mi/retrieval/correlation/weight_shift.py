@@ -105,8 +105,8 @@ def _best_match(
     best, index = misfit.min(0)
     shift_z, shift_y, rim = windows.unravel(index)
     matched = best.isfinite()
-    rest = [part.flatten(0, 1).gather(0, index[None])[0] for part in (centre_z, centre_y)]
-    d = torch.stack([shift_z, shift_y]) + torch.stack(rest)
+    offset = [part.flatten(0, 1).gather(0, index[None])[0] for part in (centre_z, centre_y)]
+    d = torch.stack([shift_z, shift_y]) + torch.stack(offset)
     d = torch.where(matched & ~rim, d, torch.nan)
     flag = Flag.PEAK_ON_RIM * (matched & rim) + Flag.NO_MATCH * ~matched
     return Displacement(d, best.sqrt(), flag.to(torch.int16))

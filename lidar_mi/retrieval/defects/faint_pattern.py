@@ -12,7 +12,7 @@ from lidar_mi.retrieval.images.windows import Windows, linear_weights, separable
 
 FALSE_ALARM = 1e-3
 """Probability that images without a pattern count as having one."""
-# Side of the blocks, px, whose sums are nearly independent, their least number, the rim left out.
+# Side of the blocks, px, whose sums are nearly independent, their least number, the masked rim.
 _BLOCK, _FEW_BLOCKS, _RIM = 24, 8, 12
 # Px; slower air shows nothing.
 _SLOWEST = 0.25
@@ -77,7 +77,7 @@ def standing(
 
     A pattern p at rest in air that moves by d leaves r = p(x + d/2) - p(x - d/2) between images
     warped to mid-time, of spectral density 4 sin^2(k.d / 2) P(k): more in waves along d than
-    across it. Noise, other air and motion through the plane leave as much in both. With the Riesz
+    across it. Of noise, other air and out-of-plane motion both have as much. With the Riesz
     transforms r_z, r_y (i k_z / |k|, i k_y / |k| in the spectrum), along and across d,
 
         <r_along^2 - r_across^2> = d^2 / 4 <|grad p|^2>

@@ -24,11 +24,11 @@ _NEIGHBOURS = 2
 _CLIPPED = 2.5, 3.0, 4.0
 # Correlation of neighbours in a profile: that of independent gains is -0.3, of texture positive.
 _SMOOTH = 0.2
-# Times that motion and gains are estimated in turn.
-_TURNS = 2
-# Px; where the air moves by less, the pattern of pixels is not apart from texture.
-_APART = 1.5
-# Side of the blocks, px, whose means are independent; the rim that is left out.
+# Iterations over motion and gains.
+_ITERATIONS = 2
+# Px; where the air moves by less, the pattern of pixels cannot be separated from texture.
+_LEAST_DISPLACEMENT = 1.5
+# Side of the blocks, px, whose means are independent; the rim that is masked.
 _BLOCK, _RIM = 16, 8
 # Fewer blocks say too little of their scatter.
 _FEW_BLOCKS = 5
@@ -36,7 +36,7 @@ _FEW_BLOCKS = 5
 _LEAST = 0.25
 # Of the local contrast, from which gains of pixels make errors larger than stated.
 _SPOILS = 0.2
-# The same of what is left of lines: that is detected, or that their estimate leaves open.
+# The same of residual lines: that are detected, or that the error of their estimate allows.
 _LEFT = 0.1, 0.16
 
 
@@ -103,8 +103,8 @@ def fixed_pattern(
 
     The gains p follow from what the motion d does not explain,
     r1(x) - r2(x + d) = p(y) - p(y + d_y), by least squares with a prior variance, the covariance
-    of the profiles. Motion and gains are estimated in turn. Gains alike over more than the local
-    mean are not found.
+    of the profiles. Motion and gains are estimated iteratively. Gains that are alike over more
+    than the local mean are not found.
 
     Parameters
     ----------
@@ -121,13 +121,13 @@ def fixed_pattern(
         return FixedPattern(_gain({}, images[0]))
     gains = {axis: found[axis][1] for axis in prior}
     unknown = {}
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         now = [working(image) / _gain(gains, image) for image in images]
         d = motion_around(now[0], now[1], windows)[0].cpu().numpy()
         for axis in prior:
             others = _gain({other: p for other, p in gains.items() if other != axis}, now[0])
-            rest = [_relative(working(image) / others) for image in images]
-            gains[axis], unknown[axis] = _solved(rest, d, axis, prior[axis])
+            values = [_relative(working(image) / others) for image in images]
+            gains[axis], unknown[axis] = _solved(values, d, axis, prior[axis])
     gain = _gain(gains, images[0])
     relative = [_relative(working(image) / gain) for image in images]
     left = max(_lines(_turned(relative, axis), false_alarm)[0] for axis in prior)
@@ -228,13 +228,13 @@ def _solved(
     values = np.concatenate([np.ones_like(part), part - 1, -part])
     place = np.tile(number, 3), np.concatenate([here, low, low + 1])
     matrix = sparse.csr_matrix((values, place), shape=(off.size, size))
-    normal, right, rest = (matrix.T @ matrix).toarray(), matrix.T @ off, off
+    normal, right, residual = (matrix.T @ matrix).toarray(), matrix.T @ off, off
     for _ in range(2):
         # what the gains do not explain; neighbours, over a correlation length of 2 px, share it
-        weight = 4 * np.mean(rest**2) / prior
+        weight = 4 * np.mean(residual**2) / prior
         inverse = np.linalg.inv(normal + weight * np.eye(size))
         gains = inverse @ right
-        rest = off - matrix @ gains
+        residual = off - matrix @ gains
     return gains - gains.mean(), prior * weight * float(np.trace(inverse)) / size
 
 
@@ -247,7 +247,7 @@ def _pixels(relative: Sequence[np.ndarray], d: torch.Tensor, false_alarm: float)
     allows, and the correlation 0.25. The gains are not removed: an estimate from two images takes
     up errors of the motion, and draws vectors to that motion.
     """
-    known = d.square().sum(0) >= _APART**2
+    known = d.square().sum(0) >= _LEAST_DISPLACEMENT**2
     known[:_RIM] = known[-_RIM:] = False
     known[:, :_RIM] = known[:, -_RIM:] = False
     if not bool(known.any()):

@@ -14,7 +14,7 @@ _BLOCK = 16
 _FEWEST = 4
 # Of the brightest block; what is darker has no ratio.
 _DARK = 0.05
-# Of the blocks' variance, that the plane has to explain: smoke that turns changes blocks as well,
+# Of the blocks' variance, that the plane has to explain: smoke that rotates changes blocks as well,
 # alike over many of them, but not in a plane (0.14 in a wake).
 _LEAST = 0.3
 
@@ -54,9 +54,9 @@ def illumination(
     middle = z.mean(), y.mean()
     slopes = np.stack([z - middle[0], y - middle[1]], 1)
     plane, *_ = np.linalg.lstsq(slopes, ratio, rcond=None)
-    whole, rest = np.sum(ratio**2), np.sum((ratio - slopes @ plane) ** 2)
-    test = (whole - rest) / 2 > fisher.isf(false_alarm, 2, degrees) * rest / degrees
-    if not test or whole - rest < _LEAST * whole:
+    whole, residual = np.sum(ratio**2), np.sum((ratio - slopes @ plane) ** 2)
+    test = (whole - residual) / 2 > fisher.isf(false_alarm, 2, degrees) * residual / degrees
+    if not test or whole - residual < _LEAST * whole:
         return none
     place = torch.meshgrid(*(torch.arange(n).to(none) for n in none.shape), indexing="ij")
     slope_z, slope_y = (float(a) * (p - p.mean()) for a, p in zip(plane, place, strict=True))

@@ -20,7 +20,7 @@ _AROUND = 8.0
 _EMPTY = 1e-3
 # Times that pixels are peeled off: areas of four pixels across vanish.
 _PEELS = 4
-# Px about a place, or about where the air carries it, in which an impulse is looked for.
+# Px about a place, or about where the air advects it, in which an impulse is looked for.
 _NEAR = 2
 # Impulses at one place must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
@@ -32,7 +32,7 @@ _SHARP = 0.5
 # Fraction of their height by which impulses in both images differ at most.
 _ALIKE = 0.3
 # The neighbours.
-_BESIDE = (0, 1), (1, 0), (1, 2), (2, 1)
+_ADJACENT = (0, 1), (1, 0), (1, 2), (2, 1)
 
 
 def threshold(number: int) -> float:
@@ -106,13 +106,13 @@ def _faintest(values: torch.Tensor) -> float:
 
 
 def _peeled(image: torch.Tensor, spread: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
-    """Impulses of an image, and of what is left without them."""
+    """Impulses of an image, and of what remains without them."""
     found = torch.zeros_like(image, dtype=torch.bool)
     for _ in range(_PEELS):
-        left = torch.where(found, torch.nan, image)
-        over = height(left)
+        remaining = torch.where(found, torch.nan, image)
+        over = height(remaining)
         new = over.abs() > threshold(over.numel()) * spread(over)
-        new &= unresolved(left, over)
+        new &= unresolved(remaining, over)
         if not bool(new.any()):
             break
         found |= new
@@ -147,10 +147,10 @@ def sharp(pair: torch.Tensor) -> torch.Tensor:
     wide = pad(known[None], (2,) * 4, mode="replicate")[0]
     around = wide.unfold(1, 5, 1).unfold(2, 5, 1).flatten(3).nanmedian(-1).values
     excess, peak = pad(known - around, (1,) * 4, value=torch.nan), (pair - around).nan_to_num(0.0)
-    beside = [excess[:, i : i + found.shape[0], j : j + found.shape[1]] for i, j in _BESIDE]
-    left = torch.stack(beside).nanmean(0).abs()
+    adjacent = [excess[:, i : i + found.shape[0], j : j + found.shape[1]] for i, j in _ADJACENT]
+    adjacent_height = torch.stack(adjacent).nanmean(0).abs()
     alike = (peak[1] - peak[0]).abs() < _ALIKE * peak.abs().amin(0)
-    alone = (left < _RESOLVED * peak.abs()).all(0) & alike & found
+    alone = (adjacent_height < _RESOLVED * peak.abs()).all(0) & alike & found
     if int(alone.sum()) < _SHARP * int(found.sum()):
         return torch.zeros_like(found)
     return alone
@@ -159,7 +159,7 @@ def sharp(pair: torch.Tensor) -> torch.Tensor:
 def stray(
     pair: torch.Tensor, found: torch.Tensor, rest: torch.Tensor, d: torch.Tensor
 ) -> torch.Tensor:
-    """Of `outstanding` pixels (images, z, y) those that the air does not carry from one to another.
+    """Of `outstanding` pixels (images, z, y) those that air does not advect from one to another.
 
     A pixel has a match if the other image has one of at least half its height within 2 px of where
     the motion d leads. If three times as many have one as in images that are rolled, the texture
@@ -171,12 +171,12 @@ def stray(
         return found
     heights = torch.stack([height(image) for image in torch.where(rest, torch.nan, pair)])
     heights = heights.nan_to_num(0.0).abs() * found
-    carried = [_carried(heights, way, 0, 0, d) for way in (0, 1)]
-    matched = torch.stack([found[k] & carried[k] for k in (0, 1)])
+    advected = [_advected(heights, way, 0, 0, d) for way in (0, 1)]
+    matched = torch.stack([found[k] & advected[k] for k in (0, 1)])
     rows, columns = d.shape[1:]
     chance = torch.stack(
         [
-            (found[0] & _carried(heights, 0, int(i * rows / 3), int(j * columns / 3), d)).sum()
+            (found[0] & _advected(heights, 0, int(i * rows / 3), int(j * columns / 3), d)).sum()
             for i, j in THIRDS
         ]
     )
@@ -185,7 +185,7 @@ def stray(
     return found & ~matched & (heights > heights[matched].max())
 
 
-def _carried(
+def _advected(
     heights: torch.Tensor, own: int, row: int, column: int, d: torch.Tensor
 ) -> torch.Tensor:
     """Pixels of an image that the other, rolled, has a match of."""

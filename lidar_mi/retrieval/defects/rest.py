@@ -36,8 +36,8 @@ _STILL = 0.1
 _DIFFER = 0.3
 # Spots at rest must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
-# Times that motion and structure at rest are estimated in turn.
-_TURNS = 3
+# Iterations over motion and structure at rest.
+_ITERATIONS = 3
 # Px; width of the Gaussians over which images without spots are averaged before the motion is
 # looked for.
 _SOFT = 1.5
@@ -73,11 +73,11 @@ class AtRest(NamedTuple):
             for name, p in parts.items()
             if bool(p.any())
         ]
-        return f"pixels left out: {', '.join(said)}" if said else ""
+        return f"masked pixels: {', '.join(said)}" if said else ""
 
     @property
     def hidden(self) -> torch.Tensor:
-        """Pixels (images, z, y) that are left out."""
+        """Pixels (images, z, y) that are masked."""
         return self.stray | self.saturated | self.structure
 
     def masked(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
@@ -188,7 +188,7 @@ def at_rest(
     (`impulses.sharp`); pixels, lines, steps and spots that stand out of both images and are more
     alike at one place than along the motion d of what is around; and areas that these cut off. d is
     the median of 5 x 5 coarse vectors of the images without what stands out of both, averaged over
-    Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated in turn.
+    Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated iteratively.
     What stands out is measured by local medians, with thresholds of one false alarm in 10 000
     images of normal noise: the slower the air, the stronger a structure must be to be known from
     it. What stands out of both next to it is part of it. Stray pixels stand out of one image alone
@@ -215,7 +215,7 @@ def at_rest(
     pair = _normalised(pair, outstanding)
     found = impulses.sharp(pair)
     hidden = outstanding | _candidates(pair, found)
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         soft = [_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True)]
         d, _ = motion_around(soft[0], soft[1], windows, continued=True)
         if not bool(d.any()):  # what stands out is all that there is
@@ -290,11 +290,11 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         def edges(found: torch.Tensor, axis: int = axis) -> _Field:
             steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
             either = same.minimum(same.roll(-1, axis))
-            # smoke rises over several pixels: a step beside it is as large and of its sign, which
+            # smoke rises over several pixels: an adjacent step is as large and of its sign, which
             # that on the other side of a thin structure is not
             wide = pad(steps.nan_to_num(0.0), (0, 0) * (-1 - axis) + (2, 2))
-            beside = (wide.narrow(axis, place, steps.shape[axis]) for place in (0, 4))
-            soft = torch.stack([steps.square() < 2 * steps * other for other in beside])
+            adjacent = (wide.narrow(axis, place, steps.shape[axis]) for place in (0, 4))
+            soft = torch.stack([steps.square() < 2 * steps * other for other in adjacent])
             soft = soft.flatten(0, 1).any(0)
             field = of(steps, 1, lambda new: new | new.roll(1, axis), either)
             return field._replace(change=field.change.masked_fill(soft, torch.inf))

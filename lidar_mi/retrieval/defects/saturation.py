@@ -9,7 +9,7 @@ from lidar_mi.retrieval.images.windows import Windows
 
 FALSE_ALARM = 1e-6
 """Probability that an image counts as saturated whose values thin out toward the largest one."""
-# Values below the largest one that tell how many pixels a value has.
+# Values below the largest one that show how many pixels a value has.
 _LEVELS = 10
 
 
@@ -48,7 +48,7 @@ def saturated_areas(clipped: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Saturated areas of at least half a template that do not move with the air.
 
     They are saturated in all images, or in one that no other has a saturated pixel for within the
-    search. What is left is texture that is cut off at its brightest spots.
+    search. The remainder is texture that is cut off at its brightest spots.
 
     Parameters
     ----------

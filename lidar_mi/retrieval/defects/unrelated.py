@@ -66,7 +66,7 @@ def unrelated(
     wide : bool
         Whether the displacement may be twice that of the windows, as in `coarse_windows`.
     noise : float or torch.Tensor, optional
-        Standard deviation of the images' white noise; left out: from their spectra.
+        Standard deviation of the images' white noise; default: from their spectra.
     false_alarm : float
 
     Returns

@@ -101,19 +101,19 @@ def solved_near(
     lower = packed(form).astype(kind, copy=False)
     (product,) = get_blas_funcs(("sbmv",), (lower,))
     (solve,) = get_lapack_funcs(("pbtrs",), (lower,))
-    rest = right.detach().cpu().permute(2, 1, 0).reshape(-1).numpy().astype(kind)
-    enough = left * np.linalg.norm(rest)
-    found, along, before = np.zeros_like(rest), None, 0.0
+    residual = right.detach().cpu().permute(2, 1, 0).reshape(-1).numpy().astype(kind)
+    enough = left * np.linalg.norm(residual)
+    found, along, before = np.zeros_like(residual), None, 0.0
     for _ in range(most):
-        nearer, _ = solve(root.lower, rest, lower=True)
-        energy = float(rest @ nearer)
+        nearer, _ = solve(root.lower, residual, lower=True)
+        energy = float(residual @ nearer)
         along = nearer if along is None else nearer + energy / before * along
         pushed = product(len(lower) - 1, 1.0, lower, along, lower=True)
         part = energy / float(along @ pushed)
         found += part * along
-        rest -= part * pushed
+        residual -= part * pushed
         before = energy
-        if not np.linalg.norm(rest) > enough:
+        if not np.linalg.norm(residual) > enough:
             shape = root.columns, root.rows, 2
             return torch.as_tensor(found).reshape(shape).permute(2, 1, 0).to(right)
     return None
@@ -149,8 +149,8 @@ def _places(rows: int, columns: int) -> tuple[torch.Tensor, tuple[np.ndarray, np
     n, below = 2 * rows, _bandwidth(rows)
     in_block = 2 * (shift_y * rows + other.clip(0, rows - 1)) + b
     blocks = torch.as_tensor((y * (1 + REACH) * n + in_block) * n + 2 * z + a).int()
-    apart = 2 * (shift_y * rows + shift_z - REACH) + b - a
-    known = (other >= 0) & (other < rows) & (y + shift_y < columns) & (apart >= 0)
+    below_diagonal = 2 * (shift_y * rows + shift_z - REACH) + b - a
+    known = (other >= 0) & (other < rows) & (y + shift_y < columns) & (below_diagonal >= 0)
     known = np.broadcast_to(known, sizes)
-    target = (2 * (y * rows + z) + a) * (below + 1) + apart
+    target = (2 * (y * rows + z) + a) * (below + 1) + below_diagonal
     return blocks, (np.flatnonzero(known), np.broadcast_to(target, sizes)[known])

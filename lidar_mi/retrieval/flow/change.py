@@ -48,6 +48,7 @@ def of_structure(spline: Spline, stack: torch.Tensor, noise: float) -> torch.Ten
     sizes = transform_sizes(spline.shape, settings)
     _, shell = radii(tuple(sizes), spline.shape, stack.dtype, stack.device)
     density, uncertainty = shell_means(stack, shell, sizes, settings.smoothing, known)
+    # the means of shells of noise alone scatter about noise^2
     structure = density > noise**2 * (1 + settings.threshold * uncertainty)
     return torch.where(structure, density - noise**2, 0.0)
 
@@ -59,7 +60,7 @@ def displaced(wave: torch.Tensor, structure: torch.Tensor) -> torch.Tensor:
     in space, its spectral density T gives that of a slice, S(k) = integral T(|(k, q)|) dq, and
     that of the gradient, F(k) = integral q^2 T(|(k, q)|) dq, over the wavenumbers q across the
     plane. Then dF/dk = -k S, so that F(k) is the integral of k' S(k') from k on. It holds more in
-    long waves than the gradients in the plane do. As in `warping.mismatch`, the density is half
+    long waves than the gradients in the plane do. As in `spline.mismatch`, the density is half
     that of the difference of two images.
 
     Parameters
@@ -78,7 +79,7 @@ def displaced(wave: torch.Tensor, structure: torch.Tensor) -> torch.Tensor:
 def strained(wave: torch.Tensor, structure: torch.Tensor) -> torch.Tensor:
     """Spectral density of differences made by a blur of 1 px where air is strained by 1 in dt.
 
-    Air carries structure, and not the blur of the instrument: seen along with the air, a blur of
+    Air advects structure, and not the blur of the instrument: seen along with the air, a blur of
     variance b^2 is stretched by the rate of strain E from image to image, which makes them differ
     by b^2 dt E_ij d2I / dx_i dx_j. For isotropic structure and a strain e along one axis, -e along
     the other, the density is b^4 e^2 dt^2 k^4 S(k) / 4; half that of the difference of two images,
@@ -102,6 +103,7 @@ def mean_square_strain(slopes: Sequence[torch.Tensor]) -> float:
     """
     along_z, along_y = slopes
     stretched, sheared = along_z[0] - along_y[1], along_z[1] + along_y[0]
+    # strain e along one axis, -e across: e^2 = (stretched^2 + sheared^2) / 4
     return float((stretched.square() + sheared.square()).mean()) / 4
 
 
@@ -120,7 +122,7 @@ def unexplained(
     ----------
     spline : Spline
     density : torch.Tensor, shape (shells,)
-        Of the differences, from `warping.mismatch`.
+        Of the differences, from `spline.mismatch`.
     structure : torch.Tensor, shape (shells,)
         From `of_structure`.
     strain : float
@@ -135,12 +137,14 @@ def unexplained(
     blurred : float
         Fraction of the differences that blur in strained air makes instead.
     """
+    # shells beyond half a cycle per pixel are cut by the corners of the spectrum
     full = torch.arange(len(density), device=density.device) < min(spline.shape) // 2
     wave = wavenumbers(density, spline.shape)
     moved, smeared = displaced(wave, structure), strained(wave, structure)
     use = density.isfinite() & (moved > 0) & (wave > math.pi / knots) & full
     if int(use.sum()) < 3:
         return 0.0, 0.0
+    # smoothed shells share the waves of their neighbours
     waves = _independent_waves(spline, density) / spline.settings.smoothing
     found, across, blurred, number = (
         part[use].double().cpu().numpy() for part in (density, moved, smeared, waves)

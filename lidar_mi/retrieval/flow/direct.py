@@ -21,12 +21,12 @@ _ROUNDING = 1e-14
 # Residual over the right hand side that a step with a factor in single precision may leave.
 _SINGLE = 1e-3
 # Products with a form until conjugate gradients from a similar one are given up.
-_TURNS = 12
+_MOST_PRODUCTS = 12
 
 
 # Least information over second derivative at which steps take the information: each then leaves
 # less than half of the distance.
-_ALIKE = 0.7
+_LEAST_INFORMATION = 0.7
 
 
 class Posterior(NamedTuple):
@@ -46,6 +46,7 @@ class Posterior(NamedTuple):
         before = self.band.covariance(self.band.factor(self.stiff))
         removed = before - self.band.covariance(self.root)
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
+        # at the largest evidence the two are equal (MacKay's fixed point)
         return variances(removed, self.prior), energy
 
     def response(self, gradient: torch.Tensor) -> torch.Tensor:
@@ -74,6 +75,7 @@ def solved(
     band = _band(mesh)
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
+    # standard errors follow the information; steps with less than the second derivative overshoot
     step = root if informative(linear) else band.factor(curvature(linear, mesh) + stiff)
     return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
 
@@ -97,6 +99,7 @@ def prior_term_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> Pri
     """That of a prior at a flow."""
     stiff = prior_form(prior)
     with_diagonal(stiff, ridge)
+    # the gradient is without what is against rounding: the minimum stays where it is
     whole = stiff.clone()
     with_diagonal(whole, rounding(stiff))
     return PriorTerm(stiff, whole, stiff).at(prior, coefficients)
@@ -118,14 +121,14 @@ def solved_in_single(
     gradient = mesh.transposed(linear.gradient) + prior_term.gradient
     whole = (data_form if informative(linear) else curvature)(linear, mesh) + prior_term.whole
     if near is not None:
-        step = solved_near(near, whole, gradient, _SINGLE, _TURNS)
+        step = solved_near(near, whole, gradient, _SINGLE, _MOST_PRODUCTS)
         if step is not None:
             return coefficients + step
     root = cholesky(whole.float())
     if root is not None:
         step = root.solve(gradient)
-        left = gradient - _band(mesh).apply(whole, step)
-        if bool(left.norm() <= _SINGLE * gradient.norm()):
+        residual = gradient - _band(mesh).apply(whole, step)
+        if bool(residual.norm() <= _SINGLE * gradient.norm()):
             return coefficients + step
     return coefficients + _in_double(whole).solve(gradient)
 
@@ -156,7 +159,7 @@ def in_single(band: Band, form: torch.Tensor) -> Factor | None:
 
 def informative(linear: Linear) -> bool:
     """Whether information and second derivative are alike: steps by either converge."""
-    return bool((linear.information >= _ALIKE * linear.weight).all())
+    return bool((linear.information >= _LEAST_INFORMATION * linear.weight).all())
 
 
 def prior_and_gradient(
@@ -167,12 +170,13 @@ def prior_and_gradient(
     with_diagonal(stiff, ridge)
     band = _band(mesh)
     gradient = mesh.transposed(linear.gradient) - band.apply(stiff, coefficients)
+    # after the gradient: the steps are shorter, and end at the same flow
     with_diagonal(stiff, rounding(stiff))
     return stiff, gradient
 
 
 def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
-    """Quadratic form of what the images tell, of all cells along z or of some (`band.form`)."""
+    """Quadratic form of the images' information, of all cells along z or some (`band.form`)."""
     return form_of_slopes(linear.information, linear.damped, mesh, cells)
 
 
@@ -195,11 +199,13 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
     mesh = prior.mesh
     rows = mesh.axes[0].knots if cells is None else cells.stop - cells.start + REACH
     total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
+    # kinds of motion share products of derivatives: each product is summed once
     pairs: dict[tuple[tuple[int, int], tuple[int, int]], list[tuple[int, int, int, float]]] = {}
     for kind, terms in enumerate(_kinds(prior)):
         for a, first, one in terms:
             for b, second, other in terms:
                 pairs.setdefault((first, second), []).append((kind, a, b, one * other))
+    # the integral over the plane is a sum over the cells of the mesh
     weight = prior.cell * prior.strength
     for (first, second), members in pairs.items():
         parts = form(weight, mesh, first, second, cells)

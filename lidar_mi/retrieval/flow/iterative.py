@@ -50,6 +50,7 @@ class Posterior(NamedTuple):
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
         # added to both, as the draws have sampling noise
         more = solver.damping * before
+        # means over a few draws may differ with the wrong sign
         return (before - after).clamp(min=0) + more, energy + more
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -72,6 +73,7 @@ class Posterior(NamedTuple):
         prior, ridge = self.single, self.settings.ridge
         like = self.coefficients.to(prior.local)
         draw = torch.Generator(device=like.device)
+        # other draws in every round, the same ones in every run
         draw.manual_seed(self.settings.solver.seed + self.iteration)
 
         def normal(*shape: int) -> torch.Tensor:
@@ -115,10 +117,12 @@ def solved(
     # knots have the precision of the prior, which may be strong; voxels have their own
     coefficients, voxels = coefficients.to(prior.local), linear.slope.dtype
     dims = mesh.dims
+    # lumped to the nodes of the prior, for draws and the preconditioner alone
     curvature = coefficients.new_empty(dims, dims, *prior.mesh.shape)
     for a, b in combinations_with_replacement(range(dims), 2):
         squares = linear.information * linear.slope[a] * linear.slope[b]
         curvature[a, b] = curvature[b, a] = separable(squares, lumps)
+    # the step itself has every voxel, and the second derivative instead of the information
     steep = linear.weight * linear.slope
 
     def applied(c: torch.Tensor) -> torch.Tensor:
@@ -151,6 +155,7 @@ def _root(curvature: torch.Tensor) -> torch.Tensor:
     """A square root of positive semidefinite matrices (components, components, ...)."""
     matrix = curvature.movedim((0, 1), (-2, -1))
     unit = torch.eye(len(curvature), dtype=matrix.dtype, device=matrix.device)
+    # about a node with slopes in one direction the matrix is singular
     floor = 1e-5 * matrix.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-20
     root = torch.linalg.cholesky(matrix + floor[..., None, None] * unit)
     return root.movedim((-2, -1), (0, 1)).contiguous()
@@ -162,6 +167,7 @@ def _preconditioner(
     """The inverse of each knot's diagonal block (components, components)."""
     mesh = prior.mesh
     dims = mesh.dims
+    # the diagonal of a form has the squares of the basis functions
     bases = [[mesh.basis(axis, order).square().T for axis in range(dims)] for order in (0, 1)]
 
     def diagonal(values: torch.Tensor, axis: int | None = None) -> torch.Tensor:

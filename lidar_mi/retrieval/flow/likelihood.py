@@ -20,8 +20,8 @@ _INTERPOLATION = 1e-5
 # A noise that is given and below this fraction of that of the spectra (of the variances) is only a
 # lower limit: what differs are the air and what splines cannot interpolate.
 _LEAST_KNOWN = 0.1
-# Width of the means that tell texture from noise, in cells between knots: at 0.8 too few pixels,
-# at 3 the rim of smoke counts as texture next to it.
+# Width of the means that separate texture from noise, in cells between knots: at 0.8 too few
+# pixels, at 3 the rim of smoke counts as texture next to it.
 _FRACTION_WIDTH = 1.5
 # Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
 _STRUCTURE = 3.0
@@ -92,16 +92,16 @@ class Linear(NamedTuple):
     slope : torch.Tensor, shape (components, ...)
         Of the mean of the warped images.
     damped : torch.Tensor, shape (components, ...)
-        The same without what is `coarse`: slopes that tell of the flow.
+        The same without what is `coarse`: slopes that inform the flow.
     coarse : torch.Tensor, shape (z, y), or None
-        Fraction of the long waves of differences and slopes that is left out at each pixel, as
+        Fraction of the long waves of differences and slopes that is removed at each pixel, as
         structure is not advected there: the residual is as white as the noise.
     gradient : torch.Tensor, shape (components, ...)
         Of the log-likelihood with respect to the flow at each pixel.
     weight : torch.Tensor
         Of the products of slopes in the second derivative.
     information : torch.Tensor
-        Of the same in what the images tell of the flow: slopes of noise tell nothing.
+        Of the same in the information on the flow: slopes of noise have none.
     variance : float
         Of the noise.
     warped : torch.Tensor, shape (images, ...)
@@ -142,6 +142,7 @@ def prepared(
     )
     level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
+    # mid-time is that of the whole burst
     time = time - time.mean()
     return Images(
         spline,
@@ -175,6 +176,7 @@ def linearised_there(
     """`linearised`, with the images' values and slopes at the places of `path`."""
     value, *slopes = sampled
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
+    # over air that is in all images: bright air that enters would change the brightness of all
     value, gain = normalised_intensity(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])
     residual = (value - value.mean(0)) * images.weight.sqrt()
@@ -185,8 +187,10 @@ def linearised_there(
     if not images.noise_updated:
         variance = max(variance, misfit_variance(misfit[valid], len(value)) / passed)
     off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
+    # beyond `robust` standard deviations residuals enter linearly (Huber)
     weight = images.weight * (settings.robust / off.clamp(min=settings.robust)) * valid
     time = images.time.reshape(-1, *[1] * mesh.dims)
+    # an image moves by its time times the flow: the derivative weights it by that
     difference = (time * (value - value.mean(0))).sum(0)
     informed = images.spline.efficiency * weight / variance
     coarse: torch.Tensor | None = None
@@ -226,7 +230,7 @@ def without_coarse(
 def information_of_first(
     images: Images, mesh: Mesh, places: torch.Tensor, sampled: Sequence[torch.Tensor], number: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """What images in a plane will tell of a flow, as far as the first of them shows.
+    """Information of images in a plane on a flow, as far as the first of them shows it.
 
     Parameters
     ----------
@@ -281,7 +285,7 @@ def _fraction_of_texture(
     """Fraction of texture in the mean square of the slopes at each pixel of a plane, 0 to 1.
 
     Noise has slopes too, and next to bright smoke there are no others. With slopes J = T + N of
-    texture and noise the differences of two images tell of the flow by T J, and scatter by
+    texture and noise the differences of two images depend on the flow by T J, and scatter by
     s^2 J^2. Their information on it is (T J)^2 / (s^2 J^2), on average the square of this fraction
     times J^2 / s^2. Both mean squares are Gaussian means over 1.5 cells of the flow's splines.
     Where the noise is not known, `noise`, the square of the misfit over that assumed, is its
@@ -309,6 +313,7 @@ def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int)
     for k in range(2, terms + 1):
         along: Sequence[torch.Tensor] = (
             mesh.slopes(coefficients)
+            # slopes of the splines are exact; in the small further terms differences suffice
             if k == 2
             else torch.gradient(term, dim=tuple(range(1, term.ndim)))
         )

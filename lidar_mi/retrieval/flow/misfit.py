@@ -1,4 +1,4 @@
-"""The noise of images by place and wavenumber, from what a flow leaves of their differences."""
+"""The noise of images by place and wavenumber, from the residuals of a flow's fit."""
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from lidar_mi.retrieval.flow.coherent_change import (
     mean_square_displacement,
 )
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
-from lidar_mi.retrieval.images.band_limit import WORTH_WHITENING, flat_if_nearly, wavenumbers
+from lidar_mi.retrieval.images.band_limit import LEAST_REDUCTION, flat_if_nearly, wavenumbers
 from lidar_mi.retrieval.images.intensity import rms
 from lidar_mi.retrieval.images.spline import Spline, band_limited, filter_of, mismatch, spectrum_of
 from lidar_mi.retrieval.images.windows import averaged
@@ -28,7 +28,7 @@ _LEAST_GIVEN = 0.5
 # Fraction of the differences of images with a noise that is given, by blur in strained air, above
 # which their misfit is not whitened.
 _BLURRED = 0.25
-# Rounds in which noise by place and by wavenumber are estimated in turn.
+# Iterations over the noise by place and by wavenumber.
 _ROUNDS = 3
 
 
@@ -48,12 +48,12 @@ def with_local_noise(
     limit. One that was not given is of the spectra, where fine texture looks like noise: their
     misfit takes its place if it is clearly less. In a plane it then does so at each place and
     wavenumber, down to 0.4 % of the images' rms. What is noise at a place depends on the waves that
-    the filter passes, and the filter on the weights of the places: both are estimated in turn.
+    the filter passes, and the filter on the weights of the places: both are estimated iteratively.
 
-    Two kinds of change leave less of themselves than noise does. In each wavenumber a lower limit
-    is the out-of-plane motion that the waves shorter than two `knots` (px) tell of: the flow
-    absorbs part of the misfit of longer ones. And structure as a whole can move otherwise than the
-    air in the plane, see `coherent_change.mean_square_displacement`.
+    Two kinds of change have smaller residuals than noise has. In each wavenumber a lower limit is
+    the out-of-plane motion that the waves shorter than two `knots` (px) show: the flow absorbs part
+    of the misfit of longer ones. And structure that is not advected can move as a whole, see
+    `coherent_change.mean_square_displacement`.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ def with_local_noise(
         Mean square of the flow's strain in dt, in a plane along its axes; blur that is not known
         makes images differ by it.
     residual_of : callable, optional
-        What the fit leaves of a difference of images in a plane, see
-        `coherent_change.residual_operator`. Left out: of volumes.
+        Residual of a difference of images in a plane after the fit, see
+        `coherent_change.residual_operator`. None of volumes.
     """
     again, overstated = images.noise_updated, False
     coherent = images.coherent
@@ -125,8 +125,8 @@ def with_local_noise(
             settings = images.spline.settings
             spectrum = spectrum_of(images.stack, weight.sqrt(), settings)
             # a filter that is not flat adds to what blur in strain makes
-            worth = np.inf if images.noise_known and blurred > _BLURRED else WORTH_WHITENING
-            density = flat_if_nearly(spectrum, density, settings.threshold, worth)
+            reduction = np.inf if images.noise_known and blurred > _BLURRED else LEAST_REDUCTION
+            density = flat_if_nearly(spectrum, density, settings.threshold, reduction)
     spline, level = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
     )

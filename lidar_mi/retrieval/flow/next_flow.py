@@ -98,7 +98,7 @@ class Flow:
         change : torch.Tensor, shape (2, z, y)
             Of the flow after this shift, px in dt, as by a model of both.
         offset : (float, float), optional
-            See `Flow`. Left out: the last one and the shift.
+            See `Flow`. Default: the last one and the shift.
         """
         axes, like = self.prior.mesh.axes, self.coefficients
         pixels = _of_pixels(axes, self.windows, like)
@@ -168,7 +168,7 @@ class ExpectedFlow:
         Of the air at the pixels at mid-time in both images, px.
     first : tuple of torch.Tensor, shape (1, z, y)
         Value and slopes of the first image there.
-    prior_term : Pull
+    prior_term : PriorTerm
     root : BandCholesky
         Factor of the precision of the flow, by the information that the first image shows.
     covariance : torch.Tensor, shape (2, 2, *windows.count)
@@ -256,6 +256,7 @@ def next_flow(
     if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
     at_centres = _of_centres(prior.mesh.axes, windows, coefficients)
+    # errors learnt from other images follow the misfit of these
     covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
@@ -297,7 +298,7 @@ def _mesh(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Mesh:
-    """Kept for the next slab: to make its splines takes longer than to use them."""
+    """Stored for the next slab: to make its splines takes longer than to use them."""
     return Mesh(axes, places(windows, torch.empty(0, dtype=dtype, device=device)))
 
 
@@ -339,7 +340,9 @@ def _completed(
         known = known & informative([noise])
     pair = normalised(stack)
     second = pair[1:].nan_to_num(0.0).float()
-    both = images.spline.beside(filtered_spline(second, _filter(start), start.settings.filter))
+    both = images.spline.stacked_with(
+        filtered_spline(second, _filter(start), start.settings.filter)
+    )
     return images._replace(spline=both, usable=known, stack=pair)
 
 
@@ -359,7 +362,7 @@ def _energy(prior: Prior, coefficients: torch.Tensor) -> float:
 def _misfit(linear: Linear, step: torch.Tensor, images: Images) -> float:
     """Mean square of the residuals after a step (2, z, y) in px, over that of the noise."""
     along = (linear.slope * step.to(linear.slope)).sum(0)
-    rest = linear.warped + images.time.reshape(-1, 1, 1) * along
-    rest = (rest - rest.mean(0)) * images.weight.sqrt()
-    square = misfit_variance(rest.square().sum(0)[linear.valid].double(), len(rest))
+    residual = linear.warped + images.time.reshape(-1, 1, 1) * along
+    residual = (residual - residual.mean(0)) * images.weight.sqrt()
+    square = misfit_variance(residual.square().sum(0)[linear.valid].double(), len(residual))
     return square / (max(images.spline.passed, 1e-6) * linear.variance)

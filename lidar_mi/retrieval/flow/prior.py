@@ -93,6 +93,7 @@ class Prior(NamedTuple):
     @property
     def cell(self) -> float:
         """Area or volume of a cell of the mesh, px^2 or voxels."""
+        # the mesh has two steps between knots
         return math.prod((axis.size - 1) / (2 * axis.cells) for axis in self.mesh.axes)
 
     @property
@@ -106,6 +107,7 @@ class Prior(NamedTuple):
     def motions(self) -> list[tuple[int, Motion]]:
         """Every motion with the number of its kind, its terms scaled to rates in space."""
         return [
+            # displacements are in pixels of their own axis, distances in those of the other
             (kind, tuple((a, b, sign * self.spacing[a] / self.spacing[b]) for a, b, sign in motion))
             for kind, motions in enumerate(KINDS[self.mesh.dims])
             for motion in motions
@@ -169,9 +171,12 @@ class Prior(NamedTuple):
         """
         count = len(self.local)
         most = settings.largest_change_trusted if noise_known else settings.largest_change
+        # over the prior variance 1 / local, so that the mean is not that of the strongest motion
         removed, found = (self.smooth(self.local * part[:count]) for part in (informed, energy))
+        # strengths vary over decades and stay positive: steps are those of their logarithm
         trend = self.local.log(), bounded(removed, found, most).log()
         change = _secant(trend, self.trend if noise_known else None, math.log(most)).exp()
+        # white noise has the variance cells / strength in its mean over a cell between knots
         local = (self.local * change).clamp(max=_cells(self.mesh) / _LEAST**2)
         divergence = self.divergence
         if divergence is not None:
@@ -188,6 +193,7 @@ class Prior(NamedTuple):
         kernels = []
         for place in self.mesh.places:
             kernel = torch.exp(-((place[:, None] - place) / self.width).square() / 2)
+            # of sum 1 at the rim too, beyond which half of the Gaussian is missing
             kernels.append(kernel / kernel.sum(1, keepdim=True))
         return separable(values, kernels)
 
@@ -212,9 +218,10 @@ class Prior(NamedTuple):
         settings: VariationalSettings,
     ) -> Divergence:
         all_of_it = self._divergent(before)
+        # of the variance of divergence, the part that is the same everywhere
         fraction = all_of_it / before.strength
         largest = settings.largest_change_divergence
-        everywhere, beside = (
+        everywhere, in_cores = (
             float(
                 bounded(
                     (part * all_of_it * informed).mean(), (part * all_of_it * energy).mean(), most
@@ -226,7 +233,7 @@ class Prior(NamedTuple):
         # images of weak texture without measurable divergence are no evidence that there is none
         most = settings.largest_ratio / float((1 / self.local[0]).mean())
         change = float(_secant(trend, before.trend, math.log(largest)).exp())
-        return Divergence(min(before.strength * change, most), before.ratio * beside, trend)
+        return Divergence(min(before.strength * change, most), before.ratio * in_cores, trend)
 
 
 def _secant(
@@ -238,10 +245,12 @@ def _secant(
 
     Where the images inform little, the fixed point alone would take hundreds of rounds.
     """
+    # of slope -1 the step is the fixed point: the strength times its ratio
     slope = -torch.ones_like(now[1])
     if before is not None:
         run = now[0] - before[0]
         secant = (now[1] - before[1]) / torch.where(run == 0, 1.0, run)
+        # no shorter than at the fixed point, and at most 1 / _SLOWEST times as long
         slope = torch.where(run == 0, slope, secant.clamp(-1.0, -_SLOWEST))
     return (-now[1] / slope).clamp(-limit, limit)
 
@@ -282,6 +291,8 @@ def first_prior(
 def refined(prior: Prior, axes: Sequence[Axis]) -> Prior:
     """A prior estimated on coarser knots, interpolated to finer ones."""
     mesh = halves(axes, prior.local)
+    # from core to still air the strength changes by decades: its logarithm is smoother
     local = interpolated(prior.local.log(), prior.mesh.places, mesh.places).exp()
+    # a secant through rounds on different knots would be none
     trendless = prior.divergence and prior.divergence._replace(trend=None)
     return prior._replace(local=local, mesh=mesh, divergence=trendless, trend=None)

@@ -42,10 +42,10 @@ def unresolved_variance(
         it. Wider, what splines leave in vortex cores is stated all around them.
     known : torch.Tensor of bool, shape (...), optional
         Pixels whose flow the images determine: next to them it is what the prior makes of noise.
-        Left out: all.
+        Default: all.
     of_noise : torch.Tensor, shape (number, ...), optional
         Components of flows that nothing but the images' noise makes, see `flows_of_noise`. The mean
-        variance of their octaves is no motion. Left out: none is.
+        variance of their octaves is no motion. Default: none is.
 
     Returns
     -------

@@ -58,7 +58,7 @@ def variational(
         sum_k sum_x (I_k(x + path(u, t_k)) - mean_k)^2 / (2 s^2)
             + 1/2 integral L(x) vorticity^2 + divergence^2 / (1 / D + 1 / (q L(x))),
 
-    with the images band-limited (`warping.band_limited`) and warped to mid-time along the curved
+    with the images band-limited (`spline.band_limited`) and warped to mid-time along the curved
     paths of the flow, so that no texture has to be known; residuals beyond 3 s count linearly.
     The prior's strength L(x), which may vary over about a template, D and q are those of the
     largest evidence: the energy of vorticity and of divergence is as large as the prior
@@ -83,7 +83,7 @@ def variational(
         Vectors are flagged where the images warped to mid-time correlate over a template by less
         than half way from this to 1: a flow fitted to unrelated textures correlates them to 0.7.
     noise : float or torch.Tensor, optional
-        Standard deviation of the images' white noise, of each pixel or of all; left out: from the
+        Standard deviation of the images' white noise, of each pixel or of all; default: from the
         images' spectra. Where images warped by the flow differ by more, their misfit is used.
     blur : float
         Standard deviation, px, of a Gaussian that the instrument blurred the images by. They are
@@ -91,9 +91,9 @@ def variational(
         blur with the texture, which is an error of 25 % there for a blur of 1 px.
     spacing : sequence of float, optional
         Of the pixels along each axis, in any unit: vorticity and divergence are those in space.
-        Left out: square pixels.
+        Default: square pixels.
     settings : VariationalSettings, optional
-        Left out: those of images or of volumes.
+        Default: those of images or of volumes.
 
     Returns
     -------

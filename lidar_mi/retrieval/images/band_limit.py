@@ -16,7 +16,7 @@ _SHELL_WAVES = 200
 # Least number of shells per cycle per pixel.
 _SHELLS = 16
 # Fraction by which whitening must lessen the variance of displacements.
-WORTH_WHITENING = 0.1
+LEAST_REDUCTION = 0.1
 
 
 class Filter(NamedTuple):
@@ -76,7 +76,7 @@ def power_spectrum(
         Odd lengths of the Fourier transforms.
     settings : FilterSettings
     weight, known
-        See `warping.band_limited`.
+        See `spline.band_limited`.
     """
     shape = tuple(images.shape[1:])
     _, shell = radii(tuple(sizes), shape, images.dtype, images.device)
@@ -105,7 +105,7 @@ def best_filter(
         Of the images.
     settings : FilterSettings
     noise, mismatch, blur
-        See `warping.band_limited`.
+        See `spline.band_limited`.
     """
     density, uncertainty, shape, sizes = spectrum
     radius, shell = radii(sizes, shape, density.dtype, density.device)
@@ -130,14 +130,18 @@ def best_filter(
     if mismatch is not None and noise is not None:
         level = torch.as_tensor(noise**2).to(floor)
     if blur:
+        # the inverse of the Gaussian's transform, limited, as noise is amplified as well
         sharper = torch.exp((blur * wavenumbers(response, shape)).square() / 2).clamp(
             max=settings.sharpening
         )
+        # the Wiener filter S / (S + N / 2) / B itself: the root is taken below
         response = torch.where(response > 0, (response * sharper).square(), 0.0)
     passed = _mean(response[shell], sizes)
+    # times sqrt(noise^2 / N) the filter whitens the mismatch (Hannan & Thomson 1973)
     white = level / floor if mismatch is not None else torch.ones_like(response)
     gain = (response * white).sqrt()
     # power of the filtered slopes with noise, the part of it from texture, and its variance
+    # the mean of two images has half the variance of their noise
     both = texture + floor / 2
     steep = radius**2 * gain[shell] ** 2
     power, informed, spread = (
@@ -149,6 +153,7 @@ def best_filter(
         passed,
         power / informed if informed > 0 else 1.0,
         informed / spread if informed > 0 else 1.0,
+        # slopes per px have radians, frequencies have cycles
         (2 * math.pi) ** 2 * _mean(steep * (floor / 2).expand(len(gain))[shell], sizes),
     )
 
@@ -157,7 +162,7 @@ def flat_if_nearly(
     spectrum: PowerSpectrum,
     mismatch: torch.Tensor,
     threshold: float,
-    worth: float = WORTH_WHITENING,
+    least_reduction: float = LEAST_REDUCTION,
 ) -> torch.Tensor:
     """The mismatch, at one level if whitening it would lessen errors by little.
 
@@ -174,10 +179,10 @@ def flat_if_nearly(
     spectrum : PowerSpectrum
         Of the images.
     mismatch : torch.Tensor, shape (shells,)
-        See `warping.band_limited`.
+        See `spline.band_limited`.
     threshold : float
         Standard errors by which a shell must exceed the mismatch to count as texture.
-    worth : float
+    least_reduction : float
         Fraction by which whitening must lessen the variance.
 
     Returns
@@ -196,11 +201,12 @@ def flat_if_nearly(
     response = texture / (texture + noise / 2)
     steep = number * wavenumbers(density, shape)[above].square() * texture
     level = (steep * response.square() * noise).sum() / (steep * response.square()).sum()
+    # g here is the square of the docstring's: the weight of a wave
     flat, white = (
         (steep * g.square() * noise).sum() / (steep * g).sum().square()
         for g in (response, response / noise)
     )
-    if flat > (1 + worth) * white:
+    if flat > (1 + least_reduction) * white:
         return mismatch
     return torch.where(mismatch.isfinite(), level, torch.inf)
 
@@ -256,7 +262,7 @@ def radii(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Frequency of each wave of a real Fourier transform, cycles per px, and its shell.
 
-    They depend on the grid alone: those of images are kept for the next images.
+    They depend on the grid alone: those of images are stored for the next images.
     """
     return (_radii if len(sizes) == 2 else _radii.__wrapped__)(sizes, shape, dtype, device)
 
@@ -293,7 +299,9 @@ def shell_means(
     window = torch.ones((), dtype=images.dtype, device=images.device)
     for n in shape:
         hann = torch.hann_window(n + 2, periodic=False, dtype=images.dtype, device=images.device)
+        # without the zeros at its ends, which would discard the outer pixels
         window = window[..., None] * hann[1:-1]
+    # as the window weights it: the windowed field then has no wave of frequency 0
     mean = (images * window).sum(dims, keepdim=True) / window.sum()
     power = torch.fft.rfftn((images - mean) * window, s=list(sizes), dim=dims)
     power = power.abs().square().mean(0)
@@ -346,8 +354,10 @@ def faded(
         n = images.shape[axis]
         place = torch.arange(-margin, size - margin, device=images.device)
         beyond = torch.maximum(-place, place - (n - 1)).clamp(0, margin).to(images)
+        # a raised cosine: no step of value or slope at either end
         fade = (1 + torch.cos(torch.pi * beyond / margin)) / 2
         edge = place.clamp(0, n - 1)
+        # mirrored about the outer pixels, which are not repeated: the period is 2 n - 2
         place = place % max(2 * n - 2, 1)
         mirrored = images.index_select(axis, torch.minimum(place, (2 * n - 2 - place) % (2 * n)))
         if antisymmetric:

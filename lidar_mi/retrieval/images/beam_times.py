@@ -71,10 +71,10 @@ def checked_times(
                 "every pixel that has a value"
             )
         found.append(values)
-    apart = dt + found[1] - found[0]
-    if np.nanmin(apart, initial=np.inf) <= 0:
+    delay = dt + found[1] - found[0]
+    if np.nanmin(delay, initial=np.inf) <= 0:
         raise InputError(
-            f"times: dt = {dt:g} s is not allowed, as a pixel is seen {np.nanmin(apart):g} s after "
+            f"times: dt = {dt:g} s is not allowed, as a pixel is seen {np.nanmin(delay):g} s after "
             "the first scan saw it; expected more than 0 s"
         )
     if not any(np.nan_to_num(values).any() for values in found):

@@ -30,7 +30,7 @@ def displacement_bound(
         Of the same texture.
     noise : float or torch.Tensor, optional
         Standard deviation of each image's noise, of all pixels or of each (of image 1, if the
-        images differ in brightness). Left out: from the images' spectra.
+        images differ in brightness). Default: from the images' spectra.
     window, stride : int
         Pixels: size of the square windows, step from one to the next.
 

@@ -75,7 +75,7 @@ def resample_pair(
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Both images on the largest grid of square cells that lies inside both.
 
-    Nodes are whole multiples of `spacing` (m). Nodes beside a pixel that is not finite have no
+    Nodes are whole multiples of `spacing` (m). Nodes next to a pixel that is not finite have no
     value. Raises InputError as `resample` otherwise, and where the images do not overlap.
     """
     first, second = _resampled([image1, image2], spacing)
@@ -114,16 +114,16 @@ def nearest_filled(values: np.ndarray) -> np.ndarray:
 
 
 def _around_gaps(image: xr.DataArray, nodes: dict[str, np.ndarray]) -> xr.DataArray:
-    """The image at the nodes, NaN beside pixels that are not finite."""
+    """The image at the nodes, NaN next to pixels that are not finite."""
     gap = ~np.isfinite(image.values)
     if not gap.any():
         return resample(image, nodes["y"], nodes["z"])
     found = resample(image.copy(data=nearest_filled(image.values)), nodes["y"], nodes["z"])
-    beside = RegularGridInterpolator(
+    gap_fraction = RegularGridInterpolator(
         [_axis(image, str(dim))[1] for dim in image.dims], gap.astype(float), bounds_error=False
     )
     at = np.meshgrid(*(nodes[str(dim)] for dim in image.dims), indexing="ij")
-    free = xr.DataArray(~(beside(np.stack(at, -1)) > 1e-6), dims=image.dims)
+    free = xr.DataArray(~(gap_fraction(np.stack(at, -1)) > 1e-6), dims=image.dims)
     return found.where(free.transpose("z", "y").values)
 
 

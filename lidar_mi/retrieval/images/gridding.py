@@ -9,9 +9,9 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.resampling_error import (
-    LeftOut,
+    LeaveOneOut,
     correlation_area,
-    left_out,
+    leave_one_out,
     pairs,
     strength_at,
     structure,
@@ -29,7 +29,7 @@ _UNCORRELATED, _SLOPE = 1e-3, 1e-6
 # within, distance of a node that has no beam near.
 _ON_NODE, _RIM, _NEAR = 1e-3, 0.02, 1.5
 # Beams that are estimated from the others.
-_LEFT_OUT = 15000
+_MOST_ESTIMATED = 15000
 # Nodes solved for together.
 _CHUNK = 4096
 # Fields that winds are retrieved from.
@@ -139,7 +139,7 @@ def _resampling_error(
     if "beam_time" in scan:
         times = scan["beam_time"].transpose("z", "y").values.ravel().astype(float)
     speed = variogram(values, pairs(places, times)).speed
-    left = _left_out(places, values, times, speed)
+    errors = _leave_one_out(places, values, times, speed)
     beams = weights.indices.reshape(len(changed), -1)
     factors = weights.data.reshape(beams.shape)
     when = times[beams]
@@ -149,22 +149,24 @@ def _resampling_error(
         part = slice(start, start + _CHUNK)
         from_node = places[beams[part]] - nodes[changed[part]][:, None]
         error[changed[part]] = variance(structure(speed), factors[part], from_node, when[part])
-    error[changed] *= strength_at(left, nodes[changed])
+    error[changed] *= strength_at(errors, nodes[changed])
     error[changed] *= correlation_area(places, nodes[changed])
     # what a node's noise shares with that of its neighbours, beyond its own
     shared = weights @ weights.sum(0) - weights.power(2).sum(1)
     # of sums, as the scatter from node to node is as often negative
     _, around = KDTree(nodes[changed]).query(nodes[changed], min(_BEAMS, len(changed)))
     shared = shared[around].reshape(len(changed), -1).mean(1)
-    error[changed] += left.noise * np.clip(shared, 0.0, None)
+    error[changed] += errors.noise * np.clip(shared, 0.0, None)
     about = {"long_name": f"standard deviation of {name} by resampling"}
     about |= {key: image.attrs[key] for key in ("units",) if key in image.attrs}
     return image.copy(data=np.sqrt(error).reshape(image.shape)).assign_attrs(about)
 
 
-def _left_out(places: np.ndarray, values: np.ndarray, times: np.ndarray, speed: float) -> LeftOut:
+def _leave_one_out(
+    places: np.ndarray, values: np.ndarray, times: np.ndarray, speed: float
+) -> LeaveOneOut:
     """Beams estimated from those around them, in the way that nodes are."""
-    chosen = np.arange(0, len(places), max(1, round(len(places) / _LEFT_OUT)))
+    chosen = np.arange(0, len(places), max(1, round(len(places) / _MOST_ESTIMATED)))
     _, near = KDTree(places).query(places[chosen], min(_BEAMS, len(places) - 1) + 1)
     near = near[:, 1:]
     weights = _weights_of(places, places[chosen], near)
@@ -172,10 +174,10 @@ def _left_out(places: np.ndarray, values: np.ndarray, times: np.ndarray, speed: 
     for start in range(0, len(chosen), _CHUNK):
         part = slice(start, start + _CHUNK)
         away = places[near[part]] - places[chosen[part]][:, None]
-        later = times[near[part]] - times[chosen[part]][:, None]
-        expected[part] = variance(structure(speed), weights[part], away, later)
+        delay = times[near[part]] - times[chosen[part]][:, None]
+        expected[part] = variance(structure(speed), weights[part], away, delay)
     square = ((weights * values[near]).sum(1) - values[chosen]) ** 2
-    return left_out(places[chosen], square, expected, 1 + (weights**2).sum(1))
+    return leave_one_out(places[chosen], square, expected, 1 + (weights**2).sum(1))
 
 
 def _weights(places: np.ndarray, nodes: np.ndarray) -> csr_array:
@@ -194,9 +196,9 @@ def _weights_of(places: np.ndarray, nodes: np.ndarray, near: np.ndarray) -> np.n
     for start in range(0, len(nodes), _CHUNK):
         chosen = slice(start, start + _CHUNK)
         from_node = places[near[chosen]] - nodes[chosen][:, None]
-        apart = from_node[:, :, None] - from_node[:, None]
+        separation = from_node[:, :, None] - from_node[:, None]
         matrix = np.zeros((len(from_node), beams + 3, beams + 3))
-        matrix[:, :beams, :beams] = _covariance(apart) + _UNCORRELATED * np.eye(beams)
+        matrix[:, :beams, :beams] = _covariance(separation) + _UNCORRELATED * np.eye(beams)
         matrix[:, :beams, beams] = matrix[:, beams, :beams] = 1.0
         matrix[:, :beams, beams + 1 :] = from_node
         matrix[:, beams + 1 :, :beams] = from_node.swapaxes(1, 2)
@@ -207,9 +209,9 @@ def _weights_of(places: np.ndarray, nodes: np.ndarray, near: np.ndarray) -> np.n
     return found
 
 
-def _covariance(apart: np.ndarray) -> np.ndarray:
+def _covariance(separation: np.ndarray) -> np.ndarray:
     """Of the structure at two places, by their distance (..., 2) in spacings."""
-    return np.exp(-0.5 * (apart**2).sum(-1) / _LENGTH**2)
+    return np.exp(-0.5 * (separation**2).sum(-1) / _LENGTH**2)
 
 
 def _inside(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def normalised_intensity(
 
 
 def rms(noise: float | torch.Tensor) -> float:
-    """Rms standard deviation of an image's noise, of a number or a map (NaN left out)."""
+    """Rms standard deviation of an image's noise, of a number or a map (NaN masked)."""
     if not isinstance(noise, torch.Tensor):
         return noise
     finite = working(noise[torch.isfinite(noise)])

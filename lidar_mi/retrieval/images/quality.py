@@ -109,6 +109,7 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
     gradient = spatial_gradient(image[None, None], mode="sobel")[0, 0]
     along_y, along_z = windows.of_templates(gradient.square())
     across = windows.of_templates(gradient[0] * gradient[1])
+    # eigenvalues of the mean product of the slopes: half its trace -+ the radius
     half_trace = (along_y + along_z) / 2
     radius = torch.hypot((along_y - along_z) / 2, across)
     weakest = (half_trace - radius).clamp(min=0).sqrt()

@@ -18,7 +18,7 @@ _LOCAL, _NOISE_BINS = 75, 24
 _LOST = 4.0
 # Fraction of the vectors beyond which all are flagged.
 _MOST = 2 / 3
-# Nearest beams that tell of their density.
+# Nearest beams that their density is from.
 _AREA = 12
 # Length of the structure for which beams are weighted, in spacings.
 _LENGTH = 1.5
@@ -41,18 +41,19 @@ class Variogram(NamedTuple):
     speed: float
     noise: float
 
-    def __call__(self, apart: np.ndarray, later: np.ndarray) -> np.ndarray:
+    def __call__(self, separation: np.ndarray, delay: np.ndarray) -> np.ndarray:
         """Of the structure, for distances (..., 2) in spacings and times (...), s."""
-        square = (apart**2).sum(-1) + (self.speed * later) ** 2
+        square = (separation**2).sum(-1) + (self.speed * delay) ** 2
         a = self.exponent
+        # 1 - (1 + x)^-a, exact also next to 0
         return self.strength * -np.expm1(-a * np.log1p(square / (2 * a * self.length**2)))
 
 
 class Pairs(NamedTuple):
     """Beams next to each other: distances (n, k, 2) in spacings, times (n, k), indices (n, k)."""
 
-    apart: np.ndarray
-    later: np.ndarray
+    separation: np.ndarray
+    delay: np.ndarray
     near: np.ndarray
 
 
@@ -70,21 +71,21 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
     1985, Math. Geol. 17, 563-586). What no distance explains is the noise.
     """
     half = ((values[near.near] - values[:, None]) ** 2 / 2).ravel()
-    distance, later = np.linalg.norm(near.apart, axis=-1).ravel(), np.abs(near.later).ravel()
+    distance, delay = np.linalg.norm(near.separation, axis=-1).ravel(), np.abs(near.delay).ravel()
     edges = [
-        np.unique(np.quantile(part, np.linspace(0, 1, _BINS + 1))) for part in (distance, later)
+        np.unique(np.quantile(part, np.linspace(0, 1, _BINS + 1))) for part in (distance, delay)
     ]
     cell = [
-        np.searchsorted(e[1:-1], p, "right") for e, p in zip(edges, (distance, later), strict=True)
+        np.searchsorted(e[1:-1], p, "right") for e, p in zip(edges, (distance, delay), strict=True)
     ]
     index = cell[0] * (_BINS + 1) + cell[1]
     number = np.bincount(index)
     h, tau, seen = (
         np.bincount(index, part)[number > 0] / number[number > 0]
-        for part in (distance, later, half)
+        for part in (distance, delay, half)
     )
     number, scale = number[number > 0], max(float(half.mean()), 1e-300)
-    fastest = np.ptp(distance) / max(float(later.max()), 1e-9)
+    fastest = np.ptp(distance) / max(float(delay.max()), 1e-9)
 
     def model(p: np.ndarray) -> Variogram:
         return Variogram(np.exp(p[0]) * scale, np.exp(p[1]), p[2], p[3] * fastest, p[4] * scale)
@@ -92,6 +93,7 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
     def misfit(p: np.ndarray) -> np.ndarray:
         made = model(p)
         expected = made(np.stack([h, 0 * h], -1), tau) + made.noise
+        # relative: squared differences scatter in proportion to their mean
         return np.sqrt(number) * (seen / expected - 1)
 
     start = np.array([1.0, np.log(3.0), 2.0, 1.0, 0.05])
@@ -132,7 +134,7 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
     return wind.assign(flag=flag.copy(data=found.astype(flag.dtype)))
 
 
-class LeftOut(NamedTuple):
+class LeaveOneOut(NamedTuple):
     """Beams as their neighbours estimate them.
 
     Places (n, 2), squared errors without noise (n,), and what these are for `structure` of
@@ -151,9 +153,9 @@ def structure(speed: float) -> Variogram:
     return Variogram(1.0, _LENGTH, 1.0, speed, 0.0)
 
 
-def left_out(
+def leave_one_out(
     places: np.ndarray, square: np.ndarray, expected: np.ndarray, noisy: np.ndarray
-) -> LeftOut:
+) -> LeaveOneOut:
     """Beams with the noise that explains their squared errors, together with the structure.
 
     A beam that its neighbours estimate errs by the structure between them and by the noise of all,
@@ -166,18 +168,19 @@ def left_out(
     means = [np.bincount(index, part) for part in (square, noisy, expected)]
     seen, by_noise, by_air = (part[number > 0] / number[number > 0] for part in means)
     seen = np.maximum(seen, 1e-300)
+    # divided by what was seen: bins of close beams, which show the noise, count as much as others
     matrix = np.stack([by_noise / seen, by_air / seen], 1)
     scale = np.maximum(matrix.max(0), 1e-300)
     (noise, strength), _ = nnls(matrix / scale, np.ones(len(seen)))
     noise, strength = noise / scale[0], strength / scale[1]
-    return LeftOut(places, square - noise * noisy, expected, float(noise), float(strength))
+    return LeaveOneOut(places, square - noise * noisy, expected, float(noise), float(strength))
 
 
-def strength_at(left: LeftOut, nodes: np.ndarray) -> np.ndarray:
+def strength_at(errors: LeaveOneOut, nodes: np.ndarray) -> np.ndarray:
     """The structure's strength about nodes (m,), at least a hundredth of the mean."""
-    _, near = KDTree(left.places).query(nodes, min(_LOCAL, len(left.places)))
-    above, below = left.square[near].mean(-1), left.expected[near].mean(-1)
-    return np.maximum(above / np.maximum(below, 1e-300), 0.01 * left.strength)
+    _, near = KDTree(errors.places).query(nodes, min(_LOCAL, len(errors.places)))
+    above, below = errors.square[near].mean(-1), errors.expected[near].mean(-1)
+    return np.maximum(above / np.maximum(below, 1e-300), 0.01 * errors.strength)
 
 
 def correlation_area(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -201,7 +204,7 @@ def variance(
     Times (m, k) are relative to the node's, which is their weighted mean.
     """
     own = 2 * (weights * found(from_node, times)).sum(-1)
-    apart = from_node[:, :, None] - from_node[:, None]
-    later = times[:, :, None] - times[:, None]
-    both = np.einsum("mi,mij,mj->m", weights, found(apart, later), weights)
+    separation = from_node[:, :, None] - from_node[:, None]
+    delay = times[:, :, None] - times[:, None]
+    both = np.einsum("mi,mij,mj->m", weights, found(separation, delay), weights)
     return np.clip(own - both, 0.0, None)

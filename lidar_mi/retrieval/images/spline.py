@@ -56,13 +56,14 @@ class Spline(NamedTuple):
         """That of one of the images."""
         return self._replace(coefficients=self.coefficients[number : number + 1])
 
-    def beside(self, other: "Spline") -> "Spline":
+    def stacked_with(self, other: "Spline") -> "Spline":
         """With the images of another one after the same filter."""
         return self._replace(coefficients=torch.cat([self.coefficients, other.coefficients]))
 
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
         """A field on the images' pixels after the images' filter; it is zero beyond them."""
         margin = self.settings.margin
+        # one margin is enough: what passes one edge of the periodic transform enters at the other
         sizes = [even_fast_len(n + margin) for n in self.shape]
         dims = tuple(range(-len(sizes), 0))
         # sizes of another parity may reach one shell further
@@ -102,6 +103,7 @@ class Spline(NamedTuple):
             value, *slopes = _read_images(self.coefficients, at[0], at[1])
         else:
             value, *slopes = _read_volumes(self.coefficients, *at)
+        # per px from per node
         return value, *(self.settings.nodes * slope for slope in slopes)
 
     def values(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -114,6 +116,7 @@ class Spline(NamedTuple):
         """Places on the images, counted in nodes."""
         finer, margin = self.settings.nodes, self.settings.margin
         return [
+            # the first of the four coefficients of a place is that of one node before it
             finer * (p.clamp(0, size - 1) + margin) - 1
             for p, size in zip(place, self.shape, strict=True)
         ]
@@ -144,6 +147,7 @@ def _read_images(
     knot, *along = (torch.empty_like(z) for _ in range(1 + len(weight_y)))
     for i in range(4):
         for j in range(4):
+            # a view that begins further on saves an addition to every number
             torch.index_select(flat[i * width + j :], 0, corner, out=knot.view(-1))
             for part, weight in zip(along, weight_y, strict=True):
                 if j:
@@ -236,7 +240,7 @@ def band_limited(
         Non-finite pixels take the value of the nearest finite one, as a step to any other would
         be structure at rest. They do not count in the power spectrum.
     noise : float, optional
-        Standard deviation of the images' white noise. Left out: from the lowest shell of the
+        Standard deviation of the images' white noise. Default: from the lowest shell of the
         power spectrum.
     mismatch : torch.Tensor, shape (shells,), optional
         Spectral density N of the differences of warped images, see `mismatch`. The filter is then
@@ -249,7 +253,7 @@ def band_limited(
         filter, S / (S + N / 2) / B with the Gaussian's transform B and the spectral density S of
         the blurred images.
     settings : FilterSettings, optional
-        Left out: those of images.
+        Default: those of images.
 
     Returns
     -------
@@ -321,11 +325,12 @@ def filtered_splines(
     sizes = transform_sizes(shape, settings)
     dims = tuple(range(1, images.ndim))
     shell = radii(tuple(sizes), shape, images.dtype, images.device)[1]
+    # images fade to 0 beyond their edges, that is to their mean
     mean = images.mean(dims, keepdim=True)
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
     )
-    # of images kept for the next ones, as the shells are
+    # stored of images for the next ones, as the shells are
     factor = _through_nodes if len(dims) == 2 else _through_nodes.__wrapped__
     through = factor(tuple(sizes), finer, images.dtype, images.device)
     keep = [slice(finer * (n + 2 * margin)) for n in shape]
@@ -351,21 +356,22 @@ def _through_nodes(
     """Coefficients over values of a spline through nodes, `finer` of them a pixel, by its waves."""
     factor = torch.ones((), dtype=dtype, device=device)
     for axis in frequencies(sizes, factor):
+        # a cubic B-spline is 1/6, 4/6, 1/6 at its nodes: (2 + cos) / 3 in its waves
         factor = factor * 3 / (2 + torch.cos(2 * torch.pi * axis / finer))
     return factor
 
 
-def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> torch.Tensor:
+def mismatch(spline: Spline, residual: torch.Tensor, number: int | None = None) -> torch.Tensor:
     """Spectral density, by shells, of the differences of warped images, before their filter.
 
     Parameters
     ----------
     spline : Spline
         That the warped images were sampled from.
-    rest : torch.Tensor, shape (images, ...)
+    residual : torch.Tensor, shape (images, ...)
         Each warped image less the mean of all; zero where not all are valid.
     number : int, optional
-        Of warped images, where `rest` is only some. Left out: as many as `rest`.
+        Of warped images, where `residual` is only some. Default: as many as `residual`.
 
     Returns
     -------
@@ -373,11 +379,13 @@ def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> t
         As `band_limited` takes it. Infinite where the filter passed nothing.
     """
     sizes = transform_sizes(spline.shape, spline.settings)
-    _, shell = radii(tuple(sizes), spline.shape, rest.dtype, rest.device)
-    number = number or len(rest)
-    rest = rest * (number / (number - 1)) ** 0.5
-    density, _ = shell_means(rest, shell, sizes, spline.settings.smoothing)
+    _, shell = radii(tuple(sizes), spline.shape, residual.dtype, residual.device)
+    number = number or len(residual)
+    # the mean of all has taken one degree of freedom
+    residual = residual * (number / (number - 1)) ** 0.5
+    density, _ = shell_means(residual, shell, sizes, spline.settings.smoothing)
     passed = spline.gain.square()
+    # where the filter passes next to nothing, the quotient would be rounding
     return torch.where(passed > 1e-3, density / passed, torch.inf)
 
 
@@ -385,7 +393,9 @@ def _refined(spectrum: torch.Tensor, sizes: Sequence[int], finer: int) -> torch.
     """Fields of odd sizes (axes but the first) from their spectra, on a grid that is finer."""
     # axis by axis: the axes not yet refined are small
     for axis, n in enumerate(sizes[:-1], 1):
+        # of odd length: no wave at the end of the spectrum has to be divided between both signs
         low, high = spectrum.split([n // 2 + 1, n // 2], axis)
         shape = [*spectrum.shape[:axis], (finer - 1) * n, *spectrum.shape[axis + 1 :]]
         spectrum = torch.fft.ifft(torch.cat([low, low.new_zeros(shape), high], axis), dim=axis)
+    # inverse transforms divide by the finer sizes
     return finer ** len(sizes) * torch.fft.irfft(spectrum, n=finer * sizes[-1])

@@ -259,8 +259,8 @@ def _gaussians(
 ) -> torch.Tensor:
     """Weights (n, n) of the pixels along an axis about each of them."""
     place = torch.arange(n, dtype=dtype, device=device)
-    apart = place[:, None] - place
-    return torch.exp(-(apart / width).square() / 2) * (apart.abs() <= reach)
+    separation = place[:, None] - place
+    return torch.exp(-(separation / width).square() / 2) * (separation.abs() <= reach)
 
 
 def separable(values: torch.Tensor, matrices: Sequence[torch.Tensor]) -> torch.Tensor:

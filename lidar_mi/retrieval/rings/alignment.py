@@ -64,10 +64,10 @@ def crests(sectors: Sectors) -> np.ndarray:
     """
     mean = sectors.profile
     smooth = _smooth(mean)
-    kept = np.sqrt((savgol_coeffs(_window(mean), 2) ** 2).sum())  # of white noise
+    passed = np.sqrt((savgol_coeffs(_window(mean), 2) ** 2).sum())  # of white noise
     known = sectors.profile_count > 0
     noise = np.full(len(mean), np.inf)
-    noise[known] = kept * np.sqrt(sectors.profile_noise[known] / sectors.profile_count[known])
+    noise[known] = passed * np.sqrt(sectors.profile_noise[known] / sectors.profile_count[known])
     if not np.ptp(smooth) > SIGNIFICANT * np.median(noise):
         raise InputError("rings: none detected; expected at least 2")
     places, found = find_peaks(smooth, prominence=PROMINENT * np.ptp(smooth))
@@ -150,12 +150,12 @@ def _change(shift: np.ndarray, middle: np.ndarray, angle: np.ndarray, free: bool
     rows = np.hstack([piece[:, None] == np.arange(len(middle)), columns]).astype(float)
     scale = np.abs(rows).max(0)
     rows /= np.where(scale > 0, scale, 1)
-    kept = np.ones(len(value), bool)
+    used = np.ones(len(value), bool)
     for _ in range(10):
-        found = np.linalg.lstsq(rows[kept], value[kept], rcond=1e-9)[0]
+        found = np.linalg.lstsq(rows[used], value[used], rcond=1e-9)[0]
         off = value - rows @ found
         # dust and reflections: beyond 4 standard deviations, these from the median
-        kept = np.abs(off) <= 4 * 1.4826 * np.median(np.abs(off[kept])) + 1e-9
+        used = np.abs(off) <= 4 * 1.4826 * np.median(np.abs(off[used])) + 1e-9
     change = found[-6:] / np.where(scale > 0, scale, 1)[-6:]
     return np.where(scale[-6:] > 0, change, 0.0)
 

@@ -345,8 +345,8 @@ def _law(fit: CurveFit) -> _Law:
     usual = 1 / np.diag(fit.model_covariance)
     if freedom > 0:
         misfit = math.sqrt(usual @ off**2 / usual.sum() * len(off) / freedom) / spacing
-        rest = np.eye(len(off)) - rows @ gain
-        expected = np.trace(weight @ rest @ fit.square_covariance @ rest.T)
+        residual_of = np.eye(len(off)) - rows @ gain
+        expected = np.trace(weight @ residual_of @ fit.square_covariance @ residual_of.T)
         excess = float(off @ weight @ off / expected)
         if excess > chi2.ppf(0.99, freedom) / freedom:
             covariance = covariance * excess

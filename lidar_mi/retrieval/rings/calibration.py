@@ -1,4 +1,4 @@
-"""What frames of a known line say of an instrument: kept in a file, given to the ring fit."""
+"""An instrument as frames of a known line show it: stored in a file, given to the ring fit."""
 
 import json
 import math

@@ -166,7 +166,7 @@ class _State:
 class _Fit(_State):
     """The instrument after a fit.
 
-    ``covariance`` is that of what all frames share, by ``names``; ``speed_by_shared`` and
+    ``covariance`` is that of what all frames have in common, by ``names``; ``speed_by_shared`` and
     ``speed_variance`` are the frames' own speeds' dependence on it and their own variances.
     """
 
@@ -222,15 +222,15 @@ def _fitted(
         by_shared = torch.linalg.solve(own, mixed)
         own_step = torch.linalg.solve(own, score[:, :few, None])[:, :, 0]
         total = (fisher[:, few:, few:] - mixed.transpose(1, 2) @ by_shared).sum(0)
-        rest = (score[:, few:] - torch.einsum("bls,bl->bs", mixed, own_step)).sum(0)
+        reduced = (score[:, few:] - torch.einsum("bls,bl->bs", mixed, own_step)).sum(0)
         for k, name in enumerate(shared):
             if name in INSTRUMENT:
                 information = tolerances[name] ** -2
                 total[k, k] += information
-                rest[k] -= state.departure[name] * information
+                reduced[k] -= state.departure[name] * information
         # the prior makes the matrix regular: frames of few rings do not determine all seven
         covariance = torch.linalg.inv(total)
-        step = covariance @ rest
+        step = covariance @ reduced
         close = bool((step.abs() <= _CLOSE * covariance.diagonal().sqrt()).all())
         change = {
             name: max(-_LONGEST.get(name, math.inf), min(value, _LONGEST.get(name, math.inf)))
@@ -322,6 +322,7 @@ def _calibration(
     # the frames' mean speed depends on the shared parameters: v = v_0 - g . shared
     slope = -state.speed_by_shared.mean(0).numpy()
     zero = float(slope @ covariance @ slope + own_variance.sum() / count**2)
+    # what the speeds scatter by beyond their own errors
     drift = math.sqrt(max(0.0, speed.var(ddof=1) - own_variance.mean()))
     places = [names.index(name) for name in INSTRUMENT]
     systematic = np.empty((1 + len(INSTRUMENT),) * 2)

@@ -151,8 +151,8 @@ def annular_sectors(
             "more"
         )
     r2 = x**2 + y**2
-    turn = (torch.atan2(y, x) / (2 * torch.pi) + 0.5) * sectors
-    label = (r2 / step).long() * sectors + turn.long().clamp(max=sectors - 1)
+    azimuth = (torch.atan2(y, x) / (2 * torch.pi) + 0.5) * sectors
+    label = (r2 / step).long() * sectors + azimuth.long().clamp(max=sectors - 1)
     # numbered in the order of the labels; pixels that do not count come last
     used = torch.zeros(int(label.max()) + 1, dtype=torch.long, device=label.device)
     used[label[weight > 0]] = 1

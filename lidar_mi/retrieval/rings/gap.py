@@ -68,6 +68,7 @@ class Gap(Tabular):
                     zip(self.group[:LISTED], self.group_std[:LISTED], strict=True), 1
                 )
             ]
+        # the best ones, in the order of their gaps
         best = np.sort(np.argsort(self.chi_square, kind="stable")[:LISTED])
         single = [
             (
@@ -152,6 +153,7 @@ def gap_of_covariance(
         low, high = 0.0, LARGEST
     else:
         low, high = max(nominal - tolerance, 0.0), nominal + tolerance
+    # orders per m of gap
     per_gap = 2 * refractive_index / length
     # a gap at either end may come from fractions that err
     reach = 5 * std[0] / per_gap[0]
@@ -160,14 +162,17 @@ def gap_of_covariance(
         math.floor((high + reach) * per_gap[0] - e[0]) + 1,
     )
     coarse = (first + e[0]) / per_gap[0]
+    # whole orders of the other lines that are nearest at this gap
     order = np.round(coarse[:, None] * per_gap - e)
     order[:, 0] = first
     weight = np.linalg.inv(covariance)
+    # generalised least squares of the one unknown, the gap
     spread = 1 / math.sqrt(float(per_gap @ weight @ per_gap))
     gap = (order + e) @ weight @ per_gap * spread**2
     off = gap[:, None] * per_gap - order - e
     misfit = np.einsum("gi,ij,gj->g", off, weight, off)
     inside = (gap >= low) & (gap <= high) & (order >= 0).all(1)
+    # the gap is fitted: one degree of freedom less than lines
     agrees = inside & (misfit <= chi2.ppf(AGREES, len(length) - 1))
     if not agrees.any():
         best = gap[inside][misfit[inside].argmin()] if inside.any() else None
@@ -200,6 +205,7 @@ def _mean(gap: np.ndarray, misfit: np.ndarray, spread: float) -> tuple[float, fl
     weight = np.exp(-(misfit - misfit.min()) / 2)
     weight /= weight.sum()
     mean = weight @ gap
+    # variance between the candidates and that of each
     return mean, math.sqrt(weight @ (gap - mean) ** 2 + spread**2)
 
 
@@ -288,6 +294,7 @@ def gap_from_lines(
     sorted_heights = rings.height[by_height]
     orders = [by_height]
     if (sorted_heights[1:] > 0.8 * sorted_heights[:-1]).any():
+        # lines of about one height may be either way round
         orders.append(by_height[::-1])
     found, refused = [], None
     for one in orders:
@@ -321,7 +328,9 @@ def fractions_of(rings: Rings, wavelength: np.ndarray, line: np.ndarray) -> np.n
     column = np.argsort(line)[rings.line]
     ratio = (wavelength / wavelength[0])[column]
     rows = np.column_stack([rings.order, column[:, None] == np.arange(len(line))])
+    # the error of r^2 is 2 r times that of r
     weight = 1 / (2 * rings.radius * rings.radius_std)
+    # r^2 / ratio = spacing * order + spacing * fraction, linear in both products
     known = np.linalg.lstsq(rows * (ratio * weight)[:, None], rings.radius**2 * weight, rcond=None)[
         0
     ]

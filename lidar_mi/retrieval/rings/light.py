@@ -81,8 +81,8 @@ def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
         model, linear, std = _fitted(value, columns, count * used)
         residual = np.where(some, value - model, 0.0) * np.sqrt(count)
         # the profile follows a sector that is alone in an annulus
-        rest = 1 - fraction
-        noise = _noise(residual / np.sqrt(np.maximum(rest, 0.5)), used & (rest >= 0.5))
+        remaining = 1 - fraction
+        noise = _noise(residual / np.sqrt(np.maximum(remaining, 0.5)), used & (remaining >= 0.5))
         # on a crest there is more, as of photons
         typical = _median(np.where(some & visible[:, None], np.abs(residual), np.nan))
         scale = np.maximum(noise, (1.4826 * typical) ** 2)

@@ -244,6 +244,7 @@ def _joined(parts: Sequence[RingFit]) -> RingFit:
 
 
 def _systematic(sensitivity: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    # rounding may leave less than 0
     return torch.einsum("bi,ij,bj->b", sensitivity, covariance, sensitivity).clamp(min=0).sqrt()
 
 
@@ -288,6 +289,7 @@ def _fit(images: torch.Tensor, task: _Task, number: int, method: str) -> RingFit
 
 def _fit_together(images: torch.Tensor, task: _Task, number: int, method: str) -> RingFit:
     """Cells are common, about the middle of the centres; an image far from it gets its own."""
+    # the mean image has the least noise
     mean = images.mean(0, dtype=torch.float32)
     centre = task.centre or gradient_centre(mean, task.response)
     inside(*centre, task.model.shape, f"images[{number}]: centre")
@@ -295,6 +297,7 @@ def _fit_together(images: torch.Tensor, task: _Task, number: int, method: str) -
     for _ in range(MOVES):
         fit = _fit_about(centre, images, task, number, method)
         away = (fit.of("x") - centre[0], fit.of("y") - centre[1])
+        # single images that are off must not move the cells of all
         middle = [float(part.median()) for part in away]
         if not task.moves or math.hypot(*middle) <= near:
             break
@@ -362,12 +365,14 @@ def _fit_about(
         end = robust_scoring(blocks, every, end.parameters, model, noise, task.free, number)
     names, chi_square = task.free, end.chi_square
     std = torch.zeros_like(end.parameters)
+    # chi_square of so many degrees of freedom scatters by sqrt(2 / freedom)
     grown = torch.where(
         chi_square > 1 + MISFIT * math.sqrt(2 / end.freedom), chi_square.sqrt(), 1.0
     )
     columns = [PARAMETERS.index(name) for name in names]
     std[:, columns] = standard_deviations(end.fisher) * grown[:, None]
     values = end.parameters.clone()
+    # fitted centres are relative to that of the cells
     for name, shift in zip(("x", "y"), centre, strict=True):
         values[:, PARAMETERS.index(name)] += shift
     size = 1 + len(INSTRUMENT)
@@ -386,7 +391,7 @@ def _start(
     cells = waves.cells
     fraction = orders(model, cells.r2)[1]
     # the phase of the first harmonic is the fraction of the order, for any finesse
-    turns = torch.stack(
+    basis = torch.stack(
         [
             torch.ones_like(fraction),
             torch.cos(2 * torch.pi * fraction),
@@ -394,8 +399,8 @@ def _start(
         ]
     )
     weight = cells.count
-    inverse = torch.linalg.pinv((turns * weight) @ turns.T, hermitian=True)
-    found = (means * weight) @ turns.T @ inverse
+    inverse = torch.linalg.pinv((basis * weight) @ basis.T, hermitian=True)
+    found = (means * weight) @ basis.T @ inverse
     # the noise at the image's mean
     spread = noise.variance(found[:, :1].clamp(min=0), found[:, :1].clamp(min=0))
     size = found[:, 1:].norm(dim=1)
@@ -411,6 +416,7 @@ def _start(
     # level Re(2 A_1 exp(2 pi i (m + s v))) = a cos + b sin: A_1 exp(2 pi i s v) ~ a - i b
     wave = torch.complex(found[:, 1], -found[:, 2])
     v = torch.angle(wave / first) / (2 * torch.pi) * model.velocity_range
+    # no higher than the mean, so that the background is not negative
     level = torch.minimum(size / (2 * abs(first)), found[:, 0])
     for name, value in (("v_los", v), ("level", level), ("background", found[:, 0] - level)):
         parameters[:, PARAMETERS.index(name)] = value
@@ -453,5 +459,6 @@ def _rings(
     sums = mean.new_zeros(2, len(mean), int(order.max()) + 1)
     strength = sums[0].scatter_add_(1, order, weight * ring**2)
     misfit = sums[1].scatter_add_(1, order, weight * ring * (means - mean))
+    # each ring by linear regression about the fitted one
     amplitude = 1 + misfit / strength
     return ((amplitude > 0.5) & (amplitude * strength.sqrt() > SIGNIFICANT)).sum(1)

@@ -77,8 +77,8 @@ class MatchedScore:
         And the variance (names,) by the priors.
         """
         whole = self.inverse @ self.score
-        kept = self.inverse**2 @ prior_information(self.model, self.names, whole.device)
-        return whole.float(), (whole**2).float(), kept
+        by_priors = self.inverse**2 @ prior_information(self.model, self.names, whole.device)
+        return whole.float(), (whole**2).float(), by_priors
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ def _read(means: torch.Tensor, score: MatchedScore) -> tuple[torch.Tensor, ...]:
     information = prior_information(model, names, means.device)
     middle = model.start(means.device)[:, columns]
     added = torch.tensor([name in _ADDED for name in names], device=means.device)
-    influence, squares, kept = score.influence
+    influence, squares, by_priors = score.influence
     freedom = means.shape[1] - len(names)
     std, chi_square = at.new_zeros(len(at), len(names)), at.new_zeros(len(at))
     far = torch.arange(len(at), device=at.device)
@@ -233,7 +233,7 @@ def _read(means: torch.Tensor, score: MatchedScore) -> tuple[torch.Tensor, ...]:
         variance = cell_variance(mean.float(), here.float(), score.noise) / score.single.cells.count
         brighter = (here[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
         grown = torch.where(added, 1.0, brighter)
-        std[far] = ((variance @ squares.T).double() + kept).sqrt() / grown
+        std[far] = ((variance @ squares.T).double() + by_priors).sqrt() / grown
         chi_square[far] = (misfit**2 / variance).sum(1).double() / freedom
         total = (misfit @ influence.T).double()
         total += (middle - here[:, columns]) * information @ score.inverse

@@ -95,8 +95,10 @@ def ring_waves(model: RingModel, cells: Cells, derivatives: bool = False) -> Wav
     n = torch.arange(1, model.count + 1, dtype=torch.float64, device=r2.device)[:, None]
     # z^2 of the blur's disc, over its squared radius: |grad m| = |dm/dr2| 2 r
     steep = (4 * math.pi * n * by_r2) ** 2 * r2
+    # mean of a wave over a spread of its phase, exp(-(2 pi n)^2 var(m) / 2), 2 for n and -n
     size = 2 * torch.exp(-2 * (math.pi * n * by_r2) ** 2 * variance)
     wave = torch.polar(torch.ones_like(order), 2 * math.pi * order)
+    # powers of the first harmonic: one sine and cosine for all
     wave = torch.cumprod(wave.expand(model.count, -1), 0)
     waves, by_blur = wave * size, wave[:0]
     if model.blur != 0 or derivatives:
@@ -177,6 +179,7 @@ def mean_and_jacobian(
     lean = _lean(model, torch.addcmul(r2, falloff, waves.variance, value=-1 / area))
     centre = model.order_at_centre
     moved = torch.add(centre % 1 - waves.order, lean, alpha=centre)
+    # the speed itself turns all waves alike, below: here is how that falls off with the angle
     moved.addcmul_(v / model.velocity_range, lean)
     amplitudes, by = model.amplitudes(parameters)
     n = torch.arange(1, amplitudes.shape[1] + 1, dtype=torch.float64, device=v.device)
@@ -219,8 +222,10 @@ def mean_and_jacobian(
         elif name in BACKGROUND:
             row[:] = cells.terms[:, model.smooth.index(name)]
         elif name == "focal_length":
+            # of the relative length: the order depends on r^2 / f^2
             row[:] = -2 * by_r2 * r2
         elif name == "blur":
+            # the blur also adds its half to the mean r^2
             row[:] = bright * _product(amplitudes * turned, waves.by_blur) + by_r2 / 2
         else:
             changes = by_tilt_and_distortion(model.geometry, cells.centre, cells.x, cells.y)
@@ -262,6 +267,7 @@ def parameter_vector(
                 f"{first:g} to {last:g} K"
             )
         vector[0, PARAMETERS.index("temperature")] = temperature
+    # the mean is linear in the level, which is 1 at the start
     vector[0, PARAMETERS.index("level")] = photons / float(mean_image(model, vector, centre).sum())
     vector[0, PARAMETERS.index("background")] = background
     return vector

@@ -432,10 +432,10 @@ def find_pattern(
         return more / power
 
     for chosen in tried:
-        rest = {m: gain(chosen, m) for m in tried if m > chosen}
-        if max(rest.values(), default=0.0) < MATERIAL:
+        gains = {m: gain(chosen, m) for m in tried if m > chosen}
+        if max(gains.values(), default=0.0) < MATERIAL:
             break
-    doubt = [m for m, g in rest.items() if g > MATERIAL / DOUBTFUL]
+    doubt = [m for m, g in gains.items() if g > MATERIAL / DOUBTFUL]
     doubts = ""
     if doubt:
         doubts = f"the spacing may be {doubt[0] / chosen:.3g} times as large, with further lines"

@@ -96,7 +96,7 @@ def fit_all(
         inside(*geometry.centre, image.shape)
         if number == ROUNDS - 1 or (number and (np.abs(change) <= 0.05 * change_std + 1e-9).all()):
             break
-        # a ring that its noise would carry off its line stays where the pattern has it
+        # a ring that its noise would move off its line stays where the pattern has it
         firm = system.parts(std)[1] < 0.1 * pattern.width
         deviation = {
             key: float(deviation.get(key, 0.0) + moved) if held else 0.0

@@ -80,6 +80,7 @@ def parameter_covariance(
     inverse = _inverse(found)
     covariance = (inverse @ spread @ inverse)[:10, :10]
     attenuation = _attenuation(found)
+    # a bias of unknown size: fully correlated between the parameters
     covariance = covariance + torch.outer(attenuation, attenuation)
     if not found.converged:
         remaining = _remaining_step(found)
@@ -187,6 +188,7 @@ def _remaining_step(found: Solution) -> torch.Tensor:
 def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
     """Whether the remaining step is more than the other standard error of any parameter."""
     square = _remaining_step(found).cpu().numpy() ** 2
+    # the remaining step is part of the covariance: it is compared with the rest
     return not (square < np.diagonal(covariance) - square).all()
 
 
@@ -248,6 +250,6 @@ def _slope(misfit: torch.Tensor, change: torch.Tensor, weight: torch.Tensor) -> 
     if not float(square) > 0:
         return 0.0
     slope = float((weight * change * misfit).sum() / square)
-    rest = misfit - slope * change
-    error = float((weight * change * rest).square().sum().sqrt() / square)
+    residual = misfit - slope * change
+    error = float((weight * change * residual).square().sum().sqrt() / square)
     return slope if slope > _SIGNIFICANT * error else 0.0

@@ -152,6 +152,7 @@ def fit_vortices(
     _check_start(start, profile)
     pixels = [on_device(image, device) for image in stack]
     with threads_for(image1.size):
+        # smaller images hold no search region, in which motion around structure is found
         if min(image1.shape) >= Windows.search:
             pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).masked(pixels)
         first, second = pixels
@@ -311,6 +312,7 @@ def _searched(make: Builder, limits: Limits) -> tuple[Solution | None, bool]:
     observed = condensed(white.at_least(float(images.scatter.mean())).differences())
     starts = starting_points(observed, STARTS, make.profile)
     others = _best(images, starts, limits, variance)
+    # both are fits to the same images, so that costs compare
     return (others if others and others.cost < found.cost else found), True
 
 
@@ -355,6 +357,7 @@ def _iterated(found: Solution, make: Builder, limits: Limits) -> VortexPairFit:
     """The fit from that to blurred images, by steps until it converges: far starts, no noise."""
     white = make(*_LEVELS[2])
     best, images = _refitted(white, found.parameters, 0.0, limits)
+    # twice, as the filter follows from the residuals and the residuals from the filter
     for _ in range(2):
         error = model_error_of(best, _NOISE_LAGS, changes=True)
         images = make.with_change(white, images, best.misfit, error.variance)
@@ -369,7 +372,9 @@ def _checked(
     make: Builder, best: Solution, images: Images, misfit: Misfit, error: ModelError
 ) -> VortexPairFit:
     """The pair of a solution in images, with its errors; `misfit` is that without whitening."""
+    # half of the slopes of noise and change are in those of the mean: the misfit curves less
     q = curvature(best, make.spacing)
+    # parameters follow a departure: they err by all of it, not by what they have left
     departure = model_error_of(best, _NOISE_LAGS, changes=True, before=error)
     covariance = parameter_covariance(best, error, departure, 1 / q**2)
     valid = misfit.valid
@@ -390,6 +395,7 @@ def _checked(
         mean_length(error) * (make.spacing[0] * make.spacing[1]) ** 0.5,
         make.z,
         make.y,
+        # a roll rate of 1 rad/s that is not known moves the images by this
         change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
         None if make.telescope is None else _change_by_slopes(make, make.telescope, best, images),
     )

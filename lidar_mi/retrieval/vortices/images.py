@@ -153,6 +153,7 @@ class Images:
         # filtered after the difference: shear and a filter of the images do not commute
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
+        # a mean wind displaces the air by itself times dt
         slope = jacobian[8:10] / self.dt
         misfit = Misfit(residual, jacobian, slope, valid, self.variance, self.scatter)
         return self.whitened(misfit)
@@ -220,6 +221,7 @@ class Images:
 
     def _near_cores(self, parameters: torch.Tensor) -> tuple[slice, slice]:
         """Rows and columns within some core radii of one of the vortices or between them."""
+        # core radii are fitted by their logarithms
         reach = _NEAR_CORES * float(parameters[[1, 5]].exp().max())
         box = []
         for places, axis in ((parameters[[3, 7]], 1), (parameters[[2, 6]], 0)):
@@ -243,6 +245,7 @@ class Images:
         """A misfit of the images without the whitening filter, after it if there is one."""
         if self.whitening is None:
             return misfit
+        # a filter of the images would not commute with their shear
         jacobian = self.whitening.filtered(misfit.jacobian * misfit.valid)
         residual = self.whitening.filtered(misfit.residual)
         slope = jacobian[8:10] / self.dt
@@ -355,7 +358,8 @@ class Builder:
             return self._splines(self.pair, self.filter(self.level))
         first, second = self.of_first, self._splines(self.pair[1:], self.of_first.filter)
         return first._replace(
-            sharp=first.sharp.beside(second.sharp), whole=first.whole.beside(second.whole)
+            sharp=first.sharp.stacked_with(second.sharp),
+            whole=first.whole.stacked_with(second.whole),
         )
 
     def _splines(self, images: torch.Tensor, chosen: Filter) -> Splines:
@@ -364,7 +368,7 @@ class Builder:
         return Splines(sharp, whole, chosen, self.spectrum)
 
     def filter(self, noise: float | None, mismatch: torch.Tensor | None = None) -> Filter:
-        """The filter of both images, as `warping.band_limited` chooses it."""
+        """The filter of both images, as `spline.band_limited` chooses it."""
         checked_noise(noise)
         return best_filter(self.spectrum, FilterSettings(), noise, mismatch)
 
@@ -386,13 +390,16 @@ class Builder:
             size = 2 * int(np.ceil(4 * blur)) + 1
             rows, columns = (min(size, 2 * n - 1) for n in self.pair.shape[1:])
             soft = gaussian_blur2d(self.pair[None], (rows, columns), (blur, blur), "replicate")[0]
+            # the blur has removed what a filter against noise would remove
             spline = band_limited(list(soft), 0.0)[0]
             spline = spline._replace(coefficients=spline.coefficients.to(self.pair))
+            # sum of the squared weights of a Gaussian
             passed = 1 / (4 * np.pi * blur**2)
         places = [
             torch.as_tensor(axis[step // 2 :: step]).to(self.pair) for axis in (self.z, self.y)
         ]
         vertical, lateral = torch.meshgrid(*places, indexing="ij")
+        # of the difference of two images
         variance = torch.full_like(lateral, 2 * noise**2)
         if self.map is not None:
             # the filter spreads noise over a few pixels, and with few samples one pixel's estimate
@@ -442,9 +449,9 @@ class Builder:
         gain = white.spline.gain * (1.0 if images.whitening is None else images.whitening.gain)
         before = images.spline._replace(gain=gain)
         # places of more noise count less, so that the spectrum is that of one field
-        rest = valid * misfit.residual / shape.sqrt() / 2
-        # the other image's rest is the same with the other sign
-        density = mismatch(before, rest[None], number=2)
+        reduced = valid * misfit.residual / shape.sqrt() / 2
+        # the other image's residual is the same with the other sign
+        density = mismatch(before, reduced[None], number=2)
         density = density.clamp(min=max(least, fraction * level) / 2)
         level = max(least, level)
         chosen = self.filter((level / 2) ** 0.5, density)

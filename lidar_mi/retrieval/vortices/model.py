@@ -137,6 +137,7 @@ def sensitivity(about: Sequence[Rotation], along: torch.Tensor) -> torch.Tensor:
         first = 4 * number
         across = along_z * one.dy - along_y * one.dz
         columns[first] = one.unit * across
+        # the parameter is the logarithm of the core radius
         columns[first + 1] = -(2 * one.omega + one.omega_slope * one.square) * across
         columns[first + 2] = -(one.omega_slope * one.dy * across + one.omega * along_z)
         columns[first + 3] = -(one.omega_slope * one.dz * across - one.omega * along_y)
@@ -232,7 +233,7 @@ def _angular_speed(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor) -> tor
 
 
 def core_turns(theta: torch.Tensor, time: float, profile: Profile) -> float:
-    """Turns of the air at the core radius in a time in s, of the vortex that rotates faster."""
+    """Revolutions of the air at the core radius in a time in s, of the faster vortex."""
     value, _ = angular_velocity(torch.ones_like(theta[:1]), profile)
     fastest = max(float(theta[first].abs() * (-2 * theta[first + 1]).exp()) for first in (0, 4)) / (
         2 * torch.pi

@@ -73,7 +73,7 @@ class Lags:
     like : torch.Tensor
         Of the type and device to work in.
     reach : float
-        Lags (steps of the grid) that do not wrap. Left out, all of the grid.
+        Lags (steps of the grid) that do not wrap. Default: all of the grid.
     """
 
     shape: tuple[int, int]
@@ -128,7 +128,9 @@ class Lags:
 
     def quadratic(self, fields: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
         """Matrix sum_a sum_x,x' f_ia(x) C(x - x') f_ja(x') of fields (i, a, z, y), C by lags."""
+        # a covariance has no negative power but by rounding and by its end at the longest lag
         spectrum = torch.fft.rfft2(covariance).real.clamp(min=0)
+        # columns of a real transform stand for both signs, but for the first and the last
         double = torch.full_like(spectrum, 2.0)
         double[:, 0] = 1
         if self.sizes[1] % 2 == 0:
@@ -177,6 +179,7 @@ def model_error(
     """
     lags = lags_used(force)
     observed = lags.autocorrelation(force, (1.0, 1.0))
+    # tr A(x) A(x + h): the mixed element counts twice
     unit = lags.autocorrelation(stiffness, (1.0, 2.0, 1.0))
     lengths = _lengths(lags.shape)
     used = lags.between(shortest)
@@ -343,6 +346,7 @@ def of_change(residual: torch.Tensor, slope: torch.Tensor, valid: torch.Tensor) 
     valid : torch.Tensor of bool, shape (z, y)
     """
     lags = lags_used(residual)
+    # pairs of pixels at every lag
     number = lags.autocorrelation([valid.to(residual)], (1.0,)).clamp(min=1)
     correlation = lags.autocorrelation([valid * residual], (1.0,)) / number
     return correlation * lags.autocorrelation(slope, (1.0, 1.0))

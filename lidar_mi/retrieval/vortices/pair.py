@@ -140,8 +140,8 @@ class VortexPairFit(Tabular):
         spread = np.sqrt(np.einsum("ij,jk,ik->i", slope, self.covariance, slope))
         turned = np.zeros(len(spread)) if self.turned is None else slope @ self.turned
         return {
-            name: Quantity(float(value), float(error), *MEANING[name], float(turn))
-            for (name, value), error, turn in zip(values.items(), spread, turned, strict=True)
+            name: Quantity(float(value), float(error), *MEANING[name], float(rotated))
+            for (name, value), error, rotated in zip(values.items(), spread, turned, strict=True)
         }
 
     def with_common_error(

@@ -127,8 +127,10 @@ def fit(
             step = _step(normal, force, damping)
             if step is not None and allowed(parameters, step):
                 tried = evaluate(parameters + step)
+                # in squared standard errors; a damped step is short without being near
                 if float(step @ normal @ step) < tolerance and damping < 1:
                     return _solution(parameters + step, tried, flow_variance, True)
+                # of the same residuals: others would change the cost by themselves
                 both = misfit.valid & tried.valid
                 before, after = (
                     float((weight * m.residual.square())[both].sum()) for m in (misfit, tried)
@@ -163,6 +165,7 @@ def _step(normal: torch.Tensor, force: torch.Tensor, damping: float) -> torch.Te
     diagonal = normal.diagonal()
     if not bool((diagonal > 0).all()):
         return None
+    # in proportion to the diagonal, as every parameter has a unit of its own (Marquardt)
     root, info = torch.linalg.cholesky_ex(normal + damping * torch.diag(diagonal))
     if int(info):
         return None

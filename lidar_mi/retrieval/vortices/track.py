@@ -254,6 +254,7 @@ class Track:
         state, covariance, _, _ = _predicted(
             state, covariance, x - slab.x, dt, wandering, self.profile
         )
+        # a straight pair has the same induction in all slabs
         by_curvature = self._inductions[:, nearest] - self._inductions.mean(1)
         covariance = self.inflation * covariance + unsteady(state, dt, wandering, by_curvature)
         return replace(
@@ -287,6 +288,7 @@ class Track:
     @cached_property
     def _smoothed(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """State and covariance of every slab, given all fits."""
+        # from the newest backwards: that one has no later fits
         found = [(self.slabs[-1].state, self.slabs[-1].covariance)]
         for slab, later in zip(self.slabs[-2::-1], self.slabs[:0:-1], strict=True):
             found.append(
@@ -304,6 +306,7 @@ class Track:
     def _inductions(self) -> np.ndarray:
         """Drift without the mean wind in the smoothed slabs, (2, number), m/s."""
         states = np.array([state for state, _ in self._smoothed]).T
+        # the rest of the drift is mutual induction
         states[MEAN_WIND] = 0
         return oblique_drift(torch.as_tensor(states), self.profile).numpy()
 
@@ -338,6 +341,7 @@ def first_track(
             "port is positive, starboard negative"
         )
     settings = settings or TrackSettings()
+    # one plane shows nothing of the slopes: they have their prior
     state = np.concatenate([pair.parameters, np.zeros(len(SLOPES))])
     covariance = np.zeros((len(state), len(state)))
     covariance[:MEASURED, :MEASURED] = pair.covariance
@@ -345,6 +349,7 @@ def first_track(
     covariance[MEASURED:, MEASURED:] = settings.unlike_slope**2 * np.eye(
         len(SLOPES)
     ) + settings.slope**2 * np.kron(np.ones((2, 2)), np.eye(2))
+    # there is no slab before that it could have come from
     nothing = np.zeros_like(covariance)
     slab = Slab(float(x), float(time), state, covariance, state, nothing, nothing)
     return Track((slab,), pair, settings)
@@ -388,6 +393,7 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
     predicted, square, used = state, None, None
     if fit is not None:
         measured = fit.parameters, fit.covariance
+        # also of what is rejected below: `Track.inflation` counts it
         square = kalman.innovation(state, covariance, *measured)
         if _has_sense(fit) and square <= chi2.ppf(track.settings.gate, MEASURED):
             used = fit
@@ -427,6 +433,7 @@ def _is_fit(pair: VortexPairFit) -> bool:
     if not np.isfinite(pair.covariance).all():
         return False
     try:
+        # normalised innovations take a positive definite covariance
         np.linalg.cholesky(pair.covariance)
     except np.linalg.LinAlgError:
         return False

@@ -54,9 +54,9 @@ def wind_bound(
     root = covariance[:2, rows][:, :, columns].sqrt()
     bound = torch.where(non_finite(pair, frame), torch.nan, root).numpy()
     tau = checked_times(times, [image1, image2], dt)
-    apart = vector_times(tau, dt, frame, np.zeros((2, *frame.count)), False).difference
+    interval = vector_times(tau, dt, frame, np.zeros((2, *frame.count)), False).difference
     found = {}
     for name, values, step in zip("wv", bound, spacing(image1), strict=True):
         about = f"Cramer-Rao bound of {name} from one template", "m s-1"
-        found[f"{name}_bound"] = field(("z", "y"), values * step / apart, *about)
+        found[f"{name}_bound"] = field(("z", "y"), values * step / interval, *about)
     return xr.Dataset(found, centres(image1, frame, "template"))

@@ -214,7 +214,7 @@ def _without_pattern(
     if found.covariance is None:
         return found, Standing(), 0
     pattern = standing(images[:2], found, windows)
-    # parameters beside the vectors would stay biased
+    # parameters that are fitted in addition to the vectors would stay biased
     if pattern.spoils or (pattern.fraction and found.quantities):
         return found, pattern, Flag.AT_REST.value
     return pattern.corrected(found), pattern, 0
@@ -244,6 +244,6 @@ def _flags_among_neighbours(
 
 def _flags_of_unrelated(clean: CleanImages, given: PairInput, method: Method) -> torch.Tensor:
     """Flags where the images show different air, of a fitted field where they do everywhere."""
-    apart = unrelated(clean.filled[:2], given.windows, method.reach > 1, given.noise)
-    apart = apart if method.local else apart.all().expand_as(apart)
-    return (Flag.UNRELATED * apart).to(torch.int16)
+    different = unrelated(clean.filled[:2], given.windows, method.reach > 1, given.noise)
+    different = different if method.local else different.all().expand_as(different)
+    return (Flag.UNRELATED * different).to(torch.int16)

@@ -167,7 +167,7 @@ def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
             f"{count - 1}"
         )
     whole = np.cumsum([0.0, *(positive("dt", step) for step in steps)])
-    # sums of steps such as 0.1 s carry no digits of rounding
+    # sums of steps such as 0.1 s have no digits of rounding
     return [float(f"{time:.12g}") for time in whole]
 
 

@@ -1,4 +1,4 @@
-"""Images of one instant from scans that take time: every beam's value carried along by the air."""
+"""Images of one instant from scans that take time: every beam's value advected by the air."""
 
 from collections.abc import Callable, Sequence
 
@@ -36,12 +36,12 @@ def synchronised(
 
     A curve that crosses itself, such as a Lissajous figure, returns to the neighbourhood of a beam
     after up to the whole scan, and the air has moved by then: values of different air would be
-    averaged. Beams are therefore carried with the air to the mean time m of all scans' beams,
+    averaged. Beams are therefore advected with the air to the mean time m of all scans' beams,
 
         place(m) = place(t) - integral of the wind from m to t along the path (midpoint rule),
 
     and resampled from there. The wind is that of `multipass` between two images in succession,
-    resampled as they are at first and then from carried beams, twice. An error of this wind counts
+    resampled as they are at first and then from advected beams, twice. An error of this wind counts
     with the time of the beams over dt: 5 % of 12 m/s and 45 ms are 3 cm.
 
     Parameters
@@ -57,7 +57,7 @@ def synchronised(
     Returns
     -------
     list of xr.Dataset
-        On their nodes. ``beam_time`` is m all over where beams were carried.
+        On their nodes. ``beam_time`` is m all over where beams were advected.
     """
     if not any(mixes_times(scan, min(np.abs(steps))) for scan in scans):
         return [on_nodes(scan) for scan in scans]
@@ -68,12 +68,12 @@ def synchronised(
     for _ in range(_ROUNDS - 1):
         winds = _winds(images, steps, image)
         images = [
-            _at_time(0.0, on_nodes(carried(scan, wind), errors=False))
+            _at_time(0.0, on_nodes(advected(scan, wind), errors=False))
             for scan, wind in zip(needed, winds, strict=True)
         ]
     winds = _winds(images, steps, image)
     return [
-        _at_time(middle, on_nodes(carried(scan, wind)))
+        _at_time(middle, on_nodes(advected(scan, wind)))
         for scan, wind in zip(scans, winds, strict=True)
     ]
 
@@ -81,8 +81,9 @@ def synchronised(
 def mixes_times(scan: xr.Dataset, dt: float) -> bool:
     """Whether beams next to each other look at the air at very different times.
 
-    Times that are linear in place, as in a raster, are resampled exactly. Of nine beams, what a
-    plane leaves of their times is compared with dt: more than 1 % in the median.
+    Times that are linear in place, as in a raster, are resampled exactly. The
+    residuals of the times of nine beams about a plane are compared with dt: more than 1 % in the
+    median.
     """
     if "beam_time" not in scan or scan.attrs.get("frozen_air"):
         return False
@@ -94,11 +95,11 @@ def mixes_times(scan: xr.Dataset, dt: float) -> bool:
     around, times = places[near], time[near]
     around, times = around - around.mean(1, keepdims=True), times - times.mean(1, keepdims=True)
     slope = np.linalg.pinv(around) @ times[..., None]
-    left = times - (around @ slope)[..., 0]
-    return float(np.median(left.std(1))) > _MIXED * dt
+    residual = times - (around @ slope)[..., 0]
+    return float(np.median(residual.std(1))) > _MIXED * dt
 
 
-def carried(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
+def advected(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
     """The scan with its beams at the places of their air at the time 0.
 
     Parameters

@@ -62,7 +62,7 @@ def retrieve_wind_volume(
     volume1, volume2 : xr.DataArray, dims (x, z, y)
         On one grid: coordinates in metres (`units` attribute), ascending and uniform, spacings may
         differ from axis to axis; positive in the mean. Brightness may differ by a factor and by a
-        decay along x. Non-finite voxels are left out.
+        decay along x. Non-finite voxels are masked.
     dt : float
         Time from volume to volume, s.
     method : {"correlation", "variational"}

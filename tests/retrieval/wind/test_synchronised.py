@@ -11,7 +11,7 @@ from lidar_mi.retrieval.images.common_grid import on_one_grid
 from lidar_mi.retrieval.images.gridding import on_nodes
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.synchronised import carried, mixes_times, synchronised
+from lidar_mi.retrieval.wind.synchronised import advected, mixes_times, synchronised
 from tests.support.flows import axes, data_array, plane_waves, texture
 
 DT, V, W = 0.1, 6.0, 12.0
@@ -111,7 +111,7 @@ def test_scans_that_mix_no_times_are_only_resampled():
 def test_beams_are_carried_along_circles(rate):
     """Rigid rotation turns a place by rate x time: the midpoint rule errs by (rate t)^3 / 6 r."""
     time, y, z = lissajous(0.09)
-    before = carried(scan(time, y, z, 0.0), lambda p: rate * np.stack([-p[..., 1], p[..., 0]], -1))
+    before = advected(scan(time, y, z, 0.0), lambda p: rate * np.stack([-p[..., 1], p[..., 0]], -1))
     turn, radius = -rate * time, np.hypot(y, z)
     expected = np.cos(turn) * y - np.sin(turn) * z, np.sin(turn) * y + np.cos(turn) * z
     limit = np.abs(turn) ** 3 / 6 * radius * 1.01 + 1e-12
