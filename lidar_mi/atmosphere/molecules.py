@@ -5,7 +5,7 @@ central Cabannes line and the rotational Raman lines around it (within about +-1
 which contain three quarters of the anisotropic part. The *Cabannes* line alone is what a
 narrow-band receiver (filter below about 0.3 nm) detects. Extinction always takes the whole band, as
 Raman-shifted light has left the laser's wavelength too. Vibrational Raman scattering (0.1 %) is
-left out. Water vapour is left out: below 1 % in the cross-section.
+neglected. Water vapour is neglected: below 1 % in the cross-section.
 """
 
 import math

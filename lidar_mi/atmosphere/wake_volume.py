@@ -31,7 +31,7 @@ def one_period(flow: xr.Dataset) -> xr.Dataset:
 
     The step from the last plane to the first, and the curvature there, are compared with those
     within the volume: where either is more than twice the largest inside, the volume is not
-    periodic. A last plane that repeats the first one is left out. A wake that is uniform
+    periodic. A last plane that repeats the first one is omitted. A wake that is uniform
     along its axis becomes a single plane.
 
     Parameters
@@ -81,7 +81,7 @@ class VolumeAlongPath:
     """A simulated wake, repeated along an axis that crosses the flight path.
 
     The state of one instant moves with ``drift`` and does not change: what the vortices do to each
-    other and to themselves in the seconds of an encounter beyond that is left out. Values are
+    other and to themselves in the seconds of an encounter beyond that is neglected. Values are
     interpolated by cubic splines, periodic along the axis. Outside of the volume the wind is that
     of two straight vortices at the mean places with the mean circulations, the extinction the
     background.

@@ -157,7 +157,7 @@ def _netcdf(path: Path) -> Iterator[Section]:
 
 
 def _span(low: float, high: float) -> str:
-    """Both ends with 4 digits, or with as many as tell them apart."""
+    """Both ends with 4 digits, or with as many as distinguish them."""
     for digits in range(4, 17):
         ends = f"{low:.{digits}g}", f"{high:.{digits}g}"
         if ends[0] != ends[1] or not low < high:

@@ -39,8 +39,8 @@ def export(
 
     Winds, volumes, both images, lines of sight and vortices, as far as the run has them; of a
     flight the aircraft's way in every flight, the vortices of its track, winds and images of the
-    slabs. Values, standard errors, flags and NaN are kept; places are x ahead, y to port, z up, m,
-    from the telescope at the first scan, of a flight from the start of its path.
+    slabs. Values, standard errors, flags and NaN are those of the run; places are x ahead, y to
+    port, z up, m, from the telescope at the first scan, of a flight from the start of its path.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ class Parameter(NamedTuple):
     optional : bool
         Whether it may be None: the stage does without.
     default : bool
-        Whether it may be left out.
+        Whether it may be omitted.
     marks : tuple
         `Only`, `But`, `Guard`.
     """
@@ -260,13 +260,13 @@ class Graph:
 
     def _existing(self, stages: Sequence[Stage]) -> list[Stage]:
         """Those that have all they cannot do without."""
-        left = [stage for stage in stages if stage.when(self.experiment)]
+        remaining = [stage for stage in stages if stage.when(self.experiment)]
         while True:
-            names = {stage.name for stage in left}
-            found = [stage for stage in left if self._is_possible(stage, names)]
-            if len(found) == len(left):
+            names = {stage.name for stage in remaining}
+            found = [stage for stage in remaining if self._is_possible(stage, names)]
+            if len(found) == len(remaining):
                 return found
-            left = found
+            remaining = found
 
     def _is_possible(self, stage: Stage, names: set[str]) -> bool:
         for parameter in parameters(stage.compute):
@@ -387,17 +387,17 @@ class Graph:
     def keys(self, stage: Stage) -> "Keys":
         """The keys of the experiment that a result depends on, through all that it needs."""
         found: set[tuple[str, Only | But | None]] = set()
-        seen: set[str] = set()
+        visited: set[str] = set()
         waiting = [stage]
         while waiting:
             one = waiting.pop()
-            seen.add(one.name)
+            visited.add(one.name)
             functions = [one.compute] + ([one.parts] if one.parts else [])
             for parameter in (p for f in functions for p in parameters(f)):
                 if Guard in parameter.marks:
                     continue
                 if parameter.name in self._names:
-                    if parameter.name in self._by_name and parameter.name not in seen:
+                    if parameter.name in self._by_name and parameter.name not in visited:
                         waiting.append(self[parameter.name])
                 elif parameter.path is not None:
                     marks = [m for m in parameter.marks if isinstance(m, Only | But)]
@@ -425,7 +425,7 @@ def _holds(path: str, mark: Only | But | None, key: str) -> bool:
     if mark is None:
         return True
     listed = any(_is_below(key, f"{path}.{one}") for one in mark.keys)
-    # a section that is left out as a whole is one value, None
+    # a section that is omitted as a whole is one value, None
     return listed == isinstance(mark, Only) or key == path
 
 

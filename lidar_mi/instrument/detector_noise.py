@@ -2,7 +2,7 @@
 
 Counts are the charge collected in a gate, in units of one mean photoelectron: an analogue
 receiver, as the paper's light levels need (10^5 photoelectrons in 17 ns leave no single pulses to
-count). Saturation, dead time, afterpulses and the steps of a digitiser are left out.
+count). Saturation, dead time, afterpulses and the steps of a digitiser are neglected.
 """
 
 import math
@@ -182,7 +182,7 @@ def noisy_scan(
     seed : int or sequence of int
         Different ones for the scans of a pair.
     plan : ScanPlan, optional
-        Where the gates lie; left out: as the scan states, in single precision where it was read
+        Where the gates lie; by default as the scan states, in single precision where it was read
         from a file.
     pulses : int
         Averaged in every beam.

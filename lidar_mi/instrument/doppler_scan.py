@@ -208,7 +208,7 @@ def wind_of_lines(
         As for `wind_at`; or two states of it, dims (time, ...), linear in time between and beyond
         them.
     times : (lines,) array, optional
-        s; 0 for all if left out.
+        s; 0 for all by default.
     """
     if "time" not in wind.dims:
         return wind_at(wind, points)

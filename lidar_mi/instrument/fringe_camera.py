@@ -44,7 +44,7 @@ class FringeCamera(Description):
     `lidar_mi.instrument.etalon.Etalon`. Light at the angle theta to the axis falls
     f tan(theta) from ``centre`` in the ideal image. The light's fall-off towards the rim is a
     Gaussian about that centre; what a lens loses by itself, cos(theta)^4, is 0.05 % in the corners
-    and left out.
+    and neglected.
 
     A real lens distorts the ideal image, a real camera is tilted against it about ``centre``, and
     out of focus a point is a disc. The disc is the same everywhere: what a tilt adds, half a

@@ -245,10 +245,10 @@ def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
 
 def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
     """What a scan in time asks of the laser and of the scanner, and the distance flown."""
-    flown = asked.platform.speed * schedule.duration
+    distance = asked.platform.speed * schedule.duration
     return [
         ("duration", f"{schedule.duration:.4g} s"),
-        ("distance flown", f"{flown:.3g} m"),
+        ("distance flown", f"{distance:.3g} m"),
         ("beams per second between turns", f"{schedule.beam_rate:.4g}"),
         ("angular rate", f"{math.degrees(schedule.load.rate):.4g} deg/s"),
         ("angular acceleration", f"{math.degrees(schedule.load.acceleration):.4g} deg/s^2"),

@@ -120,7 +120,7 @@ def budgets(
     ----------
     scans : the two rendered scans
     cores, flagged : optional
-        See `error_budget`; cores left out: those of the true wind.
+        See `error_budget`; without cores: those of the true wind.
     """
     flows = None
     if experiment.scan.air == "moving":

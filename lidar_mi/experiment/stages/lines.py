@@ -143,7 +143,7 @@ def measure_lines(
     -------
     xr.Dataset, dim (line)
         From `scan_wind`, with ``v_los``, its random ``v_los_std`` and ``v_los_systematic``, which
-        all lines share (m s^-1), as retrieved; NaN where an image gives none.
+        are common to all lines (m s^-1), as retrieved; NaN where an image gives none.
     """
     lines = scan_wind(
         states,
@@ -213,8 +213,8 @@ def with_speeds(
     Returns
     -------
     xr.Dataset, dim (line)
-        With ``v_los_covariance`` (line, other_line), m^2 s^-2, where lines share a frame of the
-        laser.
+        With ``v_los_covariance`` (line, other_line), m^2 s^-2, where one frame of the
+        laser serves several lines.
     """
     streams = [seed, _DRIFTS + scan]
     drift, drift_std = drifts(doppler, pulses, streams, range(len(v_los)), PULSES)

@@ -80,8 +80,8 @@ def cross_flow_winds(
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
         # the truth's images are photographs
-        seen = times if source in RENDERED else None
-        bound = wind_bound(pair[0], pair[1], platform.dt, noise, window_sizes(retrieval), seen)
+        timed = times if source in RENDERED else None
+        bound = wind_bound(pair[0], pair[1], platform.dt, noise, window_sizes(retrieval), timed)
         methods: list[xr.Dataset] = []
         for method in retrieval.methods:
             wind = retrieve_wind(
@@ -91,7 +91,7 @@ def cross_flow_winds(
                 method=method,
                 **window_settings(retrieval),
                 noise=noise,
-                times=seen,
+                times=timed,
                 # the extinction itself has passed no instrument
                 blur=0.0 if source in EXACT else blur,
             )
@@ -237,7 +237,7 @@ def known_blur(retrieval: Retrieval, lidar: BackscatterLidar, plan: ScanPlan) ->
 def common_error(
     retrieval: Retrieval, platform: Platform, plans: Sequence[ScanPlan]
 ) -> tuple[float, float]:
-    """Standard errors that all vectors share by the pointing between scans.
+    """Standard errors common to all vectors by the pointing between scans.
 
     Of v and of w (m/s), and of a rotation about the axis of roll (rad/s).
     """
