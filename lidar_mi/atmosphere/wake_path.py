@@ -50,6 +50,7 @@ def wake_axes(
     """Unit vectors along a wake, across it to the left and upwards, in the path frame; rad."""
     c, s = math.cos(crossing_angle), math.sin(crossing_angle)
     level, up = math.cos(climb_angle), math.sin(climb_angle)
+    # the wake is level: its axis falls in the frame of a climbing path
     return (
         np.array([c * level, s, -c * up]),
         np.array([-s * level, c, s * up]),

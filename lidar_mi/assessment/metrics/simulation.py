@@ -29,6 +29,7 @@ def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:
     if "samples_per_beam" in scans[0].attrs:
         key = f"{Source.BACKSCATTER}.samples_per_beam"
         metrics[key] = float(scans[0].attrs["samples_per_beam"])
+    # one scan without it leaves the larger of both unknown
     fraction = max(scan.attrs.get("monte_carlo_fraction", math.inf) for scan in scans)
     if math.isfinite(fraction):
         metrics[f"{Source.NOISY}.monte_carlo_fraction"] = float(fraction)

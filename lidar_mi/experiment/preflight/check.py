@@ -71,6 +71,7 @@ def sections(
     InputError
         Anything that a run would refuse before it starts.
     """
+    # of the processor: other programs do not lengthen it
     start = time.process_time()
     prepared = experiment.prepare(asked, search_path, without_warnings(notice))
     preparation, results = time.process_time() - start, prepared.results
@@ -115,6 +116,7 @@ def _backscatter(
     if not wake.turbine:
         rows.append(("vortices", sense_of_rotation(wind, find_cores(wind))))
     divergence = relative_divergence(wind)
+    # NaN without vorticity to compare with
     if divergence == divergence:
         rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
     rows.append(("extinction", _span(1e3 * extinction.values, "1/km")))

@@ -134,7 +134,7 @@ class Experiment(Tabular, Section):
         return self
 
     @model_validator(mode="after")
-    def _molecules_beside_particles(self) -> Self:
+    def _molecules_with_polarised_particles(self) -> Self:
         phase = self.scattering.phase
         if (
             self.wake

@@ -223,6 +223,7 @@ def _images(
     air = sensor.slab_images(truth, flows, plans)
     noises = [xr.zeros_like(image) + noise for image in pair]
     ideal, _ = _without_noise(sensor, air, plans, pair)
+    # one scale of all cases, so that they differ by their cause alone
     gain, offset = image_scale(ideal, pair, noises)
 
     def as_measured(
@@ -280,6 +281,7 @@ def platforms_without(platform: Platform) -> dict[str, Platform]:
     """
     found = {}
     motion, reported = platform.motion or Motion(), platform.reported or Reported()
+    # jitter is a cause of its own, which stays without motion
     still = Motion().model_copy(update={"scanner_jitter": motion.scanner_jitter})
     if motion != still:
         found["motion"] = platform.model_copy(update={"motion": still})

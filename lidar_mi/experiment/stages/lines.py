@@ -112,6 +112,7 @@ def check_lines(
         wind_of_lines(states, volumes if beams is None else volumes + beams.origin[:, None])
     except InputError as error:
         raise InputError(f"sensor.directions: {error}") from None
+    # a bound for all directions
     fastest = platform.speed + float(np.sqrt(sum(states[n] ** 2 for n in COMPONENTS)).max())
     limit = rings.model.velocity_range / 2
     if fastest > limit:
@@ -160,6 +161,7 @@ def measure_lines(
     images = line_images(doppler, rings, true.min(), true.max())
     noises = line_noises(doppler, sensor.pulses, rings)
     retrieved = np.empty((4, len(true)))
+    # so many frames at once as memory holds
     for start in range(0, len(true), FRAMES):
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
         chunk = slice(start, min(start + FRAMES, len(true)))
@@ -221,6 +223,7 @@ def with_speeds(
     # all at once: each variable that a data set takes later copies and aligns it again
     found: dict[str, tuple[Any, ...]] = {
         "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),
+        # independent errors: variances add
         "v_los_std": ("line", np.hypot(std, drift_std), lines.variables["v_los_std"].attrs),
         "v_los_systematic": (
             "line",

@@ -431,6 +431,7 @@ def _media(
     """The extinction at both times, extended to the depth and width of the beams."""
     if fields[0].sizes["x"] > 1:
         return list(fields)
+    # one extent for both scans: they meet the same air
     reach = max(plans, key=lambda plan: plan.gate_stop)
     return [
         extrude(field.isel(x=0).transpose(..., "z", "y"), reach, lidar, plans) for field in fields

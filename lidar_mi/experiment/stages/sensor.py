@@ -300,6 +300,7 @@ def mean_squares_without(
             beams,
         )
         # lines without a velocity remain without
+        # the draw of the measurement: cases differ by their cause alone
         noise, std = lines["v_los"] - lines["v_los_true"], lines["v_los_std"]
         if "line_noise" in causes:
             noise, std = 0 * noise, xr.full_like(std, _SURE)

@@ -220,6 +220,7 @@ def _beams(
     body_fixed: bool,
     random: np.random.Generator,
 ) -> Beams:
+    # both scans are of one flight, whose zero is the first one's reference time
     clock = number * platform.dt + schedule.time
     true = reported = pose_at(clock)
     if platform.reported is not None and platform.reported != Reported():
@@ -230,6 +231,7 @@ def _beams(
             schedule.places,
             distance,
             position,
+            # in the frame of the air, in which the gates stay
             platform.speed - scan.follow,
             true,
             reported,

@@ -145,6 +145,7 @@ def _image_pairs(
     """Both images and their noise by source: of the truth, then of the lidar."""
     rendered = rendered_pairs(wake, scan, detector, scans)
     if retrieval.sources == "measured":
+        # the last ones: with the detector's noise, if there is a detector
         return dict([rendered.popitem()])
     exact: dict[str, Pair] = {
         Source.EXTINCTION: both(truth.image),
@@ -225,11 +226,13 @@ def attenuated_backscatter_stderr(scan: xr.Dataset) -> xr.DataArray:
     """Standard error of the attenuated backscatter Y, same unit."""
     first = scan.isel(gate=0)
     lit = first["S0"] > 0
+    # Y is proportional to S0: relative errors are the same
     return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
 
 
 def known_blur(retrieval: Retrieval, lidar: BackscatterLidar, plan: ScanPlan) -> float:
     """Standard deviation (m) of the blur that `retrieval.blur` states for the methods."""
+    # of a Gaussian beam the 1/e^2 radius is two standard deviations
     blur = retrieval.blur
     return float(lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
 
