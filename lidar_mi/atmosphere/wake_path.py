@@ -200,8 +200,10 @@ class PairAlongPath:
                 length = np.sqrt(1 + slope[3] ** 2)
                 tangent = tuple((a + b) / length for a, b in zip(along, slope[:3], strict=True))
             axial = _dot(d, tangent)
+            # rounding can make it negative on the axis
             r2 = np.maximum(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - axial**2, 0.0)
             omega = angular_velocity(r2, side * strength, self.core_radius, self.model)
+            # omega times the vector product of tangent and distance
             u = u + omega * (tangent[1] * d[2] - tangent[2] * d[1])
             v = v + omega * (tangent[2] * d[0] - tangent[0] * d[2])
             w = w + omega * (tangent[0] * d[1] - tangent[1] * d[0])
@@ -235,6 +237,7 @@ class PairAlongPath:
                     axial -= miss / (along[0] + slope[0])
             _, y, z = start + axial * along + offset
             tangent = along + slope
+            # the plane cuts an ellipse, longer by 1 / steep; the circle has its area
             steep = tangent[0] / float(np.linalg.norm(tangent))
             radius = self.core_radius / math.sqrt(steep)
             found.append(Vortex(side * strength, radius, float(y), float(z), self.model))
@@ -249,6 +252,7 @@ class PairAlongPath:
         """
         _, left, up = self.axes
         wavelength = self.crow_wavelength or CROW_WAVELENGTH * self.separation
+        # both planes are inclined by 45 degrees, mirror images (Crow 1970)
         inclined = (side * left + up) / math.sqrt(2)
         k = 2 * math.pi / wavelength
         size = self.crow_amplitude * np.sin(k * axial)

@@ -197,6 +197,7 @@ def connected(
         _make_ready(client, threads, own_cache=True)
         # the caller's: it is theirs to close
         # the caller's: it is theirs to close
+        # the caller's: it is theirs to close
         yield client
         return
     if client is not None:

@@ -132,6 +132,7 @@ def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> li
     """
     place = far_from_cores(metrics, "true_wind.", "rms_")
     found = []
+    # with the detector's noise, if there are such images
     for source in reversed(RENDERED):
         for method in methods:
             noise, error = (

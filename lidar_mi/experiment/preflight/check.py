@@ -96,6 +96,7 @@ def sections(
             )
     if timed:
         notice("timing a few samples and a retrieval", None)
+        # with the number that is chosen already: choosing it takes pilots
         whole = with_number(asked, chosen.number) if chosen else asked
         yield "cost of the run, to a factor of 2", _cost(whole, results, preparation)
     if prepared.warnings:

@@ -116,6 +116,7 @@ def overlap(lidar: BackscatterLidar, distance: float) -> float:
 def _lens(gap: np.ndarray, first: float, second: float) -> np.ndarray:
     """Area of the overlap of two circles of given radii, with ``gap`` between their centres."""
     small, large = min(first, second), max(first, second)
+    # the formula is that of circles that cut each other; the others are replaced below
     separation = np.clip(gap, large - small + 1e-12 * large, large + small)
     # angles at both centres to where the circles meet
     at_small = (separation**2 + small**2 - large**2) / (2 * separation * small)

@@ -165,6 +165,7 @@ def _budgets(
         winds = {}
         for cause, case in images.items():
             source = sources.get(cause)
+            # the run has winds from these images
             if known is not None and source:
                 retrieved = known.sel(source=source, algorithm=method)
                 winds[cause] = retrieved.assign_attrs(method=method, dt=dt, **asdict(sizes))
