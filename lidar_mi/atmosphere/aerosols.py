@@ -145,6 +145,7 @@ class Aerosol:
         """Fraction of the geometric cross-section of all sizes that is beyond the limits."""
 
         def area(low: float, high: float) -> float:
+            # r^2 n dr is r^3 n du, with u = ln r
             return quad(
                 lambda u: self.sizes(math.exp(u)) * math.exp(3 * u), low, high, epsabs=0, limit=400
             )[0]

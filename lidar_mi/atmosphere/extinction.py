@@ -28,6 +28,7 @@ def _variable(wake: xr.Dataset, name: str, key: str) -> xr.DataArray:
         )
     field = wake[name].astype(float)
     lowest = float(field.min())
+    # so that NaN is refused, too
     if not lowest >= 0:
         raise InputError(
             f"extinction.{key}: variable {name!r} has a minimum of {lowest:g}; it must be >= 0"
@@ -40,6 +41,7 @@ def _stretched(
 ) -> xr.DataArray:
     """1 - (1 - x)^stretch with x = field/reference."""
     largest = float(field.max())
+    # 0 / 0: an empty field has no largest value to refer to
     if largest == 0 and not reference:
         raise InputError(
             f"extinction.{key}: 0 everywhere, so there is no contrast; expected values above 0, "
@@ -120,6 +122,7 @@ def extinction_from_tracer(
 
     def exhaust(name: str) -> xr.DataArray:
         fraction = _stretched(_variable(wake, name, "tracer"), stretch, reference, "tracer")
+        # on top of the background: where its aerosol is 1, the largest tracer has the maximum
         return (maximum - background) * fraction
 
     if aerosol is not None:

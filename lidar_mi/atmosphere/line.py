@@ -52,6 +52,7 @@ class Line:
         _check("line.wavelength", self.wavelength, self.wavelength > 0, "m above 0")
         for name in ("weights", "offsets", "sigmas"):
             values = np.array(getattr(self, name), float, ndmin=1)
+            # frozen as the class is, which does not reach into arrays
             values.flags.writeable = False
             object.__setattr__(self, name, values)
             allowed = "finite Hz" if name == "offsets" else "0 or more"
@@ -78,6 +79,7 @@ class Line:
         nu = self.mean + np.linspace(-extent, extent, 20_001)
         peak = nu[np.argmax(self.pdf(nu))]
         half = self.pdf(peak) / 2
+        # to 1 Hz, of widths of MHz and more
         left, right = (
             brentq(lambda x: float(self.pdf(x) - half), peak, peak + side * extent, xtol=1.0)
             for side in (-1, 1)
@@ -147,6 +149,7 @@ def rayleigh_width(wavelength: float, temperature: float) -> float:
     """
     _check("wavelength", wavelength, wavelength > 0, "m above 0")
     _check("temperature", temperature, temperature > 0, "K above 0")
+    # the Doppler shift of backscatter is 2 v / wavelength
     return _FWHM * 2 / wavelength * math.sqrt(Boltzmann * temperature / _MASS)
 
 
@@ -189,6 +192,7 @@ def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -
     sigma_r = 0.70813 - 0.16366 * y**2 + 0.19132 * y**3 - 0.07217 * y**4
     sigma_b = 0.07845 * math.exp(-4.88663 * y) + 0.804 * math.exp(-0.15003 * y) - 0.45142
     place = 0.80893 - 0.30208 * 0.10898**y
+    # both Brillouin lines are equally strong: the air is in equilibrium
     side = (1 - centre) / 2
     return Line(
         wavelength,
@@ -232,9 +236,11 @@ def backscatter_line(
         air = rayleigh(wavelength, temperature)
     else:
         air = rayleigh_brillouin(wavelength, temperature, pressure)
+    # convolved with the laser's line; of Gaussians the variances add
     air = air.broadened(laser.sigmas[0])
     weights = np.concatenate([[aerosol_fraction], (1 - aerosol_fraction) * air.weights])
     offsets, sigmas = np.append(laser.offsets, air.offsets), np.append(laser.sigmas, air.sigmas)
+    # a monochromatic Gaussian of weight 0 would still have no density
     present = weights > 0
     return Line(wavelength, weights[present], offsets[present], sigmas[present])
 

@@ -5,7 +5,7 @@ central Cabannes line and the rotational Raman lines around it (within about +-1
 which contain three quarters of the anisotropic part. The *Cabannes* line alone is what a
 narrow-band receiver (filter below about 0.3 nm) detects. Extinction always takes the whole band, as
 Raman-shifted light has left the laser's wavelength too. Vibrational Raman scattering (0.1 %) is
-left out. Water vapour is left out: below 1 % in the cross-section.
+neglected. Water vapour is neglected: below 1 % in the cross-section.
 """
 
 import math
@@ -72,6 +72,7 @@ def refractive_index(wavelength: float, co2: float = 360e-6) -> float:
         Volume fraction.
     """
     _check(wavelength, co2)
+    # in um^-2, as the formula of Peck and Reeder
     wavenumber2 = (1e-6 / wavelength) ** 2
     refractivity = 1e-8 * (
         8060.51 + 2480990 / (132.274 - wavenumber2) + 17455.7 / (39.32957 - wavenumber2)
@@ -89,6 +90,7 @@ def king_factor(wavelength: float, co2: float = 360e-6) -> float:
     wavenumber2 = (1e-6 / wavelength) ** 2
     nitrogen = 1.034 + 3.17e-4 * wavenumber2
     oxygen = 1.096 + 1.385e-3 * wavenumber2 + 1.448e-4 * wavenumber2**2
+    # the weights are per cent by volume
     percent = 100 * co2
     total = 78.084 * nitrogen + 20.946 * oxygen + 0.934 * 1.00 + percent * 1.15
     return total / (78.084 + 20.946 + 0.934 + percent)
@@ -184,6 +186,7 @@ def molecular_scattering(
     InputError
     """
     king = king_factor(wavelength, co2)
+    # extinction is by the whole band, the received light that of one
     whole, passed = anisotropy(king, "rayleigh"), anisotropy(king, band)
     density = number_density(pressure, temperature)
     sigma = cross_section(wavelength, co2)

@@ -75,7 +75,7 @@ def make_table(
 
     Notes
     -----
-    Sizes beyond the aerosol's limits are left out; the provenance states which fraction of the
+    Sizes beyond the aerosol's limits are omitted; the provenance states which fraction of the
     geometric cross-section that is (at 532 nm, taking the spheroids on to 2 um changes the lidar
     ratio by 0.4 %, depolarisation by 1 %). The cost of a spheroid grows steeply with its size:
     at size parameter 18 a second or two, at 26 minutes, and ``scatrs`` refuses what it has not

@@ -74,6 +74,7 @@ class ScatteringTable:
     @property
     def backscatter_per_extinction(self) -> float:
         """Backscatter over extinction coefficient, sr^-1: albedo a1(180)/(4 pi)."""
+        # the last angle is 180 degrees
         return float(self.albedo * self.elements[-1, 0] / (4 * math.pi))
 
     @property
@@ -181,6 +182,7 @@ def check(table: ScatteringTable) -> None:
         angle,
         "(a3 + a4)^2 + 4 b2^2 above (a1 + a2)^2 - 4 b1^2",
         (a3 + a4) ** 2 + 4 * b2**2 - (a1 + a2) ** 2 + 4 * b1**2,
+        # the left side is at most this, as no element exceeds a1
         8 * a1**2,
     )
     relations = {
@@ -232,6 +234,7 @@ def rayleigh_table(
         )
     angle = np.arange(181.0)
     cosine = np.cos(np.radians(angle))
+    # Delta and Delta' of the source
     dipole = (1 - depolarization) / (1 + depolarization / 2)
     circular = (1 - 2 * depolarization) / (1 - depolarization)
     square = 0.75 * dipole * (1 + cosine**2)
@@ -302,6 +305,7 @@ def mix(
             )
     extinction = sum(extinctions)
     scattering = [w * table.albedo for w, table in zip(extinctions, tables, strict=True)]
+    # particles per m^3 of all kinds
     number = sum(
         w / table.extinction_cross_section for w, table in zip(extinctions, tables, strict=True)
     )

@@ -59,12 +59,14 @@ def gaussian_field(
         Zero mean, not normalised.
     """
     d = len(shape)
+    # the generator by its name: numpy may change the one of default_rng
     noise = np.random.Generator(np.random.PCG64(seed)).standard_normal(shape)
     spectrum = rfftn(noise, overwrite_x=True)
     frequencies = [fftfreq(n, s) for n, s in zip(shape[:-1], spacing[:-1], strict=True)]
     frequencies.append(rfftfreq(shape[-1], spacing[-1]))
     k2 = sum(f**2 for f in np.meshgrid(*frequencies, indexing="ij", sparse=True))
     # Frequencies in cycles per metre: the common 2 pi drops out of the shape.
+    # The root of the spectral density, as the noise is an amplitude.
     spectrum *= (k2 + outer_scale**-2) ** (-(slope + d - 1) / 4)
     spectrum.flat[0] = 0
     return irfftn(spectrum, s=shape, overwrite_x=True)
@@ -129,6 +131,7 @@ def corrsin_obukhov(
             f"cells, {2 * max(spacing.values()):g} m"
         )
     sizes = [values.size for values in axes.values()]
+    # longer than the image by an outer scale, as the field is periodic
     period = tuple(
         next_fast_len(int(np.ceil(axes[name].size + outer_scale / step)), real=True)
         for name, step in spacing.items()
@@ -145,6 +148,7 @@ def corrsin_obukhov(
         g = g[tuple(slice(axes[name].size) for name in spacing)]
         s = np.sqrt(np.log1p(rms**2))
         g = (g - g.mean()) * (s / g.std())
+        # the mean of exp(g) is exp(s^2 / 2)
         factor = np.exp(g - s**2 / 2).reshape(sizes)
     return xr.DataArray(
         factor,
@@ -220,6 +224,7 @@ def periodic_texture(
             f"texture.outer_scale: {outer_scale} m is not allowed; it must be at least two "
             f"cells, {2 * max(spacing):g} m"
         )
+    # rounding must not add a node to a whole number of them
     nodes = tuple(
         next_fast_len(int(np.ceil(length / step - 1e-9)), real=True)
         for length, step in zip(extent, spacing, strict=True)

@@ -82,6 +82,7 @@ class TurbineWake:
             raise InputError(
                 f"turbine.tip_speed_ratio: {self.tip_speed_ratio} is not allowed; not 0"
             )
+        # where the root of the deficit would be imaginary
         if self.thrust > 8 * self._relative_width**2:
             widest = (math.sqrt(self.thrust / 8) - self._initial_width) / self.growth
             raise InputError(
@@ -92,6 +93,7 @@ class TurbineWake:
     @property
     def _initial_width(self) -> float:
         root = math.sqrt(1 - self.thrust)
+        # 0.2 beta^(1/2), beta the area of the expanded wake over that of the rotor
         return 0.2 * math.sqrt((1 + root) / (2 * root))
 
     @property
@@ -111,6 +113,7 @@ class TurbineWake:
     @property
     def torque_coefficient(self) -> float:
         """Torque over rho U^2 pi R^3 / 2, of the ideal rotor."""
+        # 1 - a of momentum theory
         at_disc = (1 + math.sqrt(1 - self.thrust)) / 2
         return self.thrust * at_disc / self.tip_speed_ratio
 
@@ -123,6 +126,7 @@ class TurbineWake:
         radius = self.diameter / 2
         torque = self.torque_coefficient * self.wind_speed**2 * math.pi * radius**3 / 2
         # the integrand falls like a Gaussian of sigma
+        # angular momentum r v_t, which u carries through the plane; rho cancels
         momentum, _ = integrate.quad(
             lambda r: self.axial_speed(r) * r * self._profile(r) * 2 * math.pi * r,
             0,
@@ -176,11 +180,13 @@ def isotropic_turbulence(
     """
     axes = (x, y, z)
     step = [float(axis[1] - axis[0]) for axis in axes]
+    # a node more at both ends, for the central differences
     shape = [len(axis) + 2 for axis in axes]
     period = [
         next_fast_len(n + math.ceil(outer_scale / h)) for n, h in zip(shape, step, strict=True)
     ]
     cut = tuple(slice(n) for n in shape)
+    # with this slope the density is (k^2 + k0^2)^(-17/6); k^2 is by the curl, k^2 by the shells
     potential = [
         gaussian_field(tuple(period), tuple(step), outer_scale, part, slope=11 / 3)[cut]
         for part in np.random.SeedSequence(seed).generate_state(3).tolist()
@@ -197,6 +203,7 @@ def isotropic_turbulence(
     gusts = np.stack(
         [slope((k + 2) % 3, (k + 1) % 3) - slope((k + 1) % 3, (k + 2) % 3) for k in range(3)]
     )
+    # the mean wind is that of the wake alone
     gusts -= gusts.mean((1, 2, 3), keepdims=True)
     return gusts / math.sqrt((gusts**2).mean())
 
@@ -234,6 +241,7 @@ def turbine_flow(
     axes = {name: np.atleast_1d(np.asarray(values, float)) for name, values in given.items()}
     lateral, vertical = np.meshgrid(axes["y"], axes["z"], indexing="ij")
     r = np.hypot(lateral, vertical)
+    # v_t / r, which has no direction to choose on the axis
     swirl = np.divide(wake.tangential_speed(r), r, out=np.zeros_like(r), where=r > 0)
     mean = np.stack([wake.axial_speed(r), -swirl * vertical, swirl * lateral])
     flow = np.broadcast_to(mean[:, None], (3, len(axes["x"]), *r.shape)).copy()
@@ -241,6 +249,7 @@ def turbine_flow(
         added = added_turbulence(wake.thrust, ambient, wake.downstream, wake.diameter)
         added *= np.exp(-(r**2) / (2 * wake.width**2))
         gusts = isotropic_turbulence(**axes, outer_scale=outer_scale, seed=seed)
+        # variances of independent turbulence add
         flow += wake.wind_speed * np.hypot(ambient, added) * gusts
     titles = {
         "u": "velocity along the wind",

@@ -69,6 +69,7 @@ def angular_velocity(
     """Tangential speed over radius, s^-1, from the squared radius (m^2): finite on the axis."""
     s = np.asarray(r2, dtype=float) / core_radius**2
     if model == "lamb_oseen":
+        # expm1, as 1 - exp(-x) loses its digits near the axis, where the limit is the constant
         profile = np.divide(
             -np.expm1(-LAMB_OSEEN_CONSTANT * s),
             s,

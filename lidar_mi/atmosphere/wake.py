@@ -85,6 +85,7 @@ def resample(
                 f"{name}, {extent:g} m"
             )
         ends[name] = (places[0] + margin, places[-1] - margin, cells + 1)
+    # before anything of this size is allocated
     check_nodes(spacing, {d: ends[d][2] if d in ends else wake.sizes[d] for d in "xyz"}, most)
     nodes = {name: np.linspace(*end) for name, end in ends.items()}
 

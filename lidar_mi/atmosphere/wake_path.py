@@ -50,6 +50,7 @@ def wake_axes(
     """Unit vectors along a wake, across it to the left and upwards, in the path frame; rad."""
     c, s = math.cos(crossing_angle), math.sin(crossing_angle)
     level, up = math.cos(climb_angle), math.sin(climb_angle)
+    # the wake is level: its axis falls in the frame of a climbing path
     return (
         np.array([c * level, s, -c * up]),
         np.array([-s * level, c, s * up]),
@@ -199,8 +200,10 @@ class PairAlongPath:
                 length = np.sqrt(1 + slope[3] ** 2)
                 tangent = tuple((a + b) / length for a, b in zip(along, slope[:3], strict=True))
             axial = _dot(d, tangent)
+            # rounding can make it negative on the axis
             r2 = np.maximum(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - axial**2, 0.0)
             omega = angular_velocity(r2, side * strength, self.core_radius, self.model)
+            # omega times the vector product of tangent and distance
             u = u + omega * (tangent[1] * d[2] - tangent[2] * d[1])
             v = v + omega * (tangent[2] * d[0] - tangent[0] * d[2])
             w = w + omega * (tangent[0] * d[1] - tangent[1] * d[0])
@@ -234,6 +237,7 @@ class PairAlongPath:
                     axial -= miss / (along[0] + slope[0])
             _, y, z = start + axial * along + offset
             tangent = along + slope
+            # the plane cuts an ellipse, longer by 1 / steep; the circle has its area
             steep = tangent[0] / float(np.linalg.norm(tangent))
             radius = self.core_radius / math.sqrt(steep)
             found.append(Vortex(side * strength, radius, float(y), float(z), self.model))
@@ -248,6 +252,7 @@ class PairAlongPath:
         """
         _, left, up = self.axes
         wavelength = self.crow_wavelength or CROW_WAVELENGTH * self.separation
+        # both planes are inclined by 45 degrees, mirror images (Crow 1970)
         inclined = (side * left + up) / math.sqrt(2)
         k = 2 * math.pi / wavelength
         size = self.crow_amplitude * np.sin(k * axial)

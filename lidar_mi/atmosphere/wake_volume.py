@@ -31,7 +31,7 @@ def one_period(flow: xr.Dataset) -> xr.Dataset:
 
     The step from the last plane to the first, and the curvature there, are compared with those
     within the volume: where either is more than twice the largest inside, the volume is not
-    periodic. A last plane that repeats the first one is left out. A wake that is uniform
+    periodic. A last plane that repeats the first one is omitted. A wake that is uniform
     along its axis becomes a single plane.
 
     Parameters
@@ -81,7 +81,7 @@ class VolumeAlongPath:
     """A simulated wake, repeated along an axis that crosses the flight path.
 
     The state of one instant moves with ``drift`` and does not change: what the vortices do to each
-    other and to themselves in the seconds of an encounter beyond that is left out. Values are
+    other and to themselves in the seconds of an encounter beyond that is neglected. Values are
     interpolated by cubic splines, periodic along the axis. Outside of the volume the wind is that
     of two straight vortices at the mean places with the mean circulations, the extinction the
     background.
@@ -145,6 +145,7 @@ class VolumeAlongPath:
         for name in self.flow.data_vars:
             values = self.flow[name].transpose("x", "y", "z").values.astype(float)
             if len(values) > 1:
+                # periodic along the axis: behind the last plane comes the first
                 values = spline_filter1d(values, axis=0, mode="grid-wrap")
             for axis in (1, 2):
                 values = spline_filter1d(values, axis=axis, mode="mirror")
@@ -183,8 +184,10 @@ class VolumeAlongPath:
             nodes = self.flow[name].values
             place = (own[k] - nodes[0]) / self._steps[k]
             if name == "x":
+                # the coefficients begin so many nodes before the first plane
                 place = np.mod(place, len(nodes)) + _BEYOND
             else:
+                # nodes at the rim are inside, whatever the rounding
                 inside &= (place >= -1e-9) & (place <= len(nodes) - 1 + 1e-9)
             index.append(place)
         return np.stack(index), inside
@@ -203,6 +206,7 @@ class VolumeAlongPath:
         for k, name in enumerate("uvw"):
             if name in self.flow:
                 components[k] = np.where(inside, self._at(name, index), components[k])
+        # rows are the wake's unit vectors: their transpose leads back to the path frame
         u, v, w = np.einsum("ki,k...->i...", np.stack(self.axes), components)
         return u, v, w
 
@@ -218,6 +222,7 @@ class VolumeAlongPath:
     def _tracks(self) -> tuple[CubicSpline, ...]:
         """y, z, radius and circulation of each vortex along the axis, periodic."""
         x = self.flow["x"].values
+        # a periodic spline needs its first value again at the end
         nodes = np.append(x, x[0] + self.period)
         found = []
         for side in (self.port, self.starboard):
@@ -248,6 +253,7 @@ class VolumeAlongPath:
                 tangent = np.array([1.0, slope[0], slope[1]]) @ rotation
                 place = centre + own @ rotation
                 s -= (place[0] - x) / tangent[0]
+            # the plane cuts an ellipse, longer by 1 / steep; the circle has its area
             steep = tangent[0] / float(np.linalg.norm(tangent))
             radius, circulation = float(row[2]), float(row[3])
             found.append(

@@ -83,6 +83,7 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
                 if not key.startswith("timing."):
                     values.setdefault(key, np.full(total, np.nan))[number] = value
         elif (outcome := folder.outcome(number)) is not None:
+            # metrics are written last: without them the point is not done
             status[number] = STATUS.index("failed")
             messages[number] = outcome.message
     data = _data_set(folder, values, status, messages, places)
@@ -104,6 +105,7 @@ def _data_set(
     if campaign.members > 1:
         dims.append(MEMBER)
     else:
+        # a single member is no dimension
         shape = shape[:-1]
     units = points.units()
     coords: dict[str, Any] = {}
@@ -120,6 +122,7 @@ def _data_set(
         coords[name] = (dim, np.array(found, object if isinstance(found[0], str) else None), about)
     if MEMBER in dims:
         coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})
+    # sorted: the file does not depend on which point has a metric first
     variables: dict[str, Any] = {
         key: (dims, values[key].reshape(shape), _about(key)) for key in sorted(values)
     }
@@ -128,6 +131,7 @@ def _data_set(
         status.reshape(shape),
         {
             "long_name": "what became of the point",
+            # CF flags: whole numbers whose meanings are attributes
             "flag_values": np.arange(len(STATUS), dtype=np.int8),
             "flag_meanings": " ".join(STATUS),
         },

@@ -69,6 +69,7 @@ class State(Status):
 
     def rate(self) -> float:
         """Points a second since the start; 0: none yet."""
+        # the clock may not have moved yet
         return (self.finished - self.finished_before) / max(time.monotonic() - self.started, 1e-9)
 
     def remaining(self) -> float:
@@ -194,6 +195,9 @@ def connected(
     """
     if isinstance(client, Client):
         _make_ready(client, threads, own_cache=True)
+        # the caller's: it is theirs to close
+        # the caller's: it is theirs to close
+        # the caller's: it is theirs to close
         yield client
         return
     if client is not None:
@@ -221,16 +225,20 @@ def connected(
         "distributed.worker.memory.monitor-interval": "1s",
         "distributed.admin.tick.interval": "1s",
     }
+    # the cluster closes behind the yield, but faults in its start get the message of
+    # workers_started
     with dask.config.set(settings), quiet_loggers(), ExitStack() as open_until_the_end:
         with workers_started():
             cluster = LocalCluster(
                 n_workers=count,
                 threads_per_worker=1,
                 processes=True,
+                # any free port: several campaigns may run on a machine
                 dashboard_address=":0",
                 silence_logs=50,
             )
             open_until_the_end.enter_context(cluster)
+            # the default client is that of the user's own code
             found = open_until_the_end.enter_context(Client(cluster, set_as_default=False))
             found.wait_for_workers(1, timeout=60)
         _make_ready(found, threads, own_cache=False)
@@ -255,8 +263,8 @@ def execute(
             count(folder, number, state)
         else:
             waiting.append(number)
+    # rate and slowest step are those of this start
     state.finished_before = state.finished
-    # the slowest step is that of this start
     state.seconds.clear()
     watch(state)
     _Dispatch(folder, client, state, watch, lifetime).run(waiting)
@@ -297,6 +305,7 @@ class _Dispatch:
         """All of some points, in their order."""
         self.needed = signatures(self.folder.index, waiting)
         self.next = iter(waiting)
+        # _submit adds to it while run iterates over it
         self.pending = as_completed(loop=self.client.loop)
         self._fill()
         for future in self.pending:
@@ -305,6 +314,7 @@ class _Dispatch:
 
     def _fill(self) -> None:
         """Keep the scheduler busy, but let it hold only a few tasks."""
+        # with no worker for a moment tasks are still handed over, or the loop would end
         threads = max(sum(self.client.nthreads().values()), 1)
         self.state.workers = len(self.client.nthreads())
         while len(self.numbers) < _AT_ONCE * threads:
@@ -349,6 +359,7 @@ class _Dispatch:
         first: list[int] = []
         tasks: list[Future[int]] = []
         for signature, stage in zip(images, stages, strict=True):
+            # images that one point needs are rendered in its own task
             if self.needed[signature] > 1 and signature not in self.shared:
                 first.append(len(tasks))
                 self.shared[signature] = self.client.submit(
@@ -389,6 +400,7 @@ class _Dispatch:
         for signature in self.folder.index[number].images:
             self.needed[signature] -= 1
             if not self.needed[signature]:
+                # without a future the scheduler forgets the task
                 self.shared.pop(signature, None)
                 self.folder.drop_images(signature)
 

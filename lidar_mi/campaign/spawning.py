@@ -30,6 +30,7 @@ _IMPORTING = "bootstrapping phase"
 
 def refuse_while_importing() -> None:
     """Raise InputError in a worker that imports a script which starts workers itself."""
+    # multiprocessing sets it while a new process imports the main module
     if getattr(process.current_process(), "_inheriting", False):
         raise InputError(_GUARD)
 
@@ -44,10 +45,12 @@ def check_spawning(count: int) -> None:
     """
     if not _may_open(_FILES + _FILES_EACH * count):
         raise _refused(_TOO_FEW)
+    # a file, not a pipe, which could fill up and block the process
     with tempfile.TemporaryFile() as output:
         try:
             with _output_to(output.fileno()):
                 one = multiprocessing.get_context("spawn").Process(target=os.getpid)
+                # the child inherits the output: this process has its own back at once
                 one.start()
             one.join(PATIENCE)
         except (OSError, RuntimeError, ValueError) as error:
@@ -65,6 +68,7 @@ def check_spawning(count: int) -> None:
     interpreter = os.fsdecode(spawn.get_executable())
     if not os.access(interpreter, os.X_OK):
         raise _refused(f"{interpreter} may not be executed")
+    # the last line of a traceback is the exception
     raise _refused(text.splitlines()[-1] if text else f"exit code {one.exitcode}")
 
 

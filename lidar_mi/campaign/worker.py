@@ -73,12 +73,14 @@ class Prepare(WorkerPlugin):
         InputError
             The worker has another version of the package.
         """
+        # a campaign of two versions would compare what is not comparable
         if self.version != __version__:
             raise InputError(
                 f"worker {worker.address}: has lidar-mi {__version__}; expected {self.version}, as "
                 "of the client"
             )
         if self.own_cache and "DRJIT_CACHE_DIR" not in os.environ:
+            # all users of a machine have one folder for temporary files
             cache = Path(tempfile.gettempdir()) / f"lidar-mi-{os.getuid()}" / platform.node()
             make_folder(cache)
             os.environ["DRJIT_CACHE_DIR"] = str(cache)
@@ -118,6 +120,7 @@ def carry_out(
     start = time.perf_counter()
     store: PointStore | None = None
     try:
+        # before anything that could kill the worker
         _count_attempt(place, session)
         experiment = campaign.points.experiment(number)
         store = PointStore(campaign, number, experiment)
@@ -140,11 +143,13 @@ def carry_out(
         write_outcome(place, outcome)
         write_text(place / resumable_folder.METRICS, to_json(metrics))
     except Exception as error:
+        # an outcome, not an exception: one point must not end the campaign
         log.fail(error)
         counts = (store.rendered, store.reused) if store else (0, 0)
         message = one_line(error) or type(error).__name__
         outcome = Outcome("failed", message, {"total": time.perf_counter() - start}, *counts)
         write_outcome(place, outcome)
+    # it has ended by itself: attempts count killed workers only
     (place / ATTEMPTS).unlink(missing_ok=True)
     return outcome
 
@@ -251,6 +256,7 @@ def _compute(campaign: CampaignFolder, run: Run, store: PointStore) -> None:
         return
     record = resumable_folder.new_record(run.experiment, campaign.points.search_path)
     write_text(store.place / resumable_folder.RECORD, to_yaml(record))
+    # without a report figures have no use
     finish(run, store, with_figures=False)
 
 

@@ -145,6 +145,7 @@ class Estimator:
                     image1, dt, noise, start=expected, times=times, telescope=telescope
                 )
         if prepared:
+            # in flight the second image comes only now
             seconds["wind_before"] = prepared.result()
         with _timed(seconds, "total"):
             completion = partial(complete, lines=lines) if complete else None
@@ -157,8 +158,10 @@ class Estimator:
             if retrieved:
                 wind, flags, parts = retrieved.result()
                 seconds |= parts
+        # a slab without an expected pair follows skipped ones: no work is pending
         since = self._busy if expected else (0.0, 0.0)
         self._busy = _with_delay(seconds, since, dt, self._processes)
+        # a failed fit is no start for the next wind
         self._last = pair if pair.success else None
         return SlabEstimate(wind, pair, seconds, lines, flags)
 
@@ -185,9 +188,11 @@ def _with_delay(
     before = [of("vortices_before"), of("wind_before")]
     after = [of("vortices"), of("wind", "combination")]
     if processes == 1:
+        # one process does the work of both, one after the other
         before, after, since = [sum(before)], [sum(after)], since[:1]
     ended = [start + work for start, work in zip(since, before, strict=True)]
     if "lines" in seconds:
+        # the lines are there half a period after the first image
         ended[0] = max(ended[0], period / 2) + seconds["lines"]
     done = [max(0.0, end - period) + work for end, work in zip(ended, after, strict=True)]
     seconds["total"] += max(done) - max(after)

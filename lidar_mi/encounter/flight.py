@@ -18,12 +18,12 @@ from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
 from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
-from lidar_mi.encounter.own_controller import name_of, own_controller
 from lidar_mi.encounter.preview import Lidar, WakeTracker, preview_in
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.series import FlightRecorder, flights_dataset, track_dataset
 from lidar_mi.encounter.slab_recorder import SlabRecorder
+from lidar_mi.encounter.user_controller import name_of, user_controller
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.experiment.schema.encounter import Encounter
 from lidar_mi.experiment.schema.experiment import Experiment
@@ -111,7 +111,7 @@ def simulate_flights(
             found[mode] = fly(wings_level(model, levelling))
             continue
         steering = (
-            own_controller(controller, model) if controller else feedforward(model, levelling)
+            user_controller(controller, model) if controller else feedforward(model, levelling)
         )
         if mode == AUTOPILOT:
             found[mode] = fly(steering, preview_at=lambda state: no_loads)

@@ -209,7 +209,7 @@ def _into(
             log(f"{folder.scans.number} scans of the flight that was stopped are used again")
         data = simulate(scans=folder.scans)
         folder.write(data)
-        log(f"flown: {', '.join(map(str, data.series['flight'].values))}")
+        log(f"flights simulated: {', '.join(map(str, data.series['flight'].values))}")
     if metrics is None:
         metrics = encounter_metrics(data.series, data.track)
         write_report(folder, experiment, data, metrics, log)

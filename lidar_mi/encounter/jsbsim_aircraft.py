@@ -39,6 +39,7 @@ with flaps the gear is down."""
 TAIL_ASPECT_RATIO, FIN_ASPECT_RATIO = 4.0, 1.6
 """Usual for transport aircraft (Raymer 2018, table 4.3); JSBSim knows areas and arms alone."""
 
+# from y to starboard and z down to y to port and z up
 _TO_OURS = np.array([1.0, -1.0, -1.0])
 _CONTROLS = ("aileron", "elevator", "rudder")
 _POSITIONS = ("fcs/left-aileron-pos-rad", "fcs/elevator-pos-rad", "fcs/rudder-pos-rad")
@@ -89,6 +90,7 @@ class JSBSimAircraft:
         self.control_moments, self._per_command = _control_moments(again)
         self._at_trim = _commands(self._fdm)
         trims = self._at_trim + [self._fdm[name] for name in _TRIMS]
+        # travel that the trim uses is not available to commands
         self.limits = Limits(
             np.abs(self._per_command) * np.clip(1 - np.abs(trims), 0, 1),
             np.where(self._per_command != 0, aircraft.aileron_rate, 0.0),
@@ -118,6 +120,7 @@ class JSBSimAircraft:
         if self.state.departed or not np.isfinite(inputs).all():
             self.state = replace(self.state, time=time, departed=True)
             return self.state
+        # rounding must not add a step to a whole number of them
         count = max(1, math.ceil(dt / STEP - 1e-6))
         self._fdm.set_dt(dt / count)
         _set_loads(self._fdm, loads.force, loads.moment)
@@ -143,15 +146,19 @@ class JSBSimAircraft:
         fdm = self._fdm
         north, east, up = _place(fdm) - self._origin
         along, upward = math.cos(self._climb), math.sin(self._climb)
+        # heading is clockwise seen from above, yaw is to port
         level = attitude(
             fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], -fdm["attitude/psi-rad"]
         )
         numbers = [north, east, up, *level.as_quat(), fdm["velocities/vt-fps"]]
         if not np.isfinite(numbers).all():
             return replace(self.state, time=time, departed=True)
+        # the path frame is inclined by the climb angle
         in_path = attitude(0.0, self._climb, 0.0).inv() * level
+        # right-handed about y, which is to port: the nose goes down
         yaw, nose_down, roll = in_path.as_euler("ZYX")
         p, q, r = (fdm[f"velocities/{axis}-rad_sec"] for axis in "pqr")
+        # the path goes north, so that port is west; q is nose up as pitch, r to starboard
         return AircraftState(
             time=time,
             x=float(north * along + up * upward),
@@ -187,6 +194,7 @@ def _loaded(name: str) -> "FGFDMExec":
     jsbsim.set_logger(_silent_logger(jsbsim))
     fdm = jsbsim.FGFDMExec(str(root))
     fdm.set_debug_level(0)
+    # JSBSim has read the files when the model is loaded: the folder can go
     with tempfile.TemporaryDirectory() as folder:
         write_aircraft_in_wake(root, name, FilePath(folder))
         fdm.set_aircraft_path(folder)
@@ -224,12 +232,14 @@ def _trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExe
         for part, value in (("gear/gear", float(flaps > 0)), ("fcs/flap", flaps)):
             fdm[f"{part}-cmd-norm"] = value
             fdm[f"{part}-pos-norm"] = value
+        # all engines
         fdm["propulsion/set-running"] = -1
         if not fdm.run_ic():
             continue
         try:
             fdm["simulation/do_simple_trim"] = 1
         except RuntimeError as error:
+            # no equilibrium with these flaps: with more there may be one
             if type(error).__name__ != "TrimFailureError":
                 raise
             continue
@@ -295,6 +305,7 @@ def _control_moments(
         for _ in range(_SETTLED):
             steered.run()
             trimmed.run()
+            # the actuator has arrived
             if steered[position] == last != before:
                 break
             last = steered[position]
@@ -328,6 +339,7 @@ def _strips(fdm: "FGFDMExec", lift_slope: float) -> Strips:
     surfaces = [wing_strips(span, area, lift_slope, place=place)]
     tail, fin = (fdm[f"metrics/S{which}-sqft"] * foot**2 for which in "hv")
     if tail > 0:
+        # JSBSim's arms are distances; x is forward
         behind = (-fdm["metrics/lh-ft"] * foot, 0.0, 0.0)
         strips = wing_strips(math.sqrt(TAIL_ASPECT_RATIO * tail), tail, lift_slope, place=behind)
         surfaces.append(in_downwash(strips, lift_slope, span**2 / area))

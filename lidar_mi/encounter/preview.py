@@ -89,6 +89,7 @@ class WakeTracker:
             self._last_slab = (estimate.x, estimate.time)
             if self.on_estimate:
                 self.on_estimate(estimate)
+        # latency: what the lidar has not delivered is not known yet
         while self._undelivered and self._undelivered[0].delivered <= state.time + 1e-9:
             self._track(self._undelivered.pop(0))
 

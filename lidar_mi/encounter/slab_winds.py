@@ -201,6 +201,7 @@ def _shifted(
     at_z, at_y = torch.meshgrid(z.float(), y.float(), indexing="ij")
     new, old = (model_wind(theta.float(), at_y, at_z, expected.profile) for theta in (now, moved))
     v, w = new - old
+    # displacements in px, along z first as the rows of an image
     change = torch.stack([w * slab.dt / step[0], v * slab.dt / step[1]])
     in_pixels = [[by / size for by, size in zip(s, step, strict=True)] for s in (shift, since)]
     return flow.moved(in_pixels[0], change, in_pixels[1])

@@ -128,6 +128,7 @@ def fin_strips(
     angle = _angles(2 * n)[:n]
     places = np.tile(np.asarray(place, dtype=float), (n, 1))
     places[:, 2] += height * np.cos(angle)
+    # aspect ratio of the wing whose upper half it is
     surface = _surface(places, (0.0, 1.0, 0.0), angle, area, lift_slope, 2 * height, 2 * area)
     # half a symmetric loading: its moment about the root has the slope of the force
     return replace(surface, roll_slopes=surface.slopes)
@@ -176,6 +177,7 @@ def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float)
     """
     normal_wind = (np.asarray(wind, dtype=float) * strips.normals).sum(-1)
     pressure = (0.5 * density * airspeed) * strips.areas * normal_wind  # q S_i w_n / V
+    # moments of unit forces along the normals
     arms = np.cross(strips.places, strips.normals)
     lift = pressure * strips.slopes
     moment = lift @ arms

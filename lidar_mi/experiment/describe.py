@@ -46,6 +46,7 @@ def sections(
         Nothing of this name, not readable, or an option that does not apply to it.
     """
     path = Path(what)
+    # a file with the name of a scatterer comes first
     named = not path.exists() and (what in AEROSOLS or what == MOLECULES)
     if wavelength is not None and not named:
         raise InputError(f"--wavelength: not allowed with {what}; expected a named scatterer")
@@ -157,7 +158,7 @@ def _netcdf(path: Path) -> Iterator[Section]:
 
 
 def _span(low: float, high: float) -> str:
-    """Both ends with 4 digits, or with as many as tell them apart."""
+    """Both ends with 4 digits, or with as many as distinguish them."""
     for digits in range(4, 17):
         ends = f"{low:.{digits}g}", f"{high:.{digits}g}"
         if ends[0] != ends[1] or not low < high:
@@ -183,6 +184,7 @@ def _study(folder: Path) -> Iterator[Section]:
     settings = {
         key: flat(record["experiment"]) if record else {} for key, record in records.items()
     }
+    # a variant that was not run would differ in every key
     done = {key: one for key, one in settings.items() if one}
     for key, values in differences(done).items():
         shown = dict(zip(done, map(setting, values), strict=True))
@@ -194,6 +196,7 @@ def _study(folder: Path) -> Iterator[Section]:
     ]
     if found:
         yield "results", [("", *metrics), *found]
+    # the folder of a variant is a run that can be described by itself
     yield _files(folder, without=records)
 
 
@@ -204,6 +207,7 @@ def _run_folder(folder: Path) -> Iterator[Section]:
     record = read_record(folder)
     experiment = record["experiment"]
     asked = dict(_asked_first(experiment))
+    # the number that was chosen is known only to the record
     if asked.get("render.samples_per_beam") == "auto" and "samples_per_beam" in record:
         asked["render.samples_per_beam"] = f"auto: {record['samples_per_beam']}"
     yield (

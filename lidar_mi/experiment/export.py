@@ -39,8 +39,8 @@ def export(
 
     Winds, volumes, both images, lines of sight and vortices, as far as the run has them; of a
     flight the aircraft's way in every flight, the vortices of its track, winds and images of the
-    slabs. Values, standard errors, flags and NaN are kept; places are x ahead, y to port, z up, m,
-    from the telescope at the first scan, of a flight from the start of its path.
+    slabs. Values, standard errors, flags and NaN are those of the run; places are x ahead, y to
+    port, z up, m, from the telescope at the first scan, of a flight from the start of its path.
 
     Parameters
     ----------
@@ -91,6 +91,7 @@ def export(
         raise InputError(f"{folder}: has no results yet; expected a run with images or winds")
     out = folder / format if out is None else Path(out)
     files = dict(_files(out, format, results))
+    # before the first file is written: an existing one stops all
     there = [path for path in files if path.exists()]
     if there and not overwrite:
         raise InputError(
@@ -136,6 +137,7 @@ def _results(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[str, xr.
     for name in _WINDS:
         if (folder / RESULTS[name]).is_file():
             wind = read_netcdf(folder / RESULTS[name])
+            # cross-flow winds have no x: they are means over the slab
             yield name, wind if "x" in wind.coords else wind.assign_coords(x=_slab(record))
     if (folder / RESULTS["lines"]).is_file():
         yield "lines_of_sight", _placed_lines(read_netcdf(folder / RESULTS["lines"]))
@@ -147,6 +149,7 @@ def _results(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[str, xr.
 
 def _slab(record: Mapping[str, Any]) -> xr.Variable:
     """Middle of the slab in which cross-flow winds are retrieved."""
+    # a record has quantities as they were given, with their units
     start, depth = (
         to_si(value_at(record["experiment"], f"scan.{key}"), "m", "500 m")
         for key in ("range", "thickness")
@@ -163,10 +166,12 @@ def _placed_scan(scan: xr.Dataset) -> xr.Dataset:
         return scan.isel(gate=0, drop=True).assign_coords(x=((), float(telescope + centre), _AHEAD))
     edges = np.linspace(start, stop, count + 1)
     middle = xr.DataArray((edges[1:] + edges[:-1]) / 2, dims="gate")
+    # a range along the beam, projected on x
     if about["gate_kind"] == "spherical":
         middle = middle / np.sqrt(1 + (scan["y"] ** 2 + scan["z"] ** 2) / centre**2)
     dims = ("gate", "z", "y")
     x = middle.broadcast_like(scan["S0"]).transpose(*dims)
+    # beams spread from the telescope in proportion to x
     places = {"x": telescope + x, "y": x / centre * scan["y"], "z": x / centre * scan["z"]}
     gates = scan.drop_vars(["y", "z"]).rename_dims(y="column", z="row")
     dims = ("gate", "row", "column")
@@ -182,6 +187,7 @@ def _placed_lines(lines: xr.Dataset) -> xr.Dataset:
     """Lines of sight with the middle of their range bins as place, a column a component."""
     direction = lines["direction"]
     places = lines["range"] * direction  # from the telescope at rest in the first image
+    # other programs read numbers, not vectors: a variable for each component
     split = lines.drop_vars([n for n in lines.variables if "axis" in lines[n].dims])
     for axis in ("x", "y", "z"):
         about = {"units": "m", "long_name": f"{axis} of the middle of the range bin"}
@@ -203,6 +209,7 @@ def _vortices(fits: dict[str, VortexPairFit]) -> xr.Dataset:
         for name, found in fit.quantities.items():
             about = {"units": found.units, "long_name": found.long_name}
             side, _, own = name.partition("_")
+            # of the pair, not of one of its vortices
             if side not in sides:
                 variables[name] = (), found.value, about
                 variables[f"{name}_stderr"] = (), found.stderr, {"units": found.units}

@@ -65,7 +65,7 @@ class Parameter(NamedTuple):
     optional : bool
         Whether it may be None: the stage does without.
     default : bool
-        Whether it may be left out.
+        Whether it may be omitted.
     marks : tuple
         `Only`, `But`, `Guard`.
     """
@@ -154,12 +154,14 @@ def parameters(function: Callable[..., Any]) -> tuple[Parameter, ...]:
     typed = hints(function, include_extras=True)
     found = []
     for name, given in inspect.signature(function).parameters.items():
+        # their names stand for nothing that the graph could look up
         if given.kind in (given.VAR_POSITIONAL, given.VAR_KEYWORD):
             continue
         kind, marks = typed.get(name), ()
         if get_origin(kind) is Annotated:
             kind, *rest = get_args(kind)
             marks = tuple(rest)
+        # Optional[X] and X | None have different origins
         optional = get_origin(kind) in (Union, types.UnionType) and type(None) in get_args(kind)
         default = given.default is not given.empty
         found.append(Parameter(name, section_path(name), optional, default, marks))
@@ -172,9 +174,11 @@ def section_path(name: str, model: type[BaseModel] = Experiment) -> str | None:
     for key, field in model.model_fields.items():
         if name == key:
             return key
+        # the model of a section that may be None is an argument of its union
         inner = next(
             (k for k in (field.annotation, *get_args(field.annotation)) if _is_model(k)), None
         )
+        # keys contain _ themselves: every key that the name begins with is tried
         if inner is not None and name.startswith(f"{key}_"):
             rest = section_path(name[len(key) + 1 :], inner)
             if rest is not None:
@@ -240,6 +244,7 @@ class Graph:
                 if not (known or parameter.default):
                     raise ValueError(f"stage {stage.name}: nothing gives {parameter.name}")
         there = self._existing(stages)
+        # stages of one name are allowed whose conditions exclude each other
         names = [stage.name for stage in there]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -260,13 +265,14 @@ class Graph:
 
     def _existing(self, stages: Sequence[Stage]) -> list[Stage]:
         """Those that have all they cannot do without."""
-        left = [stage for stage in stages if stage.when(self.experiment)]
+        remaining = [stage for stage in stages if stage.when(self.experiment)]
+        # a stage without its inputs goes, and with it those that need its result
         while True:
-            names = {stage.name for stage in left}
-            found = [stage for stage in left if self._is_possible(stage, names)]
-            if len(found) == len(left):
+            names = {stage.name for stage in remaining}
+            found = [stage for stage in remaining if self._is_possible(stage, names)]
+            if len(found) == len(remaining):
                 return found
-            left = found
+            remaining = found
 
     def _is_possible(self, stage: Stage, names: set[str]) -> bool:
         for parameter in parameters(stage.compute):
@@ -288,6 +294,7 @@ class Graph:
         there: set[str] = set()
         waiting = list(stages)
         while waiting:
+            # stages that the experiment has not are not waited for: their parameters are None
             ready = next((s for s in waiting if there >= self._taken(s) & all_names), None)
             if ready is None:
                 raise ValueError(f"stages: {', '.join(s.name for s in waiting)} need each other")
@@ -316,6 +323,7 @@ class Graph:
                 if parameter.name in results:
                     found[parameter.name] = results[parameter.name]
                 elif parameter.name in self._by_name:
+                    # the experiment has this stage: its result is still to come
                     return None
                 else:
                     found[parameter.name] = None
@@ -356,9 +364,11 @@ class Graph:
                 f"using {len(names) - len(missing)} of {len(names)} "
                 f"{stage.name.replace('_', ' ')} from an earlier run"
             )
+        # inputs of parts that are all stored are not computed
         if missing:
             provided |= {"missing": missing, "store": store}
             for name, part in stage.compute(**self._complete(stage, results, provided, store)):
+                # one by one: a stopped run goes on behind the last of them
                 there[name] = store.store_part(name, part) if store else part
         return there
 
@@ -387,17 +397,19 @@ class Graph:
     def keys(self, stage: Stage) -> "Keys":
         """The keys of the experiment that a result depends on, through all that it needs."""
         found: set[tuple[str, Only | But | None]] = set()
-        seen: set[str] = set()
+        visited: set[str] = set()
         waiting = [stage]
         while waiting:
             one = waiting.pop()
-            seen.add(one.name)
+            visited.add(one.name)
+            # sections that select the parts select the result, too
             functions = [one.compute] + ([one.parts] if one.parts else [])
             for parameter in (p for f in functions for p in parameters(f)):
+                # it refuses or lets pass: the result is the same for all values that pass
                 if Guard in parameter.marks:
                     continue
                 if parameter.name in self._names:
-                    if parameter.name in self._by_name and parameter.name not in seen:
+                    if parameter.name in self._by_name and parameter.name not in visited:
                         waiting.append(self[parameter.name])
                 elif parameter.path is not None:
                     marks = [m for m in parameter.marks if isinstance(m, Only | But)]
@@ -425,7 +437,7 @@ def _holds(path: str, mark: Only | But | None, key: str) -> bool:
     if mark is None:
         return True
     listed = any(_is_below(key, f"{path}.{one}") for one in mark.keys)
-    # a section that is left out as a whole is one value, None
+    # a section that is omitted as a whole is one value, None
     return listed == isinstance(mark, Only) or key == path
 
 
@@ -435,6 +447,7 @@ def _is_below(key: str, path: str) -> bool:
 
 def _leaves(settings: Mapping[str, Any], above: str = "") -> Iterable[tuple[str, Any]]:
     for key, value in settings.items():
+        # an empty section is a value, other than a missing one
         if isinstance(value, dict) and value:
             yield from _leaves(value, f"{above}{key}.")
         else:

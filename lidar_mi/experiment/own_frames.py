@@ -181,6 +181,7 @@ is determined
         found,
         etalon.index * gap,
         gap_tolerance,
+        # the phase of reflection depends on the wavelength, as a gap does not
         mirror_orders=[mirrors(fixed, one).order_shift for one in (wavelength, *lines)],
         wavelength_accuracy=wavelength_accuracy,
         achromatic=achromatic,
@@ -273,6 +274,7 @@ def retrieve_v_los(
                 f"{len(batch)}, or a divisor of that"
             )
         emitted, faults = fitted("reference", own, laser)
+        # a frame of the laser is the zero of the frames that follow it
         each = len(batch) // len(own)
         for k, fit in enumerate(received):
             zero = emitted[k // each]
@@ -322,6 +324,7 @@ def _each(
     """The fit of every image, or None and why not."""
     found: list[RingFit | None] = []
     status = []
+    # one by one: a frame that cannot be fitted must not stop the others
     for k, image in enumerate(images):
         try:
             fit = fit_rings(
@@ -334,6 +337,7 @@ def _each(
             )
         except InputError as error:
             found.append(None)
+            # the fit sees one image, the user has a batch
             status.append(str(error).replace("images[0]", f"{name}[{k}]"))
         else:
             found.append(fit)
@@ -362,6 +366,7 @@ def _batch(name: str, frames: Any, doppler: Doppler) -> torch.Tensor:
 def _response(flat: Any, doppler: Doppler) -> torch.Tensor:
     """Responses of the pixels, 1 on average."""
     values = _batch("flat", flat, doppler).double().mean(0)
+    # masked pixels, of 0, must not lower the mean of the others
     mean = float(values[values > 0].mean()) if (values > 0).any() else math.nan
     if not (torch.isfinite(values).all() and math.isfinite(mean)):
         raise InputError("flat: expected finite values, some of them above 0")

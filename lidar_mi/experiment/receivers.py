@@ -85,6 +85,7 @@ def michelson_receiver(
         Its pixels are the elements; the default one if not given.
     """
     harmonics = michelson.harmonics(interferometer)
+    # at the crest of a fringe, where light has the fewest modes
     bright = interferometer.model_copy(update={"order_fraction": 0.0})
     return _receiver(
         lidar,
@@ -141,7 +142,9 @@ def ring_receiver(
     light = camera.illumination(r2)
     cosine = fabry_perot.cosine_inside(etalon, camera.cosine(r2))
     order = fabry_perot.fractional_order(etalon, lidar.wavelength, cosine)
+    # the order, not the radius: in it all rings have the same width
     annulus = np.floor(order * _STEPS).astype(int)
+    # orders fall towards the rim, and bincount takes no negative numbers
     annulus -= annulus.min()
     pixels = np.bincount(annulus)
     used = pixels > 0
@@ -152,6 +155,7 @@ def ring_receiver(
     spread = slope**2 * camera.pixel**2 / 3 * np.bincount(annulus, light * r2)[used] / lit
     amplitudes = fabry_perot.harmonics(etalon, lidar.wavelength)
     n = np.arange(len(amplitudes))
+    # harmonics averaged over a pixel: by a Gaussian of the same variance of the order
     turns = np.exp(2j * math.pi * n * middle[:, None] - 2 * (math.pi * n) ** 2 * spread[:, None])
     return _receiver(
         lidar,
@@ -190,6 +194,7 @@ def required_energy(receiver: Receiver, error: float, v_los: float = 0.0) -> flo
         An error that a million times more or less energy does not have.
     """
 
+    # in logarithms the error falls almost linearly: as E^(-1/2) by shot noise
     def excess(log_energy: float) -> float:
         return math.log(standard_error(receiver, v_los, energy=math.exp(log_energy)) / error)
 
@@ -251,15 +256,18 @@ def _receiver(
     times = np.arange(harmonics.shape[1]) * delay
     usual = standard_atmosphere(lidar.altitude)[1]
     temperatures = [usual * node for node in TEMPERATURE_NODES]
+    # of molecules alone: aerosol is a signal of its own
     lines = [_line(lidar, kelvin, 0.0).characteristic(times) for kelvin in temperatures]
     laser = laser_line(lidar.wavelength, lidar.laser_width).characteristic(times)
     # in front of the receiver, so without an etalon
     sun = solar_background(lidar.model_copy(update={"counted": "detected"}), Etalon())
+    # the spectrum of sunlight is flat: the mean transmission, harmonic 0, passes
     electrons = sun * detector.quantum_efficiency * harmonics[:, 0].real
     dark = detector.dark_current * detector.integration_time * detector.binning**2
     channels = ChannelModel(
         molecules=torch.from_numpy(harmonics * np.array(lines)[:, None]),
         aerosol=torch.from_numpy(harmonics * laser),
+        # in speed, whose shift of the frequency is 2 v / wavelength
         period=lidar.wavelength / (2 * delay),
         temperatures=np.array(temperatures),
         background=torch.from_numpy(electrons + pixels * dark),
@@ -278,6 +286,7 @@ def _monotone(channels: ChannelModel, aerosol: float) -> tuple[float, float]:
     parameters[:, 0] = torch.from_numpy(speeds)
     background = torch.as_tensor(channels.background)
     signal = mean_and_jacobian(channels, parameters)[0] - background
+    # the light's intensity cancels in the ratio
     steps = torch.diff(torch.log(signal[:, 1] / signal[:, 0])).numpy()
     middle = _SPEEDS // 2
     if not steps[middle - 1] * steps[middle] > 0:

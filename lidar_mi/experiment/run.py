@@ -119,6 +119,7 @@ def prepare(
     beside = experiment.folder if beside is None else beside
     graph, log = stages_of(experiment), Log(notice)
     prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
+    # results first: a check may take those of any stage of the preflight
     for stage in graph:
         if stage.preflight and stage.name not in prepared.results:
             _carry_out(graph, stage, prepared)
@@ -156,6 +157,7 @@ def complete(
     store = RunFolder(folder, prepared.experiment, prepared.search_path, shared)
     with store.claimed(overwrite):
         log = prepared.log
+        # behind the claim, which removes the log of another experiment
         log.path = store.log
         log(
             f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
@@ -167,10 +169,12 @@ def complete(
             log("done")
             return prepared
         except BaseException as error:
+            # interrupts, too, which are no Exception
             if is_interrupt(error):
                 error.add_note(RESUMED)
             elif isinstance(error, Exception):
                 log.fail(error)
+                # the message of an InputError names the fault by itself
                 if not isinstance(error, InputError):
                     error.add_note(f"traceback in {log.path}")
             raise
@@ -190,6 +194,7 @@ def finish(prepared: Run, store: Store | None = None, *, with_figures: bool = Tr
     """
     graph = stages_of(prepared.experiment)
     for stage in graph:
+        # the graph computes those on demand where another stage needs them
         left_out = stage.on_demand or (stage.figure_only and not with_figures)
         if stage.name not in prepared.results and not left_out:
             _carry_out(graph, stage, prepared, store)
@@ -208,6 +213,7 @@ def _carry_out(graph: Graph, stage: Stage, run: Run, store: Store | None = None)
     results = cast(dict[str, Any], run.results)
     results[stage.name] = graph.compute(stage, results, run.log, run.search_path, store)
     if stage.timing:
+        # several stages count as one step
         run.seconds[stage.timing] += time.perf_counter() - start
 
 
@@ -215,6 +221,7 @@ def _report(run: Run, store: RunFolder) -> None:
     """Draw the figures; write them, the metrics and the report."""
     made, seconds = chapters(run.experiment, run.results, run.metrics, store.figures, run.log)
     run.seconds |= seconds
+    # figures are drawn from the metrics: their own duration comes last
     run.metrics |= {timing_key(step): round(value, 3) for step, value in seconds.items()}
     store.write_previews()
     resolved, versions = dump(run.experiment), store.record["versions"]

@@ -94,6 +94,7 @@ def steered_beams(
         reported_direction = reported.attitude.apply(_unit(target))
     else:
         reported_direction = _unit(target + np.array([position, 0.0, 0.0]) - reported_origin)
+    # the scanner follows the report; the difference turns the beam with the body
     error = true.attitude * reported.attitude.inv()
     direction = error.apply(reported_direction)
     if jitter > 0 and random is not None:

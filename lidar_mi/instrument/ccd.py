@@ -205,6 +205,7 @@ def expose(
     dark: torch.Tensor | float = ccd.dark_current * ccd.integration_time * ccd.binning**2
     if ccd.response_rms > 0:
         response = _response(ccd, expected)
+        # of the response to light: dark electrons come on top
         means, light = means * response, light * response
     if ccd.hot_pixels or ccd.dead_pixels:
         hot, dead = _bad_pixels(ccd, expected)
@@ -230,8 +231,10 @@ def _read(
     if not bool(torch.isinf(modes).all()):
         shape = modes.expand(mean.shape)
         # the sampler of torch.distributions.Gamma, which accepts no generator
+        # shape M over M: mean 1, variance 1 / M; without speckle any shape will do
         drawn = torch._standard_gamma(torch.nan_to_num(shape, posinf=1.0), generator=generator)
         mean = torch.where(torch.isinf(shape), mean, mean * drawn / shape)
+    # sunlight and dark current have no speckle: they do not share the drawn mean
     electrons = _output(torch.poisson(mean + floor, generator=generator), ccd, generator)
     if ccd.read_noise > 0:
         noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
@@ -239,12 +242,14 @@ def _read(
     if ccd.bits is not None:
         steps = torch.round(electrons / ccd.gain + ccd.bias).clamp(0, 2**ccd.bits - 1)
         electrons = (steps - ccd.bias) * ccd.gain
+    # photoelectrons, before the gain
     return electrons / ccd.multiplication_gain
 
 
 def _output(photoelectrons: torch.Tensor, ccd: CCD, generator: torch.Generator) -> torch.Tensor:
     """Electrons that reach the output: multiplied, clipped at the wells, of nonlinear response."""
     electrons, gain = photoelectrons, ccd.multiplication_gain
+    # the photocathode is in front of the chip's wells, the register behind them
     if ccd.multiplication == "iccd":
         electrons = intensified(electrons, gain, ccd.intensifier_excess, generator)
     electrons = electrons.clamp(max=ccd.chip_well)
@@ -268,6 +273,7 @@ def _bad_pixels(ccd: CCD, expected: torch.Tensor) -> tuple[torch.Tensor, torch.T
     """Whether pixels are hot, whether they are dead: those of the chip, no pixel both."""
     height, width = expected.shape[-2:]
     order = np.random.default_rng([ccd.response_seed, 1]).permutation(height * width)
+    # ranks of one order: with a larger fraction the same pixels stay hot
     rank = torch.from_numpy(np.argsort(order)).reshape(height, width).to(expected.device)
     hot, bad = (
         round(fraction * height * width)

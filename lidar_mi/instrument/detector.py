@@ -121,6 +121,7 @@ def background_photoelectrons(
     wavelength : float
         m.
     """
+    # of a cone, 2 pi (1 - cos), without the cancellation at small angles
     solid_angle = 4 * np.pi * np.sin(fov_half / 2) ** 2
     power = detector.sky_radiance * detector.filter_bandwidth * aperture_area * solid_angle
     return np.asarray(duration, float) * (

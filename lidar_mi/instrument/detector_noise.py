@@ -2,7 +2,7 @@
 
 Counts are the charge collected in a gate, in units of one mean photoelectron: an analogue
 receiver, as the paper's light levels need (10^5 photoelectrons in 17 ns leave no single pulses to
-count). Saturation, dead time, afterpulses and the steps of a digitiser are left out.
+count). Saturation, dead time, afterpulses and the steps of a digitiser are neglected.
 """
 
 import math
@@ -144,14 +144,18 @@ def detect(
             f"lidar.pulse_energy: {lidar.pulse_energy:g} J is not allowed; it gives up to "
             f"{(signal + background + dark).max():g} photoelectrons a gate, expected 1e15 at most"
         )
+    # mean n and variance n^2 / M
     light = random.gamma(modes, signal / modes) if detector.speckle else signal
     counts = np.asarray(random.poisson(light + background + dark), float)
     spread = detector.excess_noise_factor - 1
     if spread > 0:
+        # shape times scale is N, shape times scale squared N (F - 1)
         counts = random.gamma(counts / spread, spread)
     if detector.readout_noise > 0:
+        # variances of the read-outs add
         readout = math.sqrt(pulses) * detector.readout_noise
         counts = counts + random.normal(0, readout, counts.shape)
+    # photoelectrons of all pulses per S0, which is relative to the energy of one
     sensitivity = pulses * signal_photoelectrons(1, lidar.pulse_energy, lidar.wavelength, detector)
     variance = noise_variance(signal, background, dark, modes, detector, pulses)
     return Detection(
@@ -182,7 +186,7 @@ def noisy_scan(
     seed : int or sequence of int
         Different ones for the scans of a pair.
     plan : ScanPlan, optional
-        Where the gates lie; left out: as the scan states, in single precision where it was read
+        Where the gates lie; by default as the scan states, in single precision where it was read
         from a file.
     pulses : int
         Averaged in every beam.
@@ -199,6 +203,7 @@ def noisy_scan(
     duration = np.broadcast_to(gate_duration(plan.gate_length()), s0.shape)
     counted = detect(s0, lidar, detector, duration, ranges, seed, _polarization(scan), pulses)
     scene = (plan, lidar.aperture_area, scan.attrs["environment_extinction"])
+    # attenuated backscatter is proportional to S0, and so is its noise
     y, y_std = (attenuated_backscatter(x, *scene)[0] for x in (counted.s0, counted.s0_std))
     image, pixel = ("gate", "z", "y"), ("z", "y")
     noise = {
@@ -256,6 +261,7 @@ def noise_budget(
         s0, lidar, detector, duration, plan.ranges(), _polarization(scan), pulses
     )
     terms = noise_terms(signal, background, dark, modes, detector, pulses)
+    # relative noise has no value in the dark
     lit = signal > 0
     budget = {
         "photons": signal / efficiency(detector),

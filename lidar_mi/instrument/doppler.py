@@ -143,6 +143,7 @@ def solar_background(lidar: DopplerLidar, etalon: Etalon) -> float:
     Radiance x filter x area x solid angle x time x instrument constant; behind the etalon (with
     ``counted: before_etalon``) times its mean transmission, that of white light.
     """
+    # of a cone, 2 pi (1 - cos), without the cancellation at small angles
     solid_angle = 4 * math.pi * math.sin(lidar.fov_half / 2) ** 2
     power = lidar.sky_radiance * lidar.filter_bandwidth * lidar.telescope_area * solid_angle
     energy = power * lidar.gate_duration * lidar.instrument_constant
@@ -194,6 +195,7 @@ def filtered_coherence_time(line: Line, transmission: Callable[[np.ndarray], np.
     # steps of sigma / 8 of the narrowest Gaussian: sums of its square are exact to rounding
     nu = np.arange(-extent, extent, line.sigmas.min() / 8)
     transmitted = line.pdf(nu) * transmission(nu)
+    # int p^2 dnu, p normalised
     return float((transmitted**2).sum() / transmitted.sum() ** 2 / (nu[1] - nu[0]))
 
 
@@ -234,6 +236,7 @@ def channel_modes(
     """
     # FWHM of the Gaussian line with that coherence time
     width = math.sqrt(2 * math.log(2) / math.pi) / filtered_coherence_time(line, transmission)
+    # light from outside the field of view does not arrive
     footprint = min(lidar.beam_width / 2, lidar.fov_half * lidar.range)
     radius = math.sqrt(lidar.telescope_area / math.pi)
     space = spatial_modes(radius, lidar.wavelength, footprint, lidar.range)

@@ -132,8 +132,10 @@ def sight_volumes(
     """
     directions, ranges = np.asarray(directions, float), np.asarray(ranges, float)
     bin_nodes, bin_weights = np.polynomial.legendre.leggauss(_BIN)
+    # probabilists' Hermite: nodes are standard deviations of a Gaussian
     pulse_nodes, pulse_weights = np.polynomial.hermite_e.hermegauss(_PULSE)
     beam_nodes, beam_weights = np.polynomial.hermite_e.hermegauss(_BEAM)
+    # half the way of light, and from full width at half maximum to standard deviation
     smear = constants.c / 2 * lidar.pulse_duration / math.sqrt(8 * math.log(2))
     offsets = lidar.range_bin / 2 * bin_nodes[:, None] + smear * pulse_nodes
     along = ranges[:, None] + offsets.ravel()
@@ -146,6 +148,7 @@ def sight_volumes(
     signal = signal * np.exp(-2 * lidar.extinction * along) / along**2
     # 1/e^2 radius is twice the standard deviation
     sigma = (lidar.beam_radius + lidar.divergence_full / 2 * along) / 2
+    # elevations stay below 90 degrees: no beam is parallel to z
     across = np.cross(directions, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     above = np.cross(across, directions)
@@ -194,6 +197,7 @@ def wind_at(wind: xr.Dataset, points: np.ndarray) -> np.ndarray:
             )
     values = np.stack([wind[n].transpose(*axes).values for n in ("u", "v", "w")], -1)
     grid = tuple(wind[axis].values.astype(float) for axis in axes)
+    # extrapolates, but by the slack at most
     return RegularGridInterpolator(grid, values, bounds_error=False, fill_value=None)(places)
 
 
@@ -208,7 +212,7 @@ def wind_of_lines(
         As for `wind_at`; or two states of it, dims (time, ...), linear in time between and beyond
         them.
     times : (lines,) array, optional
-        s; 0 for all if left out.
+        s; 0 for all by default.
     """
     if "time" not in wind.dims:
         return wind_at(wind, points)
@@ -270,6 +274,7 @@ def scan_wind(
     std = np.broadcast_to(np.asarray(v_los_std, float), len(directions)).copy()
     if not (std >= 0).all():
         raise InputError(f"v_los_std: {std.min():g} m/s is not allowed; expected >= 0 m/s")
+    # independent streams: either can change without the other
     jitter_seed, noise_seed = np.random.SeedSequence(seed).generate_state(2)
     steered = directions if beams is None else beams.direction
     actual = pointed(steered, errors, int(jitter_seed))
@@ -283,6 +288,7 @@ def scan_wind(
     else:
         met = wind(points)
     mean = np.einsum("lp,lpc->lc", weights, met)
+    # positive toward the instrument: its own advance counts, wind along the beam reduces it
     toward = velocity + np.array([errors.speed, 0.0, 0.0]) - mean
     true = np.einsum("lc,lc->l", actual, toward)
     noise = np.random.default_rng(int(noise_seed)).standard_normal(len(true))

@@ -77,11 +77,13 @@ def harmonics(receiver: DoubleEdge, wavelength: float) -> np.ndarray:
     n = np.arange(len(amplitudes))
     inside = receiver.field_half_angle / etalon.index
     amplitudes = amplitudes * np.sinc(n * etalon.order_at_centre(wavelength) * inside**2 / 2)
+    # half of the spacing on either side: pi, not 2 pi
     below = amplitudes * np.exp(1j * math.pi * n * receiver.spacing * receiver.delay(wavelength))
     above = below.conj()
     if receiver.arrangement == "split":
         return receiver.transmittance / 2 * np.stack([below, above])
     reflected = -below
+    # 1 - T, as nothing is absorbed
     reflected[0] += 1
     # products of series are convolutions of both sides, n from -K to K
     product = np.convolve(_both_sides(reflected), _both_sides(above))
@@ -113,4 +115,5 @@ def transmission(receiver: DoubleEdge, wavelength: float, offset: ArrayLike) -> 
     series = harmonics(receiver, wavelength)
     n = np.arange(series.shape[1])[:, None]
     turns = np.exp(2j * math.pi * n * np.asarray(offset, float) * receiver.delay(wavelength))
+    # the constant counts once
     return 2 * (series @ turns).real - series[:, :1].real

@@ -117,6 +117,7 @@ class Etalon(Description):
             raise InputError(f"wavelength: {wavelength!r} m is not allowed; expected more than 0 m")
         order = 2 * self.index * self.gap / wavelength + mirrors(self, wavelength).order_shift
         if self.order_fraction is not None:
+            # the nearest order: gaps are tuned by a quarter of a wavelength at most
             order = round(order - self.order_fraction) + self.order_fraction
         return order
 
@@ -216,6 +217,7 @@ def harmonics(
     """
     reflectance, transmittance, _ = mirrors(etalon, wavelength)
     if count is None:
+        # the sum of all R^k from n on is R^n / (1 - R)
         count = math.ceil(math.log(1e-12 * (1 - reflectance)) / math.log(reflectance))
     if count > _MOST_HARMONICS:
         raise InputError(
@@ -227,8 +229,9 @@ def harmonics(
     amplitudes = amplitudes * plate_defects(etalon, wavelength, n)
     chi = 1 if line is None else line.characteristic(n / etalon.free_spectral_range(wavelength))
     amplitudes = amplitudes * (chi + 0j)
-    left = np.cumsum(abs(amplitudes[::-1]))[::-1]
-    return amplitudes[: max(2, np.count_nonzero(left > 1e-12 * left[0]))]
+    # the error of a series that ends before n: the sum of all amplitudes from n on
+    remainder = np.cumsum(abs(amplitudes[::-1]))[::-1]
+    return amplitudes[: max(2, np.count_nonzero(remainder > 1e-12 * remainder[0]))]
 
 
 def series(amplitudes: np.ndarray, order: torch.Tensor) -> torch.Tensor:
@@ -236,6 +239,7 @@ def series(amplitudes: np.ndarray, order: torch.Tensor) -> torch.Tensor:
     phase = 2 * math.pi * order.double()
     z = torch.polar(torch.ones_like(phase), phase)
     total = torch.zeros_like(z)
+    # without A_0, which is not doubled
     for amplitude in amplitudes[:0:-1].tolist():
         total += amplitude
         total *= z
@@ -321,6 +325,7 @@ def _less_whole_orders(
 ) -> np.ndarray:
     relative = np.asarray(offset, float) * wavelength / constants.c
     change = gap * (np.asarray(cosine, float) * (1 + relative) - 1)
+    # whole orders are taken off first: of 77 000 they would cost the fraction's digits
     return (centre - math.floor(centre)) + change
 
 
@@ -338,6 +343,7 @@ def _mirror_amplitudes(
         raise InputError("etalon.coatings: null is not allowed here; expected layers")
     cosine = np.asarray(cosine, float)
     wavenumber = 2 * np.pi * (1 / wavelength + np.asarray(offset, float) / constants.c)
+    # squared component along the layers, the same in all of them (Snell)
     across = etalon.index**2 * (1 - cosine**2)
 
     def admittance(index: complex) -> tuple[np.ndarray, np.ndarray]:

@@ -217,6 +217,7 @@ def exposure_at(
     aid = aid or ViewingAid(1.0, aperture)
     entrance = min(aid.objective, aperture * aid.magnification) / 2
     square = beam_radius**2 + (divergence_full / 2 * distance) ** 2
+    # far away the fraction is tiny: 1 - exp would lose its digits
     fraction = -math.expm1(-2 * entrance**2 / square)
     arrived = energy * math.exp(-extinction * distance) * aid.transmission * fraction
     return arrived / (math.pi / 4 * aperture**2)
@@ -258,6 +259,7 @@ def hazard_distance(
     if divergence_full == 0 and extinction == 0:
         return math.inf
     far = beam_radius / divergence_full if divergence_full else 1 / extinction
+    # exposure falls with the distance: doubled until the root is inside
     while excess(far) > 0:
         far *= 2
     return float(optimize.brentq(excess, 0.0, far, xtol=1e-9 * far, rtol=1e-12))
@@ -324,6 +326,7 @@ def scan_hazard_distance(
         return math.inf
     low, high = unsafe[-1], places[places.index(unsafe[-1]) + 1]
     while high / low > 1 + 1e-6:
+        # by halves of the logarithm, as the places are spaced
         middle = math.sqrt(low * high)
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
     return high
@@ -355,17 +358,21 @@ def assess_pulses(
 
 
 def _ultraviolet(nm: float, t: float) -> float:
+    # below 1 ns the table limits the irradiance
     if t < 1e-9:
         return 3e10 * t
+    # C1; C2 is what it is compared with below 315 nm
     thermal = 5.6e3 * t**0.25 if t <= 10 else math.inf
     if nm < 315:
         return min(thermal, 30.0 if nm < 302.5 else 10 ** (0.2 * (nm - 295)))
+    # 1e4 J m^-2 up to 1000 s, 10 W m^-2 beyond
     return min(thermal, max(1e4, 10 * t))
 
 
 def _retina(nm: float, t: float) -> float:
     photochemical = math.inf
     if t > 10 and nm < 600:
+        # C3 times 100 J m^-2 up to 100 s, 1 W m^-2 beyond
         photochemical = 10 ** (0.02 * max(0.0, nm - 450)) * max(100.0, t)
     c4, c7 = 10 ** (0.002 * (min(max(nm, 700.0), 1050.0) - 700)), _c7(nm)
     if nm >= 1050:
@@ -419,6 +426,7 @@ def _repeated(
     if pulse > grouping:
         return permissible_exposure(wavelength, pulse)
     counted = min(total, 10.0)  # T2 of a small source
+    # pulses within T_i have together the limit of one that lasts T_i
     inside = max(rate * grouping, min(burst[0], burst[1] * grouping))
     if inside > 1:
         limit = permissible_exposure(wavelength, grouping) / inside

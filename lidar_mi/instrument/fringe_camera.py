@@ -44,7 +44,7 @@ class FringeCamera(Description):
     `lidar_mi.instrument.etalon.Etalon`. Light at the angle theta to the axis falls
     f tan(theta) from ``centre`` in the ideal image. The light's fall-off towards the rim is a
     Gaussian about that centre; what a lens loses by itself, cos(theta)^4, is 0.05 % in the corners
-    and left out.
+    and neglected.
 
     A real lens distorts the ideal image, a real camera is tilted against it about ``centre``, and
     out of focus a point is a disc. The disc is the same everywhere: what a tilt adds, half a
@@ -131,6 +131,7 @@ class FringeCamera(Description):
         area: np.ndarray | float = 1.0
         if self.tilt != (0, 0):
             (cos_x, sin_x), (cos_y, sin_y) = ((math.cos(t), math.sin(t)) for t in self.tilt)
+            # f / P_z
             nearer = 1 / (1 + (x * sin_x * cos_y + y * sin_y) / self.focal_length)
             area = cos_x * cos_y * nearer**3
             x, y = x * cos_x * nearer, (y * cos_y - x * sin_x * sin_y) * nearer
@@ -256,6 +257,7 @@ def _passed(
         for shift in ((left + x, top + y) for y in nodes for x in nodes):
             squared, area = camera.ideal_image(shift)
             cosine = cosine_inside(etalon, camera.cosine(squared))
+            # a pixel has the light of its area in the ideal image
             falloff = weight * camera.illumination(squared) * area
             light += float(falloff.sum())
             for image, speed in zip(passed, speeds, strict=True):

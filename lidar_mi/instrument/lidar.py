@@ -66,6 +66,7 @@ class BackscatterLidar(Description):
         Variance of the truncated aperture plus that of the divergence.
         """
         edge = 2 * (self.beam_cut / self.beam_radius) ** 2
+        # a Gaussian cut at c keeps 1 - x / (exp(x) - 1) of its variance, x = 2 c^2 / radius^2
         lost = edge / math.expm1(edge) if edge < 500 else 0.0
         spread = self.divergence_full / 2 * np.asarray(distance, float)
         return np.sqrt(self.beam_radius**2 * (1 - lost) + spread**2)

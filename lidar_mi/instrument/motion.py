@@ -144,6 +144,7 @@ class Trajectory:
             )
         time = np.clip(time, first, last)
         place = np.stack([np.interp(time, self.time, axis) for axis in self.place.T], -1)
+        # velocities are those of the straight pieces between the times
         part = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self.time) - 2)
         velocity = (np.diff(self.place, axis=0) / np.diff(self.time)[:, None])[part]
         place[:, 0] -= speed * time
@@ -169,6 +170,7 @@ def attitude(
     roll: float | np.ndarray, pitch: float | np.ndarray, yaw: float | np.ndarray
 ) -> Rotation:
     """Rotation from the body to the lidar's frame by yaw, pitch and roll, in this order, rad."""
+    # capitals: about axes that turn along; about y, to port, the nose goes down
     return Rotation.from_euler("ZYX", np.stack([yaw, np.negative(pitch), roll], -1))
 
 
@@ -198,8 +200,10 @@ def random_process(
     Spectral representation: Shinozuka and Deodatis 1991. The normalised spectrum,
     (1 + (w / b)^2)^-2, is Student's distribution of w sqrt(3) / b with three degrees of freedom.
     """
+    # (1 + (w / b)^2)^-2 is 1/2 at w = b (2^(1/2) - 1)^(1/2)
     corner = 2 * math.pi * bandwidth / math.sqrt(math.sqrt(2) - 1)
     strata = (np.arange(_WAVES) + random.random(_WAVES)) / _WAVES
+    # quantiles of the upper half of the distribution: frequencies are positive
     frequencies = corner / math.sqrt(3) * special.stdtrit(3, (1 + strata) / 2)
     cosine, sine = rms / math.sqrt(_WAVES) * random.standard_normal((2, _WAVES))
     found = np.zeros(len(time))

@@ -158,6 +158,7 @@ def multiple_scattering_fraction(
     fraction = np.divide(multiple, total, out=np.full(total.shape, np.nan), where=total > 0)
     first, second = multiple * np.asarray(single_stderr), single * np.asarray(multiple_stderr)
     correlation = np.clip(correlation, -1, 1)
+    # a sum of squares, as in depolarization_stderr
     root = np.sqrt((first - correlation * second) ** 2 + (1 - correlation**2) * second**2)
     root, total = np.broadcast_arrays(root, total)
     stderr = np.divide(root, total**2, out=np.full(root.shape, np.nan), where=total > 0)

@@ -83,6 +83,7 @@ def pulse_budget(
     echo_time = 2 * farthest / constants.c
     return PulseBudget(
         pulses_per_second=rate,
+        # over all time, turns of the scanner included
         average_power=mean * pulse_energy,
         echo_time=echo_time,
         # rounding must not make an echo that just fits require a second beam
@@ -104,4 +105,5 @@ def pulses_for_error(error_of_one: float, required: float) -> int:
     for name, value in (("error_of_one", error_of_one), ("required", required)):
         if not (value > 0 and math.isfinite(value)):
             raise InputError(f"{name}: {value} m/s is not allowed; expected more than 0 m/s")
+    # rounding must not require a further pulse
     return max(1, math.ceil((error_of_one / required) ** 2 * (1 - 1e-12)))

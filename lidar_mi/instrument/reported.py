@@ -106,7 +106,9 @@ def reported_pose(
         elif rms:
             random = np.random.default_rng([seed, 3, 3, scan + 1, number + 1])
             error[axis] += rms * random.standard_normal()
+    # errors are truth less report
     place = late.place - np.stack([error[axis] for axis in PLACES], -1)
+    # departures are from where straight flight is now, not at the age of the report
     place[:, 0] -= speed * reported.latency
     velocity = late.velocity - [getattr(reported.drift, axis) for axis in PLACES]
     missed = attitude(*(error[axis] for axis in ANGLES))

@@ -119,6 +119,7 @@ class ScanPlan:
 
     def directions(self) -> np.ndarray:
         """Unit vectors of the beams, (rows * columns, 3), row by row from the top left."""
+        # film order begins at the top left of the pilot's view, where y and z are largest
         vertical, lateral = np.meshgrid(self.z[::-1], self.y[::-1], indexing="ij")
         beams = np.stack([np.full_like(lateral, self.centre), lateral, vertical], -1)
         beams = beams.reshape(-1, 3)
@@ -141,6 +142,7 @@ class ScanPlan:
         edges = np.linspace(self.gate_start, self.gate_stop, self.gate_count + 1)
         middle = (edges[1:] + edges[:-1])[:, None, None] / 2
         if self.beams is not None:
+            # the gates stay in the air: an advance of the beam's origin shortens the way
             middle = middle - self.as_image(self.beams.reported_origin[:, 0] - self.position)
         return middle * self._along_beam()
 
@@ -190,6 +192,7 @@ def plan_scans(
         nodes_y, nodes_z = np.asarray(y, float), np.asarray(z, float)
         if scan.aim == "angles":
             middle = (start + stop) / 2
+            # angles are given for t1 and t2
             half = min(index, 1)
             nodes_y = middle * np.tan(_angles(scan.azimuth_half[half], scan.columns))
             nodes_z = middle * np.tan(_angles(scan.elevation_half[half], scan.rows))

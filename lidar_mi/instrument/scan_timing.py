@@ -212,11 +212,14 @@ class ScanTiming(Description):
             active = count / self.beam_rate
         dwell, duration = active / count, active + turns
         line, place = np.divmod(np.arange(count), in_line)
+        # the middle of each dwell
         start = line * (in_line * dwell + self.dead_time) + (place + 0.5) * dwell
         if self.pattern == "serpentine":
             place = np.where(line % 2, in_line - 1 - place, place)
+        # film order is by rows, whichever axis is slow
         film = line * in_line + place if self.slow == "rows" else place * lines + line
         time = np.empty(count)
+        # the reference time is the middle of the scan
         time[film] = start - duration / 2
         vertical, lateral = np.meshgrid(z[::-1], y[::-1], indexing="ij")
         places = np.stack([lateral.ravel(), vertical.ravel()], -1)
@@ -279,6 +282,7 @@ class ScanTiming(Description):
             return distance * np.tan(found) if by_angle else found
 
         duration = count / self.beam_rate if self.beam_rate else self.duration or 0.0
+        # beams in the middles of equal intervals
         part = (np.arange(count) + 0.5) / count
         fine = np.linspace(0, 1, _SAMPLES * max(map(abs, self.cycles or (1, 1))) + 1)
         angles = np.arctan(places(fine) / distance)
@@ -300,6 +304,7 @@ class ScanTiming(Description):
             )
         duration = float(table.time[-1] - table.time[0])
         time = table.time - (table.time[0] + table.time[-1]) / 2
+        # n times have n - 1 intervals between them
         rate = (count - 1) / duration if duration > 0 else math.inf
         load = _largest_rates(table.time, angles)
         return Schedule(time, distance * np.tan(angles), duration, rate, load)
@@ -355,6 +360,7 @@ def _four_digits(value: float, rounded: Callable[[float], int]) -> float:
     if value == 0:
         return 0.0
     unit = 10.0 ** (math.floor(math.log10(value)) - 3)
+    # rounding must not lead from exact digits to the next number
     slack = 1e-9 if rounded is math.floor else -1e-9
     return float(f"{rounded(value / unit + slack) * unit:.4g}")
 

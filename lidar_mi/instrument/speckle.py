@@ -37,6 +37,7 @@ def temporal_modes(line_width: float, duration: ArrayLike) -> np.ndarray:
     duration : array
         T, s.
     """
+    # the duration in coherence times
     x = np.asarray(duration, float) * line_width / np.sqrt(2 * np.log(2) / np.pi)
     return 1 / (special.erf(np.sqrt(np.pi) * x) / x + np.expm1(-np.pi * x**2) / (np.pi * x**2))
 
@@ -68,6 +69,7 @@ def spatial_modes(
     # 1 + a / 2 is the series; for small a the closed form loses digits
     small = a < 1e-6
     safe = np.where(small, 1.0, a)
+    # ive is scaled by exp(-a): the functions themselves overflow
     closed = safe / 2 / (1 - special.ive(0, safe) - special.ive(1, safe))
     return np.where(small, 1 + a / 2, closed)
 

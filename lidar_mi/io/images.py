@@ -26,7 +26,7 @@ def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = 
 
     Values are those of the file, of whatever depth and sign: nothing is scaled or cut. Colours are
     averaged in float64, unweighted: where red, green and blue are equal, the value is theirs.
-    Transparency is left out. A FITS image is read as stored, first row first.
+    Transparency is ignored. A FITS image is read as stored, first row first.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def read_image(
     ----------
     path : path
         EXR, TIFF, PNG, JPEG, JPEG 2000, BMP, GIF, WebP, PGM, PPM, PAM, PFM, FITS, npy, npz, mat,
-        HDF5 or im7 file. Colours are averaged, transparency is left out.
+        HDF5 or im7 file. Colours are averaged, transparency is ignored.
     layer : str, optional
         Of an EXR file; the name of an array in an npz, mat or HDF5 file, of a part of a FITS file.
         Default: of EXR Y_noisy (what a detector delivered), else Y, or the mean of R, G and B; of

@@ -24,7 +24,7 @@ def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
 
     They are the properties ``external_reactions/wake-force-AXIS/magnitude`` (lbf) and
     ``external_reactions/wake-moment-AXIS/magnitude-lbsft``, in JSBSim's axes: x forward, y to
-    starboard, z down. Sockets and files that the original opens are left out.
+    starboard, z down. Sockets and files that the original opens are omitted.
 
     Parameters
     ----------

@@ -35,8 +35,8 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
     """Write the numbers of a data set as point data of a grid or of points.
 
     Values keep their types and NaN; u, v, w together become the vector ``wind``, of u = 0 where
-    there is no u. Numbers without dimensions are repeated at every point of a list, and left out
-    of grids. Units are part of an array's name: ``v [m s-1]``.
+    there is no u. Numbers without dimensions are repeated at every point of a list, and omitted
+    on grids. Units are part of an array's name: ``v [m s-1]``.
 
     Parameters
     ----------

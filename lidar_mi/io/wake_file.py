@@ -239,7 +239,7 @@ def read_wake(
 
     The file's variables lie on (time, x, y, z) in any order; time and x may be missing (a slab
     gets one x plane, at its scalar coordinate or at 0). Descending axes are turned round, units
-    are converted. The lowest levels are left out where a variable has no value at any of their
+    are converted. The lowest levels are omitted where a variable has no value at any of their
     nodes (the ground). Stretched axes and staggered variables are interpolated to even nodes, see
     `lidar_mi.atmosphere.regrid`; the attribute ``interpolated`` then states with which error.
 
@@ -248,7 +248,7 @@ def read_wake(
     path : str or Path
         NetCDF-4 or NetCDF-3 classic.
     time : float, optional
-        s; the file must hold it to 1e-3 of the step to the next state and to 1 ms. May be left out
+        s; the file must hold it to 1e-3 of the step to the next state and to 1 ms. May be omitted
         where there is one time only. In "seconds since ..." axes the count is meant.
     names : mapping, optional
         Our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:

@@ -91,7 +91,7 @@ def find_llvm(folders: Iterable[str | os.PathLike[str]] | None = None) -> list[t
     Returns
     -------
     list of (path, major version)
-        Newest first, each file once (links resolved), links to nowhere left out.
+        Newest first, each file once (links resolved), links to nowhere omitted.
     """
     found: dict[Path, int] = {}
     for folder in library_folders() if folders is None else folders:

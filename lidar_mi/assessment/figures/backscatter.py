@@ -38,7 +38,8 @@ class Scale:
     Attributes
     ----------
     limit : float
-        Speed at the end of the colours, drawn as an arrow one step long, m/s.
+        Speed at the end of the colours, m/s; its arrow is 1.8 times as long as the distance
+        from arrow to arrow.
     y, z : array
         Axes of the plane, m.
     """
@@ -295,6 +296,7 @@ def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Pl
         error = deviations(wind, other).where((wind["flag"] == 0) & (other["flag"] == 0))
         limit = _upper(abs(error["speed"]), 0.99) or 1.0
         for axis in row:
+            # shows where there is no vector
             axis.set_facecolor("0.7")
         image_panel(
             row[0],
@@ -305,6 +307,7 @@ def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Pl
             norm=TwoSlopeNorm(0, -limit, limit),
             cmap="RdBu_r",
         )
+        # directions differ by half a turn at most
         largest = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
         image_panel(
             row[1],
@@ -387,6 +390,7 @@ def _image_differences(truth: ObservedAir, scans: Sequence[xr.Dataset]) -> Plate
     differences = []
     for k, scan in enumerate(scans):
         field = truth.image(k).interp(y=scan["y"], z=scan["z"])
+        # over their means, as units and gain differ
         differences.append(scan["Y"] / scan["Y"].mean() - field / field.mean())
     limit = max(float(abs(d).quantile(0.999)) for d in differences)
     for k, difference in enumerate(differences):

@@ -128,6 +128,7 @@ def _approach(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset | None) -
                 truth[key],
                 color="k",
                 lw=1.2,
+                # one entry in the legend for both
                 label="true vortices" if name == "port" else None,
             )
             axes.errorbar(
@@ -209,6 +210,7 @@ def _draw_slab(axes: Axes, track: xr.Dataset, slabs: xr.Dataset, span: float) ->
         label="wing, where it will pass",
     )
     axes.set(xlabel="y / m (port is left)", ylabel="z / m")
+    # places and times are from the start of the path
     speed = float(np.gradient(track["x"], track["time"]).mean())
     return float(view["x"]) / speed - float(view["delivered"])
 
@@ -241,6 +243,7 @@ def draw_image(axes: Axes, view: xr.Dataset, limits: tuple[float, float] | None 
         rasterized=True,
     )
     axes.set(aspect="equal")
+    # the pilot's view: port, of positive y, is left
     axes.set_xlim(float(view["image_y"].max()), float(view["image_y"].min()))
     axes.set_ylim(float(view["image_z"].min()), float(view["image_z"].max()))
 
@@ -251,6 +254,7 @@ def draw_vectors(axes: Axes, view: xr.Dataset) -> None:
         return
     y, z = np.meshgrid(view["y"], view["z"])
     step = float(view["y"][1] - view["y"][0])
+    # 10 m/s is as long as the vectors are apart
     axes.quiver(
         y,
         z,
@@ -346,6 +350,7 @@ def _fit_limits(axes: Axes, truth: np.ndarray, found: np.ndarray, spread: np.nda
     """Values of truth and estimates, without the widest bands."""
     inside = np.isfinite(found)
     values = np.concatenate([truth[inside], found[inside]]) if inside.any() else truth
+    # the band of a track that begins is many times as wide as later
     wide = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
     margin = max(0.3 * float(np.ptp(values)), 2 * wide, 0.05)
     if np.isfinite([values.min(), values.max(), margin]).all():
@@ -367,6 +372,7 @@ def _moment(series: xr.Dataset) -> Plate:
     )
     moment.plot(
         one["time"],
+        # ailerons that cancel the wake's moment lie on its curve
         -1e-3 * one["control_roll_moment"],
         color="tab:orange",
         lw=1.2,

@@ -86,6 +86,7 @@ def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
         (place[:, 1].max() + place[:, 1].min()) / 2,
         np.ptp(place[:, 1:], axis=0).max() / 2,
     )
+    # the pilot's view: port, of positive y, is left
     panels[0].set_xlim(middle + half + 4, middle - half - 4)
     return figure, (
         "Middles of the range bins; the velocity includes the motion of the platform. Black "
@@ -123,6 +124,7 @@ def _maps(found: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
                 panel.plot(core.y, core.z, "+", color="k", ms=8)
     # lines of sight where they were used
     axes[0, 1].plot(place[:, 1], place[:, 2], "k.", ms=2)
+    # the pilot's view: port, of positive y, is left
     axes[0, 0].set_xlim(float(y.max()), float(y.min()))
     axes[0, 0].set_ylim(float(z.min()), float(z.max()))
     for panel in axes[-1]:
@@ -147,6 +149,7 @@ def _uncertainty(found: xr.Dataset) -> Plate:
     y, z = found["y"], found["z"]
     for panel, name in zip(axes[:2], ("u", "w"), strict=True):
         stderr = found[f"{name}_stderr"].transpose("z", "y").values
+        # few large values must not determine the colours
         top = float(np.quantile(stderr[valid], 0.99)) if valid.any() else 1.0
         mesh = panel.pcolormesh(
             y,
@@ -164,6 +167,7 @@ def _uncertainty(found: xr.Dataset) -> Plate:
             xlabel="y / m (port is left)",
             ylabel="z / m",
         )
+        # the pilot's view, as above
         panel.set_xlim(float(y.max()), float(y.min()))
         figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="max")
     errors = {

@@ -134,6 +134,7 @@ def over_members(values: xr.DataArray) -> Interval:
         return Interval(values, unknown, unknown)
     count = values.notnull().sum(MEMBER)
     mean = values.mean(MEMBER)
+    # a single member has no spread
     several = count.where(count > 1)
     stderr = values.std(MEMBER, ddof=1).where(count > 1) / np.sqrt(several)
     half = stderr * stats.t.ppf((1 + LEVEL) / 2, several - 1)

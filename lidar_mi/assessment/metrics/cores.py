@@ -39,6 +39,7 @@ def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
     v, w = (wind[name].transpose("z", "y").values for name in ("v", "w"))
     vorticity = np.gradient(w, y, axis=1) - np.gradient(v, z, axis=0)
     spacing = y[1] - y[0]
+    # over 1 m, as the peak of noise is a single node
     smooth = ndimage.gaussian_filter(vorticity, 1.0 / spacing)
     lateral, vertical = np.meshgrid(y, z)
     cores = []
@@ -47,12 +48,14 @@ def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
         cy, cz = y[column], z[row]
         for _ in range(10):
             near = np.hypot(lateral - cy, vertical - cz) < 5.0
+            # vorticity of the other sense would shift the centroid
             weight = np.clip(sign * vorticity, 0, None) * near
             if not weight.sum() > 0:
                 break
             cy = float((weight * lateral).sum() / weight.sum())
             cz = float((weight * vertical).sum() / weight.sum())
         edge = min(cy - y[0], y[-1] - cy, cz - z[0], z[-1] - cz)
+        # too few rings for a profile
         if edge < 4 * spacing:
             continue
         rings = np.arange(spacing, edge, spacing / 2)
@@ -101,6 +104,7 @@ def ring_averages(
     )
     if outer > min(edge, near):
         return None
+    # half a step more, so that the outermost ring is included
     rings = np.arange(inner, outer + 0.125, 0.25)
     v, w = (wind[name].transpose("z", "y").values for name in ("v", "w"))
     mean_v, mean_w, swirl = _ring_means(v, w, y, z, core.y, core.z, rings)

@@ -108,10 +108,11 @@ def measured_in_flight(
     are absent without a Doppler lidar.
     """
     measured = track.where(track["vectors"] > 0, drop=True)
+    # as the flight begins: the wake changes it
     speed = float(series["airspeed"].isel(time=0).mean())
-    ahead = _ahead(series, track)
+    look_ahead = _look_ahead(series, track)
     found = {
-        "range": float(np.median(ahead) * speed) if ahead.size else float("nan"),
+        "range": float(np.median(look_ahead) * speed) if look_ahead.size else float("nan"),
         "slabs_per_second": _rate(track["delivered"].values),
         "slab_depth": slab_depth,
         "points_per_slab": float(measured["vectors"].median()) if measured.sizes["slab"] else 0.0,
@@ -140,14 +141,15 @@ def _rate(times: np.ndarray) -> float:
     return round(float(1 / np.median(np.diff(times))), 9) if times.size > 1 else 0.0
 
 
-def _ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
+def _look_ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
     """Time (s) from each estimate to the aircraft's arrival in its plane, where it arrives."""
     flight = series.sel(flight="feedforward")
+    # a flight that ends before a slab never arrives there
     arrival = np.interp(
         track["x"].values, flight["x"].values, flight["time"].values, left=np.nan, right=np.nan
     )
-    ahead = arrival - track["delivered"].values
-    return ahead[np.isfinite(ahead)]
+    look_ahead = arrival - track["delivered"].values
+    return look_ahead[np.isfinite(look_ahead)]
 
 
 def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
@@ -155,9 +157,9 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
     found: dict[str, float] = {"slabs": float(track.sizes["slab"])}
     one = series.sel(flight="feedforward")
     found["prediction_error"] = prediction_error(one)
-    ahead = _ahead(series, track)
-    if ahead.size:
-        found["look_ahead"] = float(np.median(ahead))
+    look_ahead = _look_ahead(series, track)
+    if look_ahead.size:
+        found["look_ahead"] = float(np.median(look_ahead))
     usable = np.flatnonzero(track["usable"].values > 0)
     found["usable_slabs"] = float(usable.size)
     accepted = track["accepted"].values > 0
@@ -175,6 +177,7 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
     dof = track["innovation_dof"].values
     known = (dof > 0) & np.isfinite(track["innovation"].values) & accepted
     if known.any():
+        # 1 where innovations are as large as stated
         found["normalised_innovation"] = float(
             track["innovation"].values[known].sum() / dof[known].sum()
         )
@@ -211,6 +214,7 @@ def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
     if not all(key in found for key in keys):
         return {}
     off, ours, perfect = (found[key] for key in keys)
+    # nothing is removed: the fraction would be one of rounding
     if abs(off - perfect) <= _ROUNDING:
         return {}
     return {f"encounter.removed_of_perfect.{quantity}": (off - ours) / (off - perfect)}

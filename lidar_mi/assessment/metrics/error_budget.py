@@ -53,8 +53,10 @@ def image_scale(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, floa
         np.concatenate([i.values.ravel() for i in pair]) for pair in (blurred, rendered, noise)
     )
     x, y, s = (part[np.isfinite(x) & np.isfinite(y)] for part in (x, y, s))
+    # in even air gain and offset cannot be separated
     if np.ptp(x) < 1e-9 * np.abs(x).max():
         return float(y.mean() / x.mean()), 0.0
+    # polyfit squares its weights
     weight = 1 / s if (s > 0).all() else np.ones_like(s)
     gain, offset = np.polyfit(x / np.abs(x).max(), y, 1, w=weight / weight.max())
     return float(gain / np.abs(x).max()), float(offset)
@@ -252,6 +254,7 @@ def moved_rigidly(
         start = start[:, None] if axis == 0 else start[None, :]
         pixel = np.arange(search)[:, None] if axis == 0 else np.arange(search)[None, :]
         shift = np.nan_to_num(mean[component].values) * dt / spacing
+        # the air of a window comes from where its mean wind leads back to
         place = (start - shift)[:, :, None, None] + pixel
         places.append(np.broadcast_to(place, regions.shape))
     advected = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
@@ -263,6 +266,7 @@ def moved_rigidly(
     pair = [
         _side_by_side(blocks, measured[0]) for blocks in (cut(measured[0].values), advected + rest)
     ]
+    # a stride of a search region: one window in each block
     wind = retrieve(pair, search)
     return found.assign({name: (("z", "y"), wind[name].values) for name in ("v", "w")})
 
@@ -330,6 +334,7 @@ def error_budget(
         errors["time_step"] = _difference(found, dict(zip("vw", chord, strict=True)))
     if perfect is not None:
         bias = _difference(perfect, truth_at_vectors(perfect, truth))
+        # as of the other causes: the errors without it
         errors["method"] = errors[""] - bias
     chosen = np.logical_and.reduce([np.isfinite(e).all(0) for e in errors.values()])
     if not flagged:

@@ -24,6 +24,7 @@ def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
     places = {name: wind[f"{name}_vector"].values for name in axes}
     known = np.ones(wind["v"].shape, bool)
     for name, axis in axes.items():
+        # NaN is in no interval
         known &= (places[name] >= axis[0]) & (places[name] <= axis[-1])
     found = {}
     for name in ("v", "w"):
@@ -47,6 +48,7 @@ def deviations(wind: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
             "v": wind["v"] - reference["v"],
             "w": wind["w"] - reference["w"],
             "speed": np.hypot(wind["v"], wind["w"]) - np.hypot(reference["v"], reference["w"]),
+            # the shorter way round
             "direction": (turned + np.pi) % (2 * np.pi) - np.pi,
         }
     )
@@ -142,6 +144,7 @@ def error_by_quality(
     ``group``.
     """
     error = deviations(wind, truth)
+    # per component
     square = (error["v"] ** 2 + error["w"] ** 2).values / 2
     known = np.isfinite(square) & np.isfinite(wind[quality].values)
     order = np.argsort(wind[quality].values[known])

@@ -36,6 +36,7 @@ class ScanPointing:
         lateral, vertical = np.meshgrid(self.y[::-1], self.z[::-1])
         nodes = np.stack([lateral.ravel(), vertical.ravel()], -1)
         spacing = np.ptp(self.y) / max(self.y.size - 1, 1)
+        # up to rounding
         return bool(np.abs(self.places - nodes).max() < 1e-6 * spacing)
 
 

@@ -74,7 +74,9 @@ def ring_budget_metrics(budget: RingBudget, averaged: tuple[int, ...]) -> dict[s
     metrics["doppler.render.largest_error"] = budget.largest_error
     for centre, (air, laser) in budget.bound.items():
         for number in averaged:
+            # an average shorter than the interval has one frame of the laser
             frames = max(1, number // budget.reference_every)
+            # speeds are differences: the variance of their zero adds
             std = math.hypot(air / math.sqrt(number), laser / math.sqrt(frames))
             metrics[bound_key(centre, number)] = std
     for cause, error in budget.reference_errors.items():

@@ -158,6 +158,7 @@ def limit_metrics(mean_squares: Mapping[str, float]) -> dict[str, float]:
             remaining = square / mean_squares[""]
             key = f"sensor.error_budget.{cause}"
             metrics[f"{key}.rmse_u"] = math.sqrt(square)
+            # sampling is what remains, not what is removed
             metrics[f"{key}.fraction_u"] = remaining if cause == "sampling" else 1 - remaining
     return metrics
 

@@ -29,6 +29,7 @@ def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:
     if "samples_per_beam" in scans[0].attrs:
         key = f"{Source.BACKSCATTER}.samples_per_beam"
         metrics[key] = float(scans[0].attrs["samples_per_beam"])
+    # one scan without it leaves the larger of both unknown
     fraction = max(scan.attrs.get("monte_carlo_fraction", math.inf) for scan in scans)
     if math.isfinite(fraction):
         metrics[f"{Source.NOISY}.monte_carlo_fraction"] = float(fraction)
@@ -131,6 +132,7 @@ def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> li
     """
     place = far_from_cores(metrics, "true_wind.", "rms_")
     found = []
+    # with the detector's noise, if there are such images
     for source in reversed(RENDERED):
         for method in methods:
             noise, error = (

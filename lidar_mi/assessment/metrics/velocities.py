@@ -81,9 +81,11 @@ def _spread(error: np.ndarray, tried: int) -> dict[str, float]:
         "bias_lowest": float(means.min()),
         "bias_highest": float(means.max()),
     }
+    # the mean of each speed takes a degree of freedom
     freedom = int((count[measured] - 1).sum())
     if freedom:
         std = math.sqrt(np.nansum((error[measured] - means[:, None]) ** 2) / freedom)
+        # of a mean over speeds, each mean of variance std^2 / n
         measures["bias_stderr"] = std * math.sqrt((1 / count[measured]).sum()) / measured.sum()
         measures["std"] = std
         measures["std_stderr"] = std / math.sqrt(2 * freedom)

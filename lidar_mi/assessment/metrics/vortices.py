@@ -27,12 +27,13 @@ def true_pair(wind: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
     """Vortices of a true wind, by the names of `VortexPairFit.quantities`.
 
     Circulations and the velocity of the pair are averages over rings of 5 to 15 m about the cores
-    (`cores.ring_averages`); what is undetermined (one vortex only, rings beyond the field) is left
-    out. Circulation far from the core is that of a model, not of a flow.
+    (`cores.ring_averages`); what is undetermined (one vortex only, rings beyond the field) is
+    omitted. Circulation far from the core is that of a model, not of a flow.
     """
     true: dict[str, float] = {}
     advecting = []
     for core in cores:
+        # positive on the port side, as behind a lifting wing
         side = "port" if core.circulation > 0 else "starboard"
         true |= {f"{side}_core_radius": core.radius, f"{side}_y": core.y, f"{side}_z": core.z}
         rings = ring_averages(wind, core, [other for other in cores if other is not core])

@@ -60,6 +60,7 @@ def skill(wind: xr.Dataset) -> dict[str, float]:
     all vectors with that flag.
     """
     flag = wind["flag"].values
+    # no flag, or this one alone
     used = (flag | Flag.NO_SKILL.value) == Flag.NO_SKILL.value
     metrics: dict[str, float] = {}
     for name in ("v", "w"):

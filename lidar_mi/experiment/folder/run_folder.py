@@ -41,9 +41,9 @@ SUMMARY = "summary.txt"
 FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
 RENDERED = (*IMAGES, "fringes_*.exr")
-PREVIEWS = tuple(pattern.replace(".exr", ".png") for pattern in RENDERED)
-"""Beside each rendered image one to look at."""
 """Images of an earlier run of the same experiment that a resumed run reuses."""
+PREVIEWS = tuple(pattern.replace(".exr", ".png") for pattern in RENDERED)
+"""Images to look at, one for each rendered image."""
 RESULTS = {
     "wind": "wind.nc",
     "wind_volume": "wind_volume.nc",
@@ -234,6 +234,7 @@ def write_verdict(
 ) -> None:
     """Write report, answer and metrics of a folder, last the metrics: then it is complete."""
     text = to_json(metrics)
+    # metrics say that the run is complete: old ones must not, if this process is killed
     (folder / METRICS).unlink(missing_ok=True)
     checked = {**record, "metrics": hashlib.sha256(text.encode()).hexdigest()}
     samples = metrics.get(f"{Source.BACKSCATTER}.samples_per_beam")
@@ -333,12 +334,14 @@ def made_by(record: Mapping[str, Any], keys: Keys | None = None) -> str:
     keys : Keys, optional
         Those that matter, of settings and of files that they name; default: all.
     """
+    # in SI units: 0.5 km is the experiment of 500 m
     settings, files = reading.in_si(record["experiment"]), record["files"]
     decisive = {
         "experiment": settings if keys is None else keys.of(settings),
         "files": files if keys is None else keys.of(files),
         "versions": {name: record["versions"][name] for name in _RENDERED_BY},
     }
+    # sorted, as the order of keys has no meaning
     return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
 
 

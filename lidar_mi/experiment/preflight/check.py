@@ -71,6 +71,7 @@ def sections(
     InputError
         Anything that a run would refuse before it starts.
     """
+    # of the processor: other programs do not lengthen it
     start = time.process_time()
     prepared = experiment.prepare(asked, search_path, without_warnings(notice))
     preparation, results = time.process_time() - start, prepared.results
@@ -95,6 +96,7 @@ def sections(
             )
     if timed:
         notice("timing a few samples and a retrieval", None)
+        # with the number that is chosen already: choosing it takes pilots
         whole = with_number(asked, chosen.number) if chosen else asked
         yield "cost of the run, to a factor of 2", _cost(whole, results, preparation)
     if prepared.warnings:
@@ -115,6 +117,7 @@ def _backscatter(
     if not wake.turbine:
         rows.append(("vortices", sense_of_rotation(wind, find_cores(wind))))
     divergence = relative_divergence(wind)
+    # NaN without vorticity to compare with
     if divergence == divergence:
         rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
     rows.append(("extinction", _span(1e3 * extinction.values, "1/km")))
@@ -245,10 +248,10 @@ def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
 
 def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
     """What a scan in time asks of the laser and of the scanner, and the distance flown."""
-    flown = asked.platform.speed * schedule.duration
+    distance = asked.platform.speed * schedule.duration
     return [
         ("duration", f"{schedule.duration:.4g} s"),
-        ("distance flown", f"{flown:.3g} m"),
+        ("distance flown", f"{distance:.3g} m"),
         ("beams per second between turns", f"{schedule.beam_rate:.4g}"),
         ("angular rate", f"{math.degrees(schedule.load.rate):.4g} deg/s"),
         ("angular acceleration", f"{math.degrees(schedule.load.acceleration):.4g} deg/s^2"),

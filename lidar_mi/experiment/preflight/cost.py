@@ -92,6 +92,7 @@ def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> 
     preparation : float
         Processor time that it took, s.
     """
+    # the constants are of another machine; rendering is timed on this one
     here = slowness()
     rendering = 2 * render_seconds(experiment, results) if experiment.wake else 0.0
     return Cost(
@@ -199,8 +200,10 @@ def _images(experiment: Experiment, results: Results) -> float:
     settings = experiment.retrieval
     each = sum(_at(IMAGE_METHODS[method], pixels) for method in settings.methods)
     everything = settings.sources == "all"
+    # extinction, without texture, blurred, backscatter; and the noisy one
     sources = (4 if everything else 1) + bool(experiment.detector and everything)
     seconds = 1.0 + sources * (each + _at(BOUND, pixels))
+    # the levels of the texture sweep
     seconds += 6 * (_at(IMAGE_METHODS[ImageMethod.CC], pixels) + _at(LEVEL, pixels))
     if has_error_budget(experiment):
         seconds += CAUSES * each

@@ -57,6 +57,7 @@ class Path(Section):
 
     @model_validator(mode="after")
     def _above_the_ground(self) -> "Path":
+        # a path that climbs is lowest at its start
         lowest = self.altitude + (self.start + self.beyond) * math.sin(min(self.climb_angle, 0.0))
         if lowest <= 0:
             raise ValueError(

@@ -134,7 +134,7 @@ class Experiment(Tabular, Section):
         return self
 
     @model_validator(mode="after")
-    def _molecules_beside_particles(self) -> Self:
+    def _molecules_with_polarised_particles(self) -> Self:
         phase = self.scattering.phase
         if (
             self.wake
@@ -159,11 +159,11 @@ class Experiment(Tabular, Section):
 
     @model_validator(mode="after")
     def _telescope_stays_before_the_slab(self) -> Self:
-        flown = (self.platform.speed - self.scan.follow) * self.platform.dt
-        if flown >= self.scan.range:
+        advance = (self.platform.speed - self.scan.follow) * self.platform.dt
+        if advance >= self.scan.range:
             raise ValueError(
                 f"scan.range: {self.scan.range:g} m is not allowed; expected more than the "
-                f"{flown:g} m flown in platform.dt"
+                f"{advance:g} m flown in platform.dt"
             )
         return self
 

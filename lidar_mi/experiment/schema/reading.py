@@ -74,6 +74,7 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
     if changes:
         data = settings(found)
         for key, value in changes.items():
+            # a.b: x is {a: {b: x}}, built from the inside
             for part in reversed(key.split(".")):
                 value = {part: value}
             data = merged(data, value)
@@ -192,6 +193,7 @@ def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
         raise InputError(f"{path}: base: {shown} is not allowed; expected an experiment's name")
     sibling = path.parent / base
     file = sibling if sibling.is_file() else experiment_file(base)
+    # links and relative paths may lead to the same file
     chain = (*above, path.resolve())
     if file.resolve() in chain:
         raise InputError(f"{path}: base: {base} is based on this file; expected another experiment")
@@ -228,12 +230,14 @@ def settings(experiment: Experiment, *, si: bool = False) -> dict[str, Any]:
 
 def in_si(given: dict[str, Any]) -> dict[str, Any]:
     """The `settings` of an experiment in SI units: equal for equal experiments."""
+    # the cache must not be changed by a caller
     return copy.deepcopy(_in_si(json.dumps(given)))
 
 
 @functools.lru_cache(64)
 def _in_si(text: str) -> dict[str, Any]:
     """The same of their JSON: a run asks once for each of its stages."""
+    # text, as dictionaries are no keys of a cache
     given = json.loads(text)
     try:
         return settings(check(given, ""), si=True)

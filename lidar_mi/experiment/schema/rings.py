@@ -61,6 +61,7 @@ class Assumed(Section):
     def of(self, described: _Part) -> _Part:
         """A part of the instrument with the assumed values in place of its own."""
         given = self.model_dump(exclude_none=True)
+        # etalon and camera each have some of the assumed values
         own = {name: value for name, value in given.items() if name in type(described).model_fields}
         return described.model_copy(update=own)
 

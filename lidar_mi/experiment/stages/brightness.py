@@ -82,16 +82,16 @@ def least_samples(
     2 where nearly all do.
     """
     distance = float(np.median(plan.ranges()[0]))
-    seen = overlap(lidar, distance)
+    in_view = overlap(lidar, distance)
     if render.estimator == "analog":
         # samples contribute if they collide in the gate
         inside = float(np.median([np.median(field.values) for field in extinction]))
         around = mapping.background + mapping.molecules
         arriving = math.exp(-min(around * plan.gate_start, 300))
-        fraction = seen * inside * float(np.median(plan.gate_length())) * arriving
+        fraction = in_view * inside * float(np.median(plan.gate_length())) * arriving
     else:
-        fraction = seen / plan.gate_count
-        if seen >= 0.9:
+        fraction = in_view / plan.gate_count
+        if in_view >= 0.9:
             return 2
     # their number is counted in 31 bits
     return math.ceil(min(CONTRIBUTIONS / max(fraction, 1e-300), 2.0**31))
@@ -104,18 +104,19 @@ def overlap(lidar: BackscatterLidar, distance: float) -> float:
     point at r from the axis is in view of points of the disc within ``fov_half`` times the
     distance.
     """
-    seen = math.tan(lidar.fov_half) * distance
+    field_radius = math.tan(lidar.fov_half) * distance
     sigma = float(lidar.radius_at(distance)) / 2
     # of a Gaussian in the plane, the fraction beyond r is exp(-r^2 / 2 sigma^2): its quantiles
     beyond = (np.arange(1000) + 0.5) / 1000
     gap = sigma * np.sqrt(-2 * np.log(beyond))
     area = math.pi * lidar.aperture_radius**2
-    return float(_lens(gap, seen, lidar.aperture_radius).mean() / area)
+    return float(_lens(gap, field_radius, lidar.aperture_radius).mean() / area)
 
 
 def _lens(gap: np.ndarray, first: float, second: float) -> np.ndarray:
-    """Area that two circles of given radii have in common, their centres being ``gap`` apart."""
+    """Area of the overlap of two circles of given radii, with ``gap`` between their centres."""
     small, large = min(first, second), max(first, second)
+    # the formula is that of circles that cut each other; the others are replaced below
     separation = np.clip(gap, large - small + 1e-12 * large, large + small)
     # angles at both centres to where the circles meet
     at_small = (separation**2 + small**2 - large**2) / (2 * separation * small)

@@ -120,7 +120,7 @@ def budgets(
     ----------
     scans : the two rendered scans
     cores, flagged : optional
-        See `error_budget`; cores left out: those of the true wind.
+        See `error_budget`; without cores: those of the true wind.
     """
     flows = None
     if experiment.scan.air == "moving":
@@ -165,6 +165,7 @@ def _budgets(
         winds = {}
         for cause, case in images.items():
             source = sources.get(cause)
+            # the run has winds from these images
             if known is not None and source:
                 retrieved = known.sel(source=source, algorithm=method)
                 winds[cause] = retrieved.assign_attrs(method=method, dt=dt, **asdict(sizes))
@@ -223,6 +224,7 @@ def _images(
     air = sensor.slab_images(truth, flows, plans)
     noises = [xr.zeros_like(image) + noise for image in pair]
     ideal, _ = _without_noise(sensor, air, plans, pair)
+    # one scale of all cases, so that they differ by their cause alone
     gain, offset = image_scale(ideal, pair, noises)
 
     def as_measured(
@@ -280,6 +282,7 @@ def platforms_without(platform: Platform) -> dict[str, Platform]:
     """
     found = {}
     motion, reported = platform.motion or Motion(), platform.reported or Reported()
+    # jitter is a cause of its own, which stays without motion
     still = Motion().model_copy(update={"scanner_jitter": motion.scanner_jitter})
     if motion != still:
         found["motion"] = platform.model_copy(update={"motion": still})

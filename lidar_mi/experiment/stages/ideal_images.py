@@ -83,9 +83,9 @@ def ideal_scan(
         return xr.Dataset({"Y": states[0].drop_vars("time").interp(nodes)})
     middle = plan.position + plan.centre
     reported = plan.beams.reported_places(middle)
-    seen = _at_beams(states, plan.beams.time, plan.beams.true_places(middle))
+    values = _at_beams(states, plan.beams.time, plan.beams.true_places(middle))
     fields = {
-        "Y": seen,
+        "Y": values,
         "beam_time": plan.beams.time,
         "y_reported": reported[:, 0],
         "z_reported": reported[:, 1],
@@ -106,12 +106,12 @@ def _at_beams(states: xr.DataArray, time: np.ndarray, places: np.ndarray) -> np.
         ]
     )
     times = states["time"].values
-    seen = np.zeros(len(time))
+    values = np.zeros(len(time))
     for state, one in zip(states.values, np.eye(len(times)), strict=True):
         # interpolation of a unit vector gives the weight of its state at every beam
         weight = np.interp(time, times, one)
         met = weight > 0
         if met.any():
             here = ndimage.map_coordinates(state, index[:, met], order=3, mode="nearest")
-            seen[met] += weight[met] * here
-    return seen
+            values[met] += weight[met] * here
+    return values

@@ -124,13 +124,13 @@ def window_reach(retrieval: Retrieval, platform: Platform, plan: ScanPlan) -> fl
 
 def _of_the_light(lidar: BackscatterLidar, scan: Scan, plan: ScanPlan) -> list[str]:
     """Light that the telescope does not see."""
-    seen = overlap(lidar, float(np.median(plan.ranges()[0])))
-    if seen >= LEAST_OVERLAP:
+    in_view = overlap(lidar, float(np.median(plan.ranges()[0])))
+    if in_view >= LEAST_OVERLAP:
         return []
     key = first_set({"lidar": lidar, "scan": scan}, "lidar.fov_half", "scan.range")
     half = "" if key == "lidar.fov_half" else "a field of view (half angle) of "
     return [
-        f"{key}: {half}{shown(lidar.fov_half, 'mrad')} sees {seen:.0%} of "
+        f"{key}: {half}{shown(lidar.fov_half, 'mrad')} sees {in_view:.0%} of "
         f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
     ]
 

@@ -15,7 +15,7 @@ from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.phase import Scatterer, backscatter_phase_function
 
 LEAST_OVERLAP = 0.9
-"""Of the field of view and the beam; with less, the light that is lost is worth a warning."""
+"""Of the field of view and the beam; with less, a warning states the light that is lost."""
 
 
 class LightBudget(NamedTuple):
@@ -57,17 +57,17 @@ def light_budget(
     """Light and noise of the median pixel.
 
     Single scattering of air whose extinction is that of the truth's median; attenuation within the
-    slab and the molecular part's own phase function are left out. Accurate to some per cent where
+    slab and the molecular part's own phase function are neglected. Accurate to some per cent where
     the air is optically thin; multiple scattering adds to it.
     """
     mapping = wake.extinction
     distance = float(np.median(plan.ranges()[0]))
     length = float(np.median(plan.gate_length()))
     extinction = float(np.median(truth.extinction[0].values))
-    seen = overlap(lidar, distance)
+    in_view = overlap(lidar, distance)
     passing = math.exp(-2 * min((mapping.background + mapping.molecules) * distance, 300))
     backscatter = air.albedo * backscatter_phase_function(air)
-    s0 = seen * passing * lidar.aperture_area / distance**2 * backscatter * extinction * length
+    s0 = in_view * passing * lidar.aperture_area / distance**2 * backscatter * extinction * length
     counted = spread = None
     if detector:
         duration, pulses = gate_duration(length), scan.pulses_per_beam
@@ -75,4 +75,4 @@ def light_budget(
         variance, summed = noise_variance(*means, detector, pulses), float(means[0])
         counted = summed / pulses
         spread = math.sqrt(float(variance)) / summed if summed > 0 else math.inf
-    return LightBudget(seen, passing, 1 / backscatter, s0, counted, spread)
+    return LightBudget(in_view, passing, 1 / backscatter, s0, counted, spread)

@@ -52,6 +52,7 @@ class LineImages:
 
 def line_images(doppler: Doppler, rings: Rings, slowest: float, fastest: float) -> LineImages:
     """Images of air with speeds (m/s) in a range."""
+    # nodes must differ, even if all lines have one speed
     middle, half = (fastest + slowest) / 2, max((fastest - slowest) / 2, 1e-3)
     light, counted = photons(doppler.lidar), doppler.lidar.counted
     air = [
@@ -100,6 +101,7 @@ def line_frames(
     air = []
     for number, speed, distance in zip(lines, speeds, ranges, strict=True):
         lidar = doppler.lidar.model_copy(update={"range": float(distance)})
+        # the range changes the light, not the rings
         mean = images.at(speed) * (photons(lidar) / light)
         # random streams different from those of the images of the Doppler lidar's chapter
         streams = [first + _LINES + number]

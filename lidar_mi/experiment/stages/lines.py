@@ -112,6 +112,7 @@ def check_lines(
         wind_of_lines(states, volumes if beams is None else volumes + beams.origin[:, None])
     except InputError as error:
         raise InputError(f"sensor.directions: {error}") from None
+    # a bound for all directions
     fastest = platform.speed + float(np.sqrt(sum(states[n] ** 2 for n in COMPONENTS)).max())
     limit = rings.model.velocity_range / 2
     if fastest > limit:
@@ -143,7 +144,7 @@ def measure_lines(
     -------
     xr.Dataset, dim (line)
         From `scan_wind`, with ``v_los``, its random ``v_los_std`` and ``v_los_systematic``, which
-        all lines share (m s^-1), as retrieved; NaN where an image gives none.
+        are common to all lines (m s^-1), as retrieved; NaN where an image gives none.
     """
     lines = scan_wind(
         states,
@@ -160,6 +161,7 @@ def measure_lines(
     images = line_images(doppler, rings, true.min(), true.max())
     noises = line_noises(doppler, sensor.pulses, rings)
     retrieved = np.empty((4, len(true)))
+    # so many frames at once as memory holds
     for start in range(0, len(true), FRAMES):
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
         chunk = slice(start, min(start + FRAMES, len(true)))
@@ -213,14 +215,15 @@ def with_speeds(
     Returns
     -------
     xr.Dataset, dim (line)
-        With ``v_los_covariance`` (line, other_line), m^2 s^-2, where lines share a frame of the
-        laser.
+        With ``v_los_covariance`` (line, other_line), m^2 s^-2, where one frame of the
+        laser serves several lines.
     """
     streams = [seed, _DRIFTS + scan]
     drift, drift_std = drifts(doppler, pulses, streams, range(len(v_los)), PULSES)
     # all at once: each variable that a data set takes later copies and aligns it again
     found: dict[str, tuple[Any, ...]] = {
         "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),
+        # independent errors: variances add
         "v_los_std": ("line", np.hypot(std, drift_std), lines.variables["v_los_std"].attrs),
         "v_los_systematic": (
             "line",

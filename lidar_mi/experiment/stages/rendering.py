@@ -48,9 +48,9 @@ def scan_plans(
     scan: Scan, platform: Platform, seed: int, truth: Truth, search_path: Path
 ) -> list[ScanPlan]:
     """The scans of both images, with the beams in time where `timed_plans` has any."""
-    flown = (platform.speed - scan.follow) * platform.dt
+    advance = (platform.speed - scan.follow) * platform.dt
     y, z = truth.wind["y"].values, truth.wind["z"].values
-    plans = plan_scans(scan, y, z, (0.0, flown))
+    plans = plan_scans(scan, y, z, (0.0, advance))
     return timed_plans(scan, platform, seed, plans, search_path)
 
 
@@ -222,10 +222,10 @@ def render_images(
         progress=progress,
         batches=batches_of(IMAGES, store, log, chosen),
     )
-    flown = {"platform_speed": platform.speed, "dt": platform.dt}
+    motion = {"platform_speed": platform.speed, "dt": platform.dt}
     for index, image in zip(wanted, rendered, strict=True):
         image = with_products(image)
-        image.attrs |= flown
+        image.attrs |= motion
         if plans[index].beams is not None:
             image.attrs["reference_time"] = index * platform.dt
             image.attrs["frozen_air"] = int(scan.air == "frozen")
@@ -316,9 +316,9 @@ def chosen_samples(
     pilots = _rendered(fields, wake, lidar, scattering, few, seed, plans, air, wanted)
     found = []
     for plan, pilot in zip(plans, pilots, strict=True):
-        seen = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, scan.pulses_per_beam)
+        noisy = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, scan.pulses_per_beam)
         least = least_samples(lidar, render, wake.extinction, truth.extinction, plan)
-        found.append(choose_samples(seen, number, render, least))
+        found.append(choose_samples(noisy, number, render, least))
     return max(found, key=lambda one: (one.number, one.fraction))
 
 
@@ -431,6 +431,7 @@ def _media(
     """The extinction at both times, extended to the depth and width of the beams."""
     if fields[0].sizes["x"] > 1:
         return list(fields)
+    # one extent for both scans: they meet the same air
     reach = max(plans, key=lambda plan: plan.gate_stop)
     return [
         extrude(field.isel(x=0).transpose(..., "z", "y"), reach, lidar, plans) for field in fields

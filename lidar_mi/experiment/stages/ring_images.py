@@ -99,6 +99,7 @@ def ring_instrument(doppler: Doppler) -> Rings:
         Winds beyond the unambiguous range, fewer than two rings on the CCD, pixels that overflow.
     """
     render, pixels = doppler.render, doppler.camera.width * doppler.camera.height
+    # samples are traced pass by pass
     at_once = min(render.samples_per_pass, pixels * render.samples_per_pixel)
     check_memory(
         PROGRAM + PER_PIXEL * pixels + PER_SAMPLE * at_once,

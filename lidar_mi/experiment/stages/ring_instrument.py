@@ -51,6 +51,7 @@ def ring_model(
     rows = [harmonics(etalon, wavelength, one) for one in lines]
     table = np.zeros((len(rows), max(map(len, rows))), complex)
     for row, values in zip(table, rows, strict=True):
+        # broader lines have fewer harmonics: the others are 0
         row[: len(values)] = values
     diagonal2 = (camera.width**2 + camera.height**2) / 4 * camera.pixel**2
     return RingModel(
@@ -62,6 +63,7 @@ def ring_model(
         order_at_centre=etalon.order_at_centre(wavelength),
         harmonics=table,
         temperatures=np.asarray(temperatures, float),
+        # the exponent of the illumination at half the diagonal
         falloff=2 * diagonal2 / camera.illumination_radius**2,
         tilt=camera.tilt,
         distortion=camera.distortion,
@@ -95,6 +97,7 @@ def air_rings(
         Of the smooth variations of light and background that are fitted along.
     """
     pressure, temperature = standard_atmosphere(lidar.altitude)
+    # aerosol that is fitted has harmonics of its own: the line is that of molecules
     known = lidar.aerosol_fraction if aerosol_std == 0 else 0.0
 
     def line(kelvin: float) -> Line:

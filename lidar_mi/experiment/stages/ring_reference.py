@@ -40,6 +40,7 @@ def reference_frames(averaged: int, every: int, key: str) -> tuple[int, int]:
 def step_speed(doppler: Doppler) -> float:
     """Rms change of the retrieved speed by the drifts from pulse to pulse, m/s."""
     return math.hypot(
+        # v = wavelength / 2 times a change of frequency; c / 2 times a relative one, as of the gap
         doppler.lidar.wavelength / 2 * doppler.reference.laser_drift,
         speed_of_light / 2 * doppler.reference.expansion * doppler.reference.etalon_drift,
     )

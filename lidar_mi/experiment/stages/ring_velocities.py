@@ -314,6 +314,7 @@ def speeds_to_laser(
             if refused:
                 refused(str(error).removeprefix("images[0]: "))
             return np.full((4, 1), np.nan)
+        # one frame refuses the batch: each is tried by itself
         alone = [
             speeds_to_laser(
                 one[None], own[None], doppler, rings, noises, method, centre, refused=refused

@@ -67,9 +67,9 @@ def combined_wind(
     """
     log("combining both lidars")
     try:
-        seen = crossflow(sensor, detector, wind)
-        settings = combine_settings(wake, platform, scan, volume, sensor, seen)
-        found = with_truth(name, scan, slab_wind, lines, seen, settings)
+        images = crossflow(sensor, detector, wind)
+        settings = combine_settings(wake, platform, scan, volume, sensor, images)
+        found = with_truth(name, scan, slab_wind, lines, images, settings)
     except InputError as error:
         log.remark(f"no wind from both lidars: {error}")
         return None
@@ -141,8 +141,8 @@ def _oblique_view(
     if not moves_along(wake, volume):
         return {}
     # the telescope's distance at mid-time
-    flown = (platform.speed - scan.follow) * platform.dt
-    distance = scan.range + scan.thickness / 2 - flown / 2
+    advance = (platform.speed - scan.follow) * platform.dt
+    distance = scan.range + scan.thickness / 2 - advance / 2
     return {"distance": distance, "gate_speed": scan.follow}
 
 
@@ -300,6 +300,7 @@ def mean_squares_without(
             beams,
         )
         # lines without a velocity remain without
+        # the draw of the measurement: cases differ by their cause alone
         noise, std = lines["v_los"] - lines["v_los_true"], lines["v_los_std"]
         if "line_noise" in causes:
             noise, std = 0 * noise, xr.full_like(std, _SURE)

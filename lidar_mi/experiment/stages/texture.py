@@ -42,8 +42,8 @@ def texture_sweep(
     for index, rms in enumerate(LEVELS):
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))
         texture = wake.texture.model_copy(update={"rms": rms})
-        rough = wake.model_copy(update={"texture": texture})
-        truth = true_air(rough, platform, scan, volume, seed, flows, advected=advected)
+        textured = wake.model_copy(update={"texture": texture})
+        truth = true_air(textured, platform, scan, volume, seed, flows, advected=advected)
         wind = retrieve_wind(
             truth.image(0),
             truth.image(1),

@@ -178,17 +178,17 @@ def _fits(key: str, schedule: Schedule, interval: float, name: str) -> None:
 def _poses(platform: Platform, seed: int, search_path: Path) -> Callable[[np.ndarray], Pose]:
     """The true pose at times since the first scan's reference time."""
     motion = platform.motion or Motion()
-    flown = None
+    recorded = None
     if motion.trajectory:
         key = "platform.motion.trajectory"
         path = find_file(motion.trajectory, search_path, key)
         columns = read_timed_table(path, dict.fromkeys(PLACES, "m") | dict.fromkeys(ANGLES, "rad"))
-        flown = trajectory(columns, platform.speed, path.name)
+        recorded = trajectory(columns, platform.speed, path.name)
         _flies(platform, columns, path.name)
 
     def pose_at(time: np.ndarray) -> Pose:
         try:
-            return true_pose(motion, time, platform.speed, seed, flown)
+            return true_pose(motion, time, platform.speed, seed, recorded)
         except InputError as error:
             raise InputError(f"platform.motion.trajectory: {error}") from None
 
@@ -220,6 +220,7 @@ def _beams(
     body_fixed: bool,
     random: np.random.Generator,
 ) -> Beams:
+    # both scans are of one flight, whose zero is the first one's reference time
     clock = number * platform.dt + schedule.time
     true = reported = pose_at(clock)
     if platform.reported is not None and platform.reported != Reported():
@@ -230,6 +231,7 @@ def _beams(
             schedule.places,
             distance,
             position,
+            # in the frame of the air, in which the gates stay
             platform.speed - scan.follow,
             true,
             reported,

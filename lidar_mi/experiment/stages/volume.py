@@ -89,6 +89,7 @@ def grid(wake: Wake, scan: Scan, plans: Sequence[ScanPlan]) -> tuple[np.ndarray,
     for axis in ("z", "y"):
         places = [_places(plan, axis)[0] for plan in plans]
         low, high = max(p[0] for p in places), min(p[-1] for p in places)
+        # rounding must not lose the nodes at the rim
         first = np.ceil(low / spacing - 1e-6)
         nodes.append(spacing * np.arange(first, np.floor(high / spacing + 1e-6) + 1))
     return tuple(nodes)
@@ -98,6 +99,7 @@ def _places(plan: ScanPlan, axis: str) -> np.ndarray:
     """Positions of the beams in the middles of the gates, (gates, beams), m."""
     edges = np.linspace(plan.gate_start, plan.gate_stop, plan.gate_count + 1)
     middle = (edges[1:] + edges[:-1]) / 2
+    # beams spread in proportion to the distance, planar gates cut them at one x
     return middle[:, None] / plan.centre * getattr(plan, axis)
 
 
@@ -235,6 +237,7 @@ def volume_winds(
                     noise=volumes.noise[source],
                 )
             )
+        # attributes of single methods are not those of all
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
     found = found.assign_coords(source=list(volumes.pairs), algorithm=list(volume.methods))

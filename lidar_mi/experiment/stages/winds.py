@@ -80,8 +80,8 @@ def cross_flow_winds(
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
         # the truth's images are photographs
-        seen = times if source in RENDERED else None
-        bound = wind_bound(pair[0], pair[1], platform.dt, noise, window_sizes(retrieval), seen)
+        timed = times if source in RENDERED else None
+        bound = wind_bound(pair[0], pair[1], platform.dt, noise, window_sizes(retrieval), timed)
         methods: list[xr.Dataset] = []
         for method in retrieval.methods:
             wind = retrieve_wind(
@@ -91,7 +91,7 @@ def cross_flow_winds(
                 method=method,
                 **window_settings(retrieval),
                 noise=noise,
-                times=seen,
+                times=timed,
                 # the extinction itself has passed no instrument
                 blur=0.0 if source in EXACT else blur,
             )
@@ -145,6 +145,7 @@ def _image_pairs(
     """Both images and their noise by source: of the truth, then of the lidar."""
     rendered = rendered_pairs(wake, scan, detector, scans)
     if retrieval.sources == "measured":
+        # the last ones: with the detector's noise, if there is a detector
         return dict([rendered.popitem()])
     exact: dict[str, Pair] = {
         Source.EXTINCTION: both(truth.image),
@@ -225,11 +226,13 @@ def attenuated_backscatter_stderr(scan: xr.Dataset) -> xr.DataArray:
     """Standard error of the attenuated backscatter Y, same unit."""
     first = scan.isel(gate=0)
     lit = first["S0"] > 0
+    # Y is proportional to S0: relative errors are the same
     return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
 
 
 def known_blur(retrieval: Retrieval, lidar: BackscatterLidar, plan: ScanPlan) -> float:
     """Standard deviation (m) of the blur that `retrieval.blur` states for the methods."""
+    # of a Gaussian beam the 1/e^2 radius is two standard deviations
     blur = retrieval.blur
     return float(lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
 
@@ -237,7 +240,7 @@ def known_blur(retrieval: Retrieval, lidar: BackscatterLidar, plan: ScanPlan) ->
 def common_error(
     retrieval: Retrieval, platform: Platform, plans: Sequence[ScanPlan]
 ) -> tuple[float, float]:
-    """Standard errors that all vectors share by the pointing between scans.
+    """Standard errors common to all vectors by the pointing between scans.
 
     Of v and of w (m/s), and of a rotation about the axis of roll (rad/s).
     """

@@ -17,7 +17,7 @@ def blur_by_beam(
     has the weight g(k+1) - 2 g(k) + g(k-1), where g(x) is the mean of max(0, x + sigma X) for
     normal X. The spacing adds 1/6 px^2 to the Gaussian's variance: for 0.5 m and the paper's beam,
     two thirds more. Oblique beams also smear the plane over the gate's ``depth`` (m), along the way
-    they take through it; a pulse weighs the gate's middle more than its ends. What is left out
+    they take through it; a pulse weighs the gate's middle more than its ends. What is neglected
     costs less than 0.1 % of a pixel on textured air: the aperture's truncation beyond its variance,
     and that smear where ``depth`` is 0 (500 m, gates of 2.5 m; at 150 m it is wider than the beam).
     """

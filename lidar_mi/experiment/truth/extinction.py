@@ -121,13 +121,13 @@ def true_air(
             factor = factor.expand_dims(x=first["x"].values)
         factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
         if second is None:
-            rough1 = smooth1 * factor
-            rough2 = advected(rough1)
+            textured1 = smooth1 * factor
+            textured2 = advected(textured1)
         else:
-            rough1 = smooth1 * factor
-            rough2 = smooth2 * advected(factor)
+            textured1 = smooth1 * factor
+            textured2 = smooth2 * advected(factor)
     else:
-        rough1, rough2 = smooth1, smooth2
+        textured1, textured2 = smooth1, smooth2
     # winds are retrieved from the first gate
     depth = scan.thickness / scan.gate_count
     gates = (scan.range, scan.range + depth)
@@ -138,9 +138,9 @@ def true_air(
     def with_molecules(field: xr.DataArray) -> xr.DataArray:
         return field.copy(data=field.values + mapping.molecules)
 
-    rough = with_molecules(rough1), with_molecules(rough2)
+    textured = with_molecules(textured1), with_molecules(textured2)
     smooth = with_molecules(smooth1), with_molecules(smooth2)
-    return Truth(rough, smooth, wind)
+    return Truth(textured, smooth, wind)
 
 
 def extinction_of(

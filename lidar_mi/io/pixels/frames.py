@@ -60,7 +60,7 @@ def checked(path: str | Path, pixels: np.ndarray) -> np.ndarray:
 
 
 def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> np.ndarray:
-    """One number a pixel: the mean of red, green and blue; transparency is left out.
+    """One number a pixel: the mean of red, green and blue; transparency is ignored.
 
     Nothing is weighted and no gamma is undone. Where the three are equal, the number is theirs.
 

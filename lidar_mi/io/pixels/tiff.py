@@ -36,7 +36,7 @@ _ALPHA = (1, 2)
 def read_tiff(path: Path) -> Frames:
     """The pages of a file, or the axis of time, depth or channels that its metadata state.
 
-    Reduced copies of a page (pyramids, thumbnails) and masks are left out. A page is turned as its
+    Reduced copies of a page (pyramids, thumbnails) and masks are omitted. A page is turned as its
     orientation says; GDAL's value for missing data becomes NaN.
 
     Raises

@@ -25,7 +25,7 @@ def name_of(maker: Callable[..., Any]) -> str:
     return "own controller" if name == "<lambda>" else name
 
 
-def own_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Controller:
+def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Controller:
     """The controller that a function makes for an aircraft, checked at every call.
 
     Parameters

@@ -6,7 +6,7 @@ import pytest
 
 import lidar_mi as lm
 from lidar_mi.encounter.aircraft import Commands
-from lidar_mi.encounter.own_controller import name_of
+from lidar_mi.encounter.user_controller import name_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.schema.reading import check
@@ -48,7 +48,7 @@ def fly(controller):
         (lambda aircraft: 3, "returned 3 (int) for an aircraft"),
         (lambda aircraft: aircraft.flaps, "AttributeError: "),
         (lambda aircraft: half, "what it returned takes other arguments"),
-        (late, "controller late: ZeroDivisionError: division by zero (test_own_controller.py:"),
+        (late, "controller late: ZeroDivisionError: division by zero (test_user_controller.py:"),
         (
             lambda aircraft: lambda preview, state: Commands(aileron=float("nan")),
             "Commands.aileron: nan (float) at 0.00 s of flight; expected a finite number, rad",
