@@ -198,6 +198,7 @@ def connected(
         # the caller's: it is theirs to close
         # the caller's: it is theirs to close
         # the caller's: it is theirs to close
+        # the caller's: it is theirs to close
         yield client
         return
     if client is not None:
