@@ -196,8 +196,6 @@ def connected(
     if isinstance(client, Client):
         _make_ready(client, threads, own_cache=True)
         # the caller's: it is theirs to close
-        # the caller's: it is theirs to close
-        # the caller's: it is theirs to close
         yield client
         return
     if client is not None:

@@ -262,6 +262,7 @@ def moved_rigidly(
     def cut(image: np.ndarray) -> np.ndarray:
         return sliding_window_view(image, (search, search))[::stride, ::stride]
 
+    # what is not the blurred air, mostly noise, stays as it was
     rest = cut(measured[1].values - blurred[1].values)
     pair = [
         _side_by_side(blocks, measured[0]) for blocks in (cut(measured[0].values), advected + rest)

@@ -138,6 +138,7 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
 def fulfilled(findings: Sequence[Finding]) -> bool | None:
     """Whether all rows pass; None if none fails but some are undetermined."""
     results = {finding.passed for finding in findings}
+    # a row that fails decides, whatever is unknown of others
     if False in results:
         return False
     return None if None in results else True
@@ -239,6 +240,7 @@ def _judged(row: Requirement, measured: float, distance: float) -> Finding:
     if not math.isinf(maximum):
         margins.append(1 - measured / maximum)
     unknown = math.isnan(measured) or math.isnan(maximum)
+    # the nearer limit decides
     margin = math.nan if unknown else min(margins, default=math.inf)
     passed = None if unknown else row.minimum <= measured <= maximum
     return Finding(row.quantity, row.minimum, maximum, measured, passed, margin)

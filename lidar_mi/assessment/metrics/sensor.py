@@ -77,6 +77,7 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
         if beyond.any():
             rmse = error_statistics(error, where=beyond)["rmse"]
             metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
+            # errors as large as this are those of zero wind
             strength = float(np.sqrt((true[beyond] ** 2).mean()))
             metrics[f"sensor.outside_cores.rms_{name}"] = strength
             metrics[f"sensor.outside_cores.std_{name}"] = float(true[beyond].std())

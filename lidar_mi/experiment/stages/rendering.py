@@ -104,12 +104,14 @@ def check_light(
         Air that does not scatter, a detector inconsistent with the pulse, beams too wide for the
         largest medium, moving air in more states than the memory holds.
     """
+    # refuses beams that are too wide for a medium
     _media(lidar, truth.extinction, plans)
     in_states = values_of_states(wake, scan, volume, flows, plans)
     footprint.check_states(len(plans[0].y) * len(plans[0].z), in_states)
     if detector:
         for plan in plans:
             duration = gate_duration(plan.gate_length())
+            # refuses a line narrower than that of the pulse
             speckle_modes(detector, lidar, duration, plan.ranges())
     if not max(float(field.max()) for field in truth.extinction) > 0:
         raise InputError(

@@ -111,6 +111,7 @@ def ring_instrument(doppler: Doppler) -> Rings:
     )
     lidar, etalon, camera, ccd = doppler.lidar, doppler.etalon, doppler.camera, doppler.ccd
     line = air_line(lidar)
+    # of the true instrument: nothing is assumed in place of it
     model, laser = ring_models(doppler.model_copy(update={"assumed": Assumed()}))
     for number in doppler.retrieval.averaged:
         reference_frames(number, doppler.reference.every, "doppler.retrieval.averaged")
@@ -143,6 +144,7 @@ def ring_instrument(doppler: Doppler) -> Rings:
             f"doppler.ccd: a pixel that holds {ccd.saturation:.3g} photoelectrons is not allowed; "
             f"expected more, as the rings' crests have {crest:.3g}"
         )
+    # the image's sum: photons behind the etalon, wherever the lidar equation counts them
     return Rings(line, model, laser, float(image.sum()), background, modes)
 
 
@@ -288,6 +290,7 @@ def reference_photons(doppler: Doppler, rings: Rings) -> float:
 def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:
     """Mean photons per pixel of an image of ``total`` photons."""
     light = torch.from_numpy(image["S0"].values.astype(float))
+    # rendered light is relative: the image gives the pattern alone
     return light * (total / light.sum())
 
 
@@ -300,6 +303,7 @@ def exposed_frames(
     numbers: Sequence[int],
 ) -> torch.Tensor:
     """Sums of so many noisy images each, photoelectrons; of one mean, or one each."""
+    # one draw for all pulses, whose sum has the same statistics
     mean, ccd = averaged * expected, summed(doppler.ccd, averaged)
     modes, background = averaged * rings.modes, averaged * rings.background
 

@@ -109,6 +109,7 @@ def ring_budget(doppler: Doppler, rings: Rings, lit_rings: RingImages, log: Log)
 def _bounds(doppler: Doppler, rings: Rings) -> dict[str, tuple[float, float]]:
     """Cramer-Rao bounds of one image at the first speed and of its reference, m/s, by centre."""
     efficiency, centres = doppler.ccd.quantum_efficiency, doppler.retrieval.centre
+    # photoelectrons, as the signal of the bound
     floor = efficiency * rings.background + doppler.ccd.dark_current * doppler.ccd.integration_time
     both = (
         (rings.model, rings.photons, doppler.v_los[0]),
@@ -182,6 +183,7 @@ def velocities(
                 text = f"retrieving winds from averages of {n} images at {true:g} m/s"
                 log.bar(text, done / total)
                 images = range(first, min(first + FRAMES, settings.images))
+                # a number, and so a random stream, for every image of every case
                 numbers = [(j * len(speeds) + k) * settings.images + i for i in images]
                 frames = exposed_frames(doppler, rings, expected[k], n, seed, numbers)
                 # those that follow one frame of the laser have the same
@@ -199,6 +201,7 @@ def velocities(
                 drifted, drift_std = drifts(
                     doppler, n, [seed, first_of_case], images, "doppler.retrieval.averaged"
                 )
+                # slow methods have the first images of a case alone
                 few = max(0, min(settings.slow_images - first, len(images)))
                 for c, centre in enumerate(settings.centre):
                     for name in fits:

@@ -278,6 +278,7 @@ def mean_squares_without(
     true = {name: truth[name].interp(at).transpose("z", "y").values for name in COMPONENTS}
     surely = {f"{name}_stderr": np.full_like(true[name], _SURE) for name in ("v", "w")}
     surely |= {"v": true["v"], "w": true["w"], "vw_correlation": np.zeros_like(true["v"])}
+    # exact vectors have no common error either
     known = crossflow.drop_vars(COMMON_ERRORS, errors="ignore")
     known = known.assign({name: (("z", "y"), field) for name, field in surely.items()})
     z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
@@ -313,6 +314,7 @@ def mean_squares_without(
             flow = crossflow
             oblique = _oblique_view(wake, platform, scan, volume)
             settings = {"crossflow_std": sensor.crossflow_std, **oblique}
+        # time and drift are no causes: they are the same in all cases
         settings |= timed
         u = combine(flow, changed, **settings)["u"].transpose("z", "y").values
         return float(((u - true["u"])[chosen] ** 2).mean())

@@ -63,11 +63,13 @@ def check_volume(
         raise InputError("wake.file: no wind along x (u) in it; expected u, v and w for volume")
     _check_gates(scan, flows[0])
     shape = tuple(map(len, grid(wake, scan, plans)))
+    # refuses fewer voxels than a window has
     Windows(shape, volume.template, volume.search, volume.stride)
 
 
 def _check_gates(scan: Scan, flow: xr.Dataset) -> None:
     x = flow["x"].values
+    # a plane fills half a step on either side
     half = (x[1] - x[0]) / 2
     if scan.range < x[0] - half or scan.range + scan.thickness > x[-1] + half:
         raise InputError(
