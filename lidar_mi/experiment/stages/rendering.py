@@ -107,7 +107,10 @@ def check_light(
     # refuses beams that are too wide for a medium
     _media(lidar, truth.extinction, plans)
     in_states = values_of_states(wake, scan, volume, flows, plans)
-    footprint.check_states(len(plans[0].y) * len(plans[0].z), in_states)
+    columns, rows = len(plans[0].y), len(plans[0].z)
+    # the flow may be that of another point of a campaign, with another footprint
+    footprint.check_size(columns, rows)
+    footprint.check_states(columns * rows, in_states)
     if detector:
         for plan in plans:
             duration = gate_duration(plan.gate_length())
