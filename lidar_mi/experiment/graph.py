@@ -214,7 +214,7 @@ def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
     for parameter in parameters(function):
         if parameter.name in provided:
             arguments[parameter.name] = provided[parameter.name]
-        elif parameter.path is not None and parameter.name not in given:
+        elif parameter.path is not None:
             arguments[parameter.name] = section(experiment, parameter.path)
     return function(**arguments)
 
