@@ -260,8 +260,7 @@ class Graph:
 
     def needs(self, stage: Stage) -> list[str]:
         """Names of the results that a stage takes."""
-        wanted = [p.name for p in parameters(stage.compute) if p.name in self._names]
-        return [name for name in wanted if name in self._by_name]
+        return [p.name for p in parameters(stage.compute) if p.name in self._by_name]
 
     def _existing(self, stages: Sequence[Stage]) -> list[Stage]:
         """Those that have all they cannot do without."""

@@ -82,9 +82,19 @@ def has_wake(experiment: Experiment) -> bool:
     return experiment.wake is not None
 
 
+def has_volume(experiment: Experiment) -> bool:
+    """Whether winds are retrieved from two volumes."""
+    return experiment.volume is not None
+
+
+def has_sensor(experiment: Experiment) -> bool:
+    """Whether both lidars work as one sensor."""
+    return experiment.sensor is not None
+
+
 def is_without_volume(experiment: Experiment) -> bool:
     """Whether cross-flow winds are retrieved from two images, not winds from two volumes."""
-    return experiment.volume is None
+    return not has_volume(experiment)
 
 
 def has_error_budget(experiment: Experiment) -> bool:
@@ -138,7 +148,7 @@ STAGES = (
     Stage("detector_noise", detector_noise, is_without_volume),
     Stage("pointing", beam_pointing),
     Stage("eye_safety", scan_safety, is_without_volume),
-    Stage("volumes", scan_volumes, check=check_volume, timing="retrieve"),
+    Stage("volumes", scan_volumes, has_volume, check=check_volume, timing="retrieve"),
     Stage("wind_volume", volume_winds, timing="retrieve"),
     Stage("error_budget", error_budgets, has_error_budget, timing="error_budget"),
     # the Doppler lidar
@@ -159,7 +169,7 @@ STAGES = (
     Stage("exposure", exposure, figure_only=True),
     # both as one sensor
     Stage("requirements", requirement_tables, preflight=True),
-    Stage("slab_wind", slab_wind, preflight=True),
+    Stage("slab_wind", slab_wind, has_sensor, preflight=True),
     Stage("states", states_of_wind, preflight=True),
     Stage("line_beams", line_beams, preflight=True),
     Stage("lines", measure_lines, check=check_lines, timing="sensor"),
@@ -169,7 +179,7 @@ STAGES = (
     Stage("costs", lidar_costs),
     Stage("pulses_needed", pulses_needed),
     # the vortices, fitted to the most accurate vectors available
-    Stage("vectors", combined_vectors),
+    Stage("vectors", combined_vectors, has_sensor),
     Stage("vectors", image_vectors, has_image_vortices),
     Stage("vortices", fit_pairs, has_vortices, timing="vortex"),
 )

@@ -55,7 +55,7 @@ def requirement_tables(
     return read_requirements() if platform.speed else {}
 
 
-def slab_wind(sensor: Sensor, truth: Truth) -> xr.Dataset:
+def slab_wind(truth: Truth) -> xr.Dataset:
     """True u, v, w (m s^-1) on (z, y), averaged over the slab; u is 0 in a wake without it."""
     wind = truth.wind
     return wind if "u" in wind else wind.assign(u=xr.zeros_like(wind["v"]))

@@ -144,15 +144,12 @@ def given_samples(
 
 def samples_by_noise(
     wake: Wake,
-    platform: Platform,
     scan: Scan,
     lidar: BackscatterLidar,
     detector: Detector,
     scattering: Scattering,
     render: RenderSettings,
-    volume: Volume | None,
     seed: int,
-    flows: Flows,
     truth: Truth,
     plans: Sequence[ScanPlan],
     air: Scatterer,
@@ -160,20 +157,7 @@ def samples_by_noise(
 ) -> int:
     """Monte Carlo samples per beam, by the noise of the detector; see `chosen_samples`."""
     chosen = chosen_samples(
-        wake,
-        platform,
-        scan,
-        lidar,
-        detector,
-        scattering,
-        render,
-        volume,
-        seed,
-        flows,
-        truth,
-        plans,
-        air,
-        log,
+        wake, scan, lidar, detector, scattering, render, seed, truth, plans, air, log
     )
     log(samples_text(render, chosen))
     return chosen.number
@@ -292,15 +276,12 @@ def _rendered(
 
 def chosen_samples(
     wake: Wake,
-    platform: Platform,
     scan: Scan,
     lidar: BackscatterLidar,
     detector: Detector,
     scattering: Scattering,
     render: RenderSettings,
-    volume: Volume | None,
     seed: int,
-    flows: Flows,
     truth: Truth,
     plans: Sequence[ScanPlan],
     air: Scatterer,

@@ -181,7 +181,6 @@ def scan_volumes(
     scan: Scan,
     lidar: BackscatterLidar,
     detector: Detector | None,
-    volume: Volume,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
 ) -> Volumes:

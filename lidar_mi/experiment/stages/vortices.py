@@ -45,7 +45,7 @@ class VortexFits:
     method: str | None = None
 
 
-def combined_vectors(sensor: Sensor, wind3d: xr.Dataset | None) -> xr.Dataset | None:
+def combined_vectors(wind3d: xr.Dataset | None) -> xr.Dataset | None:
     """Cross-flow wind of both lidars, with the flags of v and w; None: there is none."""
     if wind3d is None:
         return None

@@ -8,7 +8,6 @@ import torch
 import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.retrieval.checks import identical
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
@@ -173,7 +172,7 @@ def _vectors(
         flag = flag | _flags_among_neighbours(found.d, low, windows, validation)
     if checks and method.reach:
         flag = flag | _flags_of_unrelated(clean, given, method)
-    if identical(given.images):
+    if given.same:
         flag = flag | Flag.AT_REST.value
     times = None if method.timed else given.times
     when = vector_times(times, given.dt, windows, found.d.cpu().numpy(), method.centred)

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from lidar_mi.retrieval.checks import identical
 from lidar_mi.retrieval.defects.faint_pattern import Standing
 from lidar_mi.retrieval.defects.removal import CleanImages
 from lidar_mi.retrieval.images.beam_times import VectorTimes
@@ -106,7 +105,7 @@ def _remarks(given: PairInput, clean: CleanImages, pattern: Standing) -> dict[st
         "defects": str(clean.defects),
         "fixed_pattern": ", ".join(patterns),
         "standing_fraction": pattern.fraction,
-        "identical_images": identical(given.images),
+        "identical_images": given.same,
         "illumination": clean.change_of_illumination,
     }
     return {name: value for name, value in said.items() if value}

@@ -8,7 +8,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.checks import checked_stack, identical, on_device, positive
 from lidar_mi.retrieval.images.beam_times import checked_times
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.methods import METHODS, Method
@@ -33,6 +33,8 @@ class PairInput(NamedTuple):
         When each pixel of two images was seen, s from its image's reference time.
     blur, blur_px : float
         Standard deviation of the instrument's blur, m and px.
+    same : str
+        Which images are the same, bit for bit, in words; empty: none.
     """
 
     images: list[xr.DataArray]
@@ -43,6 +45,7 @@ class PairInput(NamedTuple):
     times: list[np.ndarray] | None
     blur: float
     blur_px: float
+    same: str
 
 
 def method_of(name: str | Method) -> Method:
@@ -82,7 +85,8 @@ def checked_input(
     frame, blur_px = windows.on(stack[0].shape), _in_pixels(blur, stack[0])
     pixels = [on_device(image, device) for image in stack]
     known = on_device(level, device) if isinstance(level, xr.DataArray) else level
-    return PairInput(stack, pixels, frame, dt, known, seen, blur, blur_px)
+    same = identical(stack)
+    return PairInput(stack, pixels, frame, dt, known, seen, blur, blur_px, same)
 
 
 def _in_pixels(blur: float, image: xr.DataArray) -> float:
