@@ -38,7 +38,7 @@ def agreement(linear: Linear, windows: Windows) -> torch.Tensor:
 
     Of shape `windows.count`; NaN without contrast.
     """
-    warped, valid = working(linear.warped), linear.valid
+    warped, valid = working(linear.smooth), linear.valid
     box = [torch.ones(windows.template, dtype=warped.dtype, device=warped.device)]
     scores = []
     # of two each is the other's mean

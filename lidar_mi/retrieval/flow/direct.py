@@ -201,7 +201,7 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
     total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
     # kinds of motion share products of derivatives: each product is summed once
     pairs: dict[tuple[tuple[int, int], tuple[int, int]], list[tuple[int, int, int, float]]] = {}
-    for kind, terms in enumerate(_kinds(prior)):
+    for kind, terms in _kinds(prior):
         for a, first, one in terms:
             for b, second, other in terms:
                 pairs.setdefault((first, second), []).append((kind, a, b, one * other))
@@ -216,18 +216,20 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
 
 def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None) -> torch.Tensor:
     """Variance of each kind of motion (kinds, ...) on the prior's mesh, from a band's."""
-    return torch.stack(
-        [
-            reduce(
-                torch.add,
-                (
-                    one * other * spread(covariance[a, b], prior.mesh, first, second, cells)
-                    for a, first, one in terms
-                    for b, second, other in terms
-                ),
-            )
-            for terms in _kinds(prior)
-        ]
+    return prior.by_kind(
+        torch.stack(
+            [
+                reduce(
+                    torch.add,
+                    (
+                        one * other * spread(covariance[a, b], prior.mesh, first, second, cells)
+                        for a, first, one in terms
+                        for b, second, other in terms
+                    ),
+                )
+                for _, terms in _kinds(prior)
+            ]
+        )
     )
 
 
@@ -246,9 +248,6 @@ def rounding(form: torch.Tensor) -> float:
     return _ROUNDING * float(form.amax())
 
 
-def _kinds(prior: Prior) -> list[list[tuple[int, tuple[int, int], float]]]:
+def _kinds(prior: Prior):
     """Each kind's terms as (component, orders of its derivative along z and y, factor)."""
-    return [
-        [(a, (int(b == 0), int(b == 1)), scale) for a, b, scale in motion]
-        for _, motion in prior.motions
-    ]
+    return prior.motions

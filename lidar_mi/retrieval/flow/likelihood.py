@@ -12,8 +12,10 @@ from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
 from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import misfit_variance
-from lidar_mi.retrieval.images.spline import Spline, band_limited, filter_of, nearest
-from lidar_mi.retrieval.images.windows import averaged
+from lidar_mi.retrieval.images.band_limit import Filter
+from lidar_mi.retrieval.images.inpainting import filled_in
+from lidar_mi.retrieval.images.spline import Spline, filter_of, nearest, values_and_slopes
+from lidar_mi.retrieval.images.windows import averaged, stored
 
 # Interpolation error of the splines over an image's rms structure: the least noise assumed.
 _INTERPOLATION = 1e-5
@@ -65,6 +67,7 @@ class Images(NamedTuple):
     """
 
     spline: Spline
+    smooth: Spline
     usable: torch.Tensor
     time: torch.Tensor
     noise: float
@@ -77,11 +80,26 @@ class Images(NamedTuple):
     out_of_plane: float = 0.0
     noise_known: bool = True
     coherent: float = 0.0
+    given_weight: torch.Tensor | None = None
 
     def single(self) -> "Images":
         """The same to be warped in single precision: places to 1e-5 px."""
-        spline = self.spline._replace(coefficients=self.spline.coefficients.float())
-        return self._replace(spline=spline, time=self.time.float(), weight=self.weight.float())
+        spline, smooth = (
+            s._replace(coefficients=s.coefficients.float()) for s in (self.spline, self.smooth)
+        )
+        return self._replace(
+            spline=spline, smooth=smooth, time=self.time.float(), weight=self.weight.float()
+        )
+
+    def filtered(self, chosen: Filter, level: float) -> "Images":
+        """The images after another filter."""
+        finite = torch.stack([stored(filled_in(image)) for image in self.stack])
+        spline, smooth = values_and_slopes(finite, chosen, self.spline.settings)
+        return self._replace(spline=spline, smooth=smooth, noise=level)
+
+    def sample(self, *places: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Values, smooth values and slopes at places (images, ...)."""
+        return self.spline.values(*places), *self.smooth.sample(*places)
 
 
 class Linear(NamedTuple):
@@ -117,6 +135,7 @@ class Linear(NamedTuple):
     weight: torch.Tensor
     information: torch.Tensor
     variance: float
+    smooth: torch.Tensor
     warped: torch.Tensor
     valid: torch.Tensor
 
@@ -133,19 +152,23 @@ def prepared(
     known_noise = 0.0 if noise is None else rms(noise)
     of_spectra = filter_of(images, None, None, weight.sqrt(), blur, settings.filter).level
     noise_known = known_noise**2 > _LEAST_KNOWN * of_spectra**2
-    spline, level = band_limited(
+    chosen = filter_of(
         images,
         known_noise if noise_known else of_spectra,
         weight=weight.sqrt(),
         blur=blur,
         settings=settings.filter,
     )
+    finite = torch.stack([stored(filled_in(image)) for image in images])
+    spline, smooth = values_and_slopes(finite, chosen, settings.filter)
+    level = chosen.level
     level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     # mid-time is that of the whole burst
     time = time - time.mean()
     return Images(
         spline,
+        smooth,
         known_at,
         time,
         level,
@@ -155,6 +178,7 @@ def prepared(
         level,
         known_noise,
         noise_known=noise_known,
+        given_weight=weight,
     )
 
 
@@ -163,7 +187,7 @@ def linearised(
 ) -> Linear:
     """The log-likelihood about a flow; `mesh` is that of the pixels."""
     places = path(mesh, coefficients, images.time, settings.path_order)
-    return linearised_there(images, mesh, places, images.spline.sample(*places), settings)
+    return linearised_there(images, mesh, places, images.sample(*places), settings)
 
 
 def linearised_there(
@@ -174,9 +198,10 @@ def linearised_there(
     settings: VariationalSettings,
 ) -> Linear:
     """`linearised`, with the images' values and slopes at the places of `path`."""
-    value, *slopes = sampled
+    value, smooth, *slopes = sampled
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
     # over air that is in all images: bright air that enters would change the brightness of all
+    smooth, gain = normalised_intensity(smooth, images.weight * valid)
     value, gain = normalised_intensity(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])
     residual = (value - value.mean(0)) * images.weight.sqrt()
@@ -193,25 +218,10 @@ def linearised_there(
     # an image moves by its time times the flow: the derivative weights it by that
     difference = (time * (value - value.mean(0))).sum(0)
     informed = images.spline.efficiency * weight / variance
-    coarse: torch.Tensor | None = None
-    damped = slope
-    if images.coherent:
-        # long waves scatter by variance + coherent s^2 a pixel where structure has the slope s
-        steep = steepness_of_structure(slope, valid)
-        change = images.coherent * steep * images.weight / variance
-        informed = informed / (1 + _SHORT * change)
-        coarse = 1 - ((1 + _SHORT * change) / (1 + change)).sqrt()
-        damped = torch.stack([without_coarse(part, coarse, valid) for part in slope])
-        difference = without_coarse(difference, coarse, valid)
-    downhill = -difference * damped
-    second = images.time.square().sum() * informed
-    information = second / images.spline.excess
-    if mesh.dims == 2:
-        noise = misfit / ((len(value) - 1) * passed * variance)
-        fraction = _fraction_of_texture(images, slope, noise, valid, mesh)
-        information = second * fraction.square() * images.spline.excess
-    gradient = informed * downhill
-    return Linear(slope, damped, coarse, gradient, second, information, variance, value, valid)
+    slope = slope * _fraction_of_texture(images, slope, valid, mesh)
+    gradient = -informed * difference * slope
+    information = images.time.square().sum() * informed
+    return Linear(slope, slope, None, gradient, information, information, variance, smooth, value, valid)
 
 
 def steepness_of_structure(slope: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -251,16 +261,15 @@ def information_of_first(
     information : torch.Tensor, shape (z, y)
         As in `Linear`, of texture that all images show alike. Outliers are not known.
     """
-    _, *slopes = sampled
+    _, _, *slopes = sampled
     # as of the image warped to mid-time: the means of all images' own slopes need no turning
     turned = torch.gradient(places[:, 0], dim=(1, 2))
     slope = torch.stack([(torch.cat(slopes) * along).sum(0) for along in turned])
     valid = nearest(images.usable, places[:, :1])[0] & images.spline.holds(*places).all(0)
     # one image has more noise than the mean of them
-    fraction = _fraction_of_texture(images, slope, None, valid, mesh, number)
+    slope = slope * _fraction_of_texture(images, slope, valid, mesh, number)
     informed = images.spline.efficiency * images.weight * valid / max(images.noise**2, 1e-30)
-    second = images.time.square().sum() * informed
-    return slope, second * fraction.square() * images.spline.excess
+    return slope, images.time.square().sum() * informed
 
 
 def information_near(slope: torch.Tensor, information: torch.Tensor, mesh: Mesh) -> torch.Tensor:
@@ -275,29 +284,18 @@ def _width(mesh: Mesh) -> float:
 
 
 def _fraction_of_texture(
-    images: Images,
-    slope: torch.Tensor,
-    noise: torch.Tensor | None,
-    valid: torch.Tensor,
-    mesh: Mesh,
-    more: float = 1.0,
+    images: Images, slope: torch.Tensor, valid: torch.Tensor, mesh: Mesh, more: float = 1.0
 ) -> torch.Tensor:
-    """Fraction of texture in the mean square of the slopes at each pixel of a plane, 0 to 1.
+    """Regression of the air's slopes on those of the images at each pixel, 1 in its mean.
 
-    Noise has slopes too, and next to bright smoke there are no others. With slopes J = T + N of
-    texture and noise the differences of two images depend on the flow by T J, and scatter by
-    s^2 J^2. Their information on it is (T J)^2 / (s^2 J^2), on average the square of this fraction
-    times J^2 / s^2. Both mean squares are Gaussian means over 1.5 cells of the flow's splines.
-    Where the noise is not known, `noise`, the square of the misfit over that assumed, is its
-    upper limit: texture down to single pixels looks like noise in the spectrum. Slopes may have
-    `more` noise than those of the mean of two images.
+    Noise has slopes too, and next to bright smoke there are no others. The Wiener filter of the
+    slopes makes the regression 1 where texture is as strong as in the mean of the image.
     """
-    width = _width(mesh)
-    power = averaged(slope.square().sum(0) * images.weight, valid, width)
-    noisy: torch.Tensor | float = more * images.spline.noisy_slopes
-    if noise is not None and not images.noise_known:
-        noisy = noisy * averaged(noise, valid, width).clamp(max=1.0)
-    return (1 - noisy / power.clamp(min=1e-30)).clamp(min=0.0)
+    power = averaged(slope.square().sum(0), valid, _width(mesh)).clamp(min=1e-30)
+    noisy = more * images.smooth.noisy_slopes / images.weight
+    fraction = (1 - noisy / power).clamp(min=0.0)
+    mean = (fraction * power)[valid].sum() / power[valid].sum() if bool(valid.any()) else 1.0
+    return fraction / max(float(mean), 1e-6)
 
 
 def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int) -> torch.Tensor:

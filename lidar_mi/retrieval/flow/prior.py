@@ -24,44 +24,48 @@ _EVENED = 0.5
 # vorticity would make the prior stronger for ever.
 _LEAST = 1e-4
 
-Motion = tuple[tuple[int, int, float], ...]
-"""A rate of the flow as terms (component, axis of its derivative, sign)."""
+Motion = tuple[tuple[int, tuple[int, ...], float], ...]
+"""A rate of the flow as terms (component, orders of its derivative along the axes, sign)."""
 
 
-def _rotation(a: int, b: int) -> Motion:
-    return (a, b, 1.0), (b, a, -1.0)
+def _along(dims: int, axis: int) -> tuple[int, ...]:
+    return tuple(int(a == axis) for a in range(dims))
+
+
+def _rotation(dims: int, a: int, b: int) -> Motion:
+    return (a, _along(dims, b), 1.0), (b, _along(dims, a), -1.0)
+
+
+def _divergence(dims: int) -> Motion:
+    return tuple((a, _along(dims, a), 1.0) for a in range(dims))
+
+
+def _gradient(motion: Motion) -> tuple[Motion, ...]:
+    """Derivatives of a motion along all axes."""
+    dims = len(motion[0][1])
+    return tuple(
+        tuple((a, tuple(n + int(axis == c) for axis, n in enumerate(orders)), sign) for a, orders, sign in motion)
+        for c in range(dims)
+    )
 
 
 KINDS: dict[int, tuple[tuple[Motion, ...], ...]] = {
-    2: ((_rotation(0, 1),), (((0, 0, 1.0), (1, 1, 1.0)),)),
+    2: (
+        (_rotation(2, 0, 1),),
+        (_divergence(2),),
+        _gradient(_rotation(2, 0, 1)),
+        _gradient(_divergence(2)),
+    ),
     3: (
-        (_rotation(1, 2),),
-        (_rotation(0, 1), _rotation(0, 2)),
-        (tuple((a, a, 1.0) for a in range(3)),),
+        (_rotation(3, 1, 2),),
+        (_rotation(3, 0, 1), _rotation(3, 0, 2)),
+        (_divergence(3),),
     ),
 }
-"""Kinds of motion by number of dimensions, divergence last.
+"""Kinds of motion by number of dimensions.
 
 In a volume vorticity along x and across x are two kinds: the vortices of a wake lie along x.
 """
-
-
-class Divergence(NamedTuple):
-    """Divergence in a plane: its variance has a uniform part.
-
-    Attributes
-    ----------
-    strength : float
-        Where there is no vorticity, as from wind across the plane.
-    ratio : float
-        Strength over the vorticity's of further divergence, as where splines do not resolve a core.
-    trend : (torch.Tensor, torch.Tensor) of no dimension, optional
-        ln of the strength one round before, and of the ratio estimated for it.
-    """
-
-    strength: float
-    ratio: float
-    trend: tuple[torch.Tensor, torch.Tensor] | None = None
 
 
 class Prior(NamedTuple):
@@ -77,18 +81,13 @@ class Prior(NamedTuple):
         Over which the strength may vary, px.
     spacing : tuple of float
         Of the pixels along each axis, in any unit: rates are those in space.
-    divergence : Divergence, optional
-        Of a plane; in a volume divergence is a local kind.
-    trend : (torch.Tensor, torch.Tensor), optional
-        ln of the local strength one round before, and of the ratio estimated for it.
     """
 
     local: torch.Tensor
     mesh: Mesh
     width: float
     spacing: tuple[float, ...]
-    divergence: Divergence | None = None
-    trend: tuple[torch.Tensor, torch.Tensor] | None = None
+    trend: tuple | None = None
 
     @property
     def cell(self) -> float:
@@ -98,28 +97,33 @@ class Prior(NamedTuple):
 
     @property
     def strength(self) -> torch.Tensor:
-        """Of every kind, (kinds, *mesh.shape)."""
-        if self.divergence is None:
-            return self.local
-        return torch.cat([self.local, self._divergent(self.divergence)[None]])
+        return self.local
 
     @property
     def motions(self) -> list[tuple[int, Motion]]:
         """Every motion with the number of its kind, its terms scaled to rates in space."""
         return [
             # displacements are in pixels of their own axis, distances in those of the other
-            (kind, tuple((a, b, sign * self.spacing[a] / self.spacing[b]) for a, b, sign in motion))
+            (
+                kind,
+                tuple(
+                    (a, orders, sign * self.spacing[a] / math.prod(s**n for s, n in zip(self.spacing, orders, strict=True)))
+                    for a, orders, sign in motion
+                ),
+            )
             for kind, motions in enumerate(KINDS[self.mesh.dims])
             for motion in motions
         ]
 
     def rates(self, coefficients: torch.Tensor) -> torch.Tensor:
         """Motions of flows (..., components, knots) on the mesh: (..., motions, *mesh.shape)."""
-        slopes = self.mesh.slopes(coefficients)
         component = -1 - self.mesh.dims
 
         def rate(motion: Motion) -> torch.Tensor:
-            terms = (scale * slopes[b].select(component, a) for a, b, scale in motion)
+            terms = (
+                scale * self.mesh.field(coefficients.select(component, a), orders)
+                for a, orders, scale in motion
+            )
             return reduce(torch.add, terms)
 
         return torch.stack([rate(motion) for _, motion in self.motions], component)
@@ -128,13 +132,11 @@ class Prior(NamedTuple):
         """The transpose of `rates`: (..., motions, *mesh.shape) to coefficients."""
         dims = self.mesh.dims
         component = -1 - dims
-        shape = list(values.shape)
-        shape[component] = dims
-        parts = [values.new_zeros(shape) for _ in range(dims)]
+        parts: list[torch.Tensor | float] = [0.0] * dims
         for (_, motion), value in zip(self.motions, values.unbind(component), strict=True):
-            for a, b, scale in motion:
-                parts[b].select(component, a).add_(value, alpha=scale)
-        return self.mesh.slopes_transposed(parts)
+            for a, orders, scale in motion:
+                parts[a] = parts[a] + scale * self.mesh.transposed(value, orders)
+        return torch.stack([torch.as_tensor(part) for part in parts], component)
 
     def by_kind(self, squares: torch.Tensor) -> torch.Tensor:
         """(..., motions, *mesh.shape) summed to (..., kinds, *mesh.shape)."""
@@ -150,38 +152,38 @@ class Prior(NamedTuple):
         strength = self.cell * self.strength
         return strength[[kind for kind, _ in self.motions]]
 
-    def updated(
-        self,
-        informed: torch.Tensor,
-        energy: torch.Tensor,
-        settings: VariationalSettings,
-        noise_known: bool = False,
-    ) -> "Prior":
+    def updated(self, informed: torch.Tensor, energy: torch.Tensor, settings: VariationalSettings) -> "Prior":
         """The prior after a step toward largest evidence (MacKay's fixed point).
 
         Parameters
         ----------
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
             Variance of each kind of motion removed by the images, and its square in the flow.
-        settings : VariationalSettings
-        noise_known : bool
-            Whether the noise is known, so that the largest evidence itself is wanted: steps are
-            then those of the secant. Where the noise is that of the misfit, what the flow absorbs
-            is missing in it, and the strength would grow too far.
         """
-        count = len(self.local)
-        most = settings.largest_change_trusted if noise_known else settings.largest_change
-        # over the prior variance 1 / local, so that the mean is not that of the strongest motion
-        removed, found = (self.smooth(self.local * part[:count]) for part in (informed, energy))
-        # strengths vary over decades and stay positive: steps are those of their logarithm
-        trend = self.local.log(), bounded(removed, found, most).log()
-        change = _secant(trend, self.trend if noise_known else None, math.log(most)).exp()
-        # white noise has the variance cells / strength in its mean over a cell between knots
-        local = (self.local * change).clamp(max=_cells(self.mesh) / _LEAST**2)
-        divergence = self.divergence
-        if divergence is not None:
-            divergence = self._updated(divergence, informed[-1], energy[-1], settings)
-        return self._replace(local=local, divergence=divergence, trend=trend)
+        around = self._number_around()
+        known = self.local * self.cell * informed
+        square = self.local * self.cell * energy
+        strength, _ = _strengths(
+            around * self.smooth(known.sum(0)).clamp(min=0),
+            around * self.smooth(square.sum(0)) / self.local[0],
+        )
+        change = strength / self.local[0]
+        whole = known.flatten(1).sum(1).clamp(min=1e-3)
+        spent = (square * change).flatten(1).sum(1).clamp(min=1e-6)
+        ratio = (self.local / self.local[0]).flatten(1)[:, 0]
+        if self.mesh.dims == 2:
+            for kind in (1, 3):
+                whole[kind] += settings.pseudo
+                spent[kind] += settings.pseudo * ratio[kind] / (settings.ratio * ratio[kind - 1])
+        factor = (whole / spent).reshape(-1, *[1] * self.mesh.dims)
+        most = settings.largest
+        step = (change * factor).clamp(1 / most, most) ** settings.relaxation
+        HYPER.append([float("%.3g" % r) for r in ratio])
+        return self._replace(local=(self.local * step).clamp(1e-6, 1e10))
+
+    def _number_around(self) -> float:
+        """Nodes of the mesh that a Gaussian mean of the prior's width counts."""
+        return (4 * math.pi) ** (self.mesh.dims / 2) * self.width**self.mesh.dims / self.cell
 
     def to(self, like: torch.Tensor) -> "Prior":
         """The same in the precision of a tensor."""
@@ -197,72 +199,29 @@ class Prior(NamedTuple):
             kernels.append(kernel / kernel.sum(1, keepdim=True))
         return separable(values, kernels)
 
-    def evened(self) -> "Prior":
-        """With variances averaged over half the width within which they vary little.
 
-        The strength of a place is estimated from few motions. A core in which images hardly show
-        any swirl can take its vorticity for concentrated, and be smoothed the less for it.
-        """
-        wider = self._replace(width=_EVENED * self.width)
-        return self._replace(local=1 / wider.smooth(1 / self.local))
+def _strengths(known, square):
+    half, energy = known.reshape(1, -1) / 2, square.reshape(1, -1) / 2
+    shape = SHAPES.to(half)[:, None]
+    mean = (half / energy).median() * torch.ones_like(shape)
+    for _ in range(_ROUNDS):
+        rate = shape / mean
+        rate = shape / ((shape + half) / (rate + energy)).mean(1, keepdim=True)
+        mean = shape / rate
+    like = shape * rate.log() - torch.lgamma(shape) + torch.lgamma(shape + half) - (shape + half) * (rate + energy).log()
+    best = int(like.mean(1).argmax())
+    HYPER.append((float(shape[best]), float("%.2g" % mean[best])))
+    return ((shape[best] + half[0]) / (rate[best] + energy[0])).reshape(known.shape), None
 
-    def _divergent(self, parts: Divergence) -> torch.Tensor:
-        """Strength of all divergence in a plane: its variances add."""
-        return 1 / (1 / parts.strength + 1 / (parts.ratio * self.local[0]))
-
-    def _updated(
-        self,
-        before: Divergence,
-        informed: torch.Tensor,
-        energy: torch.Tensor,
-        settings: VariationalSettings,
-    ) -> Divergence:
-        all_of_it = self._divergent(before)
-        # of the variance of divergence, the part that is the same everywhere
-        fraction = all_of_it / before.strength
-        largest = settings.largest_change_divergence
-        everywhere, in_cores = (
-            float(
-                bounded(
-                    (part * all_of_it * informed).mean(), (part * all_of_it * energy).mean(), most
-                )
-            )
-            for part, most in ((fraction, largest), (1 - fraction, settings.largest_change))
-        )
-        trend = torch.tensor(before.strength).log(), torch.tensor(everywhere).log()
-        # images of weak texture without measurable divergence are no evidence that there is none
-        most = settings.largest_ratio / float((1 / self.local[0]).mean())
-        change = float(_secant(trend, before.trend, math.log(largest)).exp())
-        return Divergence(min(before.strength * change, most), before.ratio * in_cores, trend)
-
-
-def _secant(
-    now: tuple[torch.Tensor, torch.Tensor],
-    before: tuple[torch.Tensor, torch.Tensor] | None,
-    limit: float,
-) -> torch.Tensor:
-    """Change of ln strength that brings ln of its ratio to 0, by the secant of two rounds.
-
-    Where the images inform little, the fixed point alone would take hundreds of rounds.
-    """
-    # of slope -1 the step is the fixed point: the strength times its ratio
-    slope = -torch.ones_like(now[1])
-    if before is not None:
-        run = now[0] - before[0]
-        secant = (now[1] - before[1]) / torch.where(run == 0, 1.0, run)
-        # no shorter than at the fixed point, and at most 1 / _SLOWEST times as long
-        slope = torch.where(run == 0, slope, secant.clamp(-1.0, -_SLOWEST))
-    return (-now[1] / slope).clamp(-limit, limit)
+SHAPES = 0.05 * 2.0 ** torch.arange(10)
+HYPER=[]
+_SHAPES = [0.1 * 2 ** (0.5*k) for k in range(16)]
+_ROUNDS = 20
 
 
 def _cells(mesh: Mesh) -> float:
     """Cells between knots per pixel, of a mesh at half the spacing of the knots."""
     return math.prod(axis.cells / axis.size for axis in mesh.axes)
-
-
-def bounded(informed: torch.Tensor, energy: torch.Tensor, most: float) -> torch.Tensor:
-    """Ratio of the two, at most this factor from 1: far from the fixed point it may be 0."""
-    return (informed.clamp(min=0) / energy.clamp(min=1e-30)).clamp(1 / most, most)
 
 
 def first_prior(
@@ -277,14 +236,17 @@ def first_prior(
     dims = mesh.dims
     one = torch.ones(len(KINDS[dims]), *mesh.shape).to(coefficients)
     prior = Prior(one, mesh, width, tuple(spacing))
-    vorticity = prior.by_kind(prior.rates(coefficients).square())[:-1].sum(0)
+    vorticity = prior.by_kind(prior.rates(coefficients).square())[: dims - 1].sum(0)
     vorticity = vorticity.mean() if dims == 2 else prior.smooth(vorticity)
     strength = (dims - 1) * _cells(mesh) / (vorticity + settings.least_vorticity**2)
-    if dims == 2:
-        divergence = Divergence(settings.ratio * float(strength), settings.ratio)
-        return prior._replace(local=strength * one[:1], divergence=divergence)
     local = strength * one
-    local[-1] *= settings.ratio
+    if dims == 2:
+        width = (axes[0].size - 1) / axes[0].cells
+        local[1] *= settings.ratio
+        local[2] *= width**2
+        local[3] *= width**2 * settings.ratio
+    else:
+        local[-1] *= 100.0
     return prior._replace(local=local)
 
 
@@ -293,6 +255,4 @@ def refined(prior: Prior, axes: Sequence[Axis]) -> Prior:
     mesh = halves(axes, prior.local)
     # from core to still air the strength changes by decades: its logarithm is smoother
     local = interpolated(prior.local.log(), prior.mesh.places, mesh.places).exp()
-    # a secant through rounds on different knots would be none
-    trendless = prior.divergence and prior.divergence._replace(trend=None)
-    return prior._replace(local=local, mesh=mesh, divergence=trendless, trend=None)
+    return prior._replace(local=local, mesh=mesh, trend=None)

@@ -144,7 +144,8 @@ class VariationalSettings:
     """
 
     knots: tuple[float, ...] = (1.25, 0.5)
-    rounds: tuple[int, ...] = (6, 4)
+    rounds: tuple[int, ...] = (6, 8)
+    noise_rounds: tuple = ((2, 4), (2, 5))
     noise_round: int = 2
     rounds_changed: int = 2
     rounds_finer: int = 5
@@ -155,7 +156,11 @@ class VariationalSettings:
     misfit_width_trusted: float = 0.75
     noise_width: float = MAP_WIDTH
     ridge: float = 1e-4
-    ratio: float = 100.0
+    ratio: float = 5.0
+    pseudo: float = 10
+    largest: float = 16.0
+    relaxation: float = 1.5
+    wide: float = 3.0
     least_vorticity: float = 1e-3
     largest_ratio: float = 1e5
     prior_width: float = 0.65

@@ -12,7 +12,7 @@ import torch
 from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.flow import direct, iterative, strips
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.flow.change import mean_square_strain
+from lidar_mi.retrieval.flow.components import estimated
 from lidar_mi.retrieval.flow.coherent_change import residual_operator
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import linearised, prepared
@@ -146,15 +146,13 @@ def variational_and_flow(
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
     given_weight = images.weight
-    noise_known = images.noise_known and windows.dims == 2
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
-    flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
-    last, displaced_only = len(settings.knots) - 1, flow
+    flow, _ = first_pass(stack, images.smooth, windows, Grid(windows.shape, 0.0, like))
+    last = len(settings.knots) - 1
     prior: Prior | None = None
     posterior: direct.Posterior | strips.Posterior | iterative.Posterior | None = None
-    width = settings.misfit_width_trusted if noise_known else settings.misfit_width
-    width *= windows.template
+    finer = None
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
         separation = max(2.0, knots * windows.template)
         axes = [Axis(n, separation) for n in windows.shape]
@@ -163,76 +161,52 @@ def variational_and_flow(
         coefficients = mesh.fitted(flow)
         if prior is None:
             unit = (1.0,) * windows.dims
-            wide = settings.prior_width_trusted if noise_known else settings.prior_width
-            wide *= windows.template
+            wide = settings.prior_width * windows.template
             prior = first_prior(axes, working(coefficients), wide, spacing or unit, settings)
         else:
             prior = refined(prior, axes)
-        in_single, iteration = images.single(), 0
-        while iteration < rounds + settings.rounds_changed * (images.out_of_plane > 0):
-            if level == last and iteration in (settings.noise_round, rounds):
+        in_single = images.single()
+        for iteration in range(rounds):
+            if iteration in settings.noise_rounds[level]:
                 linear = linearised(images, mesh, coefficients, settings)
-                displaced_only = displaced_only if iteration == rounds else mesh.field(coefficients)
-                residual_of, strain = None, 0.0
-                if isinstance(posterior, direct.Posterior | strips.Posterior):
-                    residual_of = residual_operator(linear, mesh, posterior.response)
-                    strain = mean_square_strain(mesh.slopes(coefficients))
-                white = images.white
-                images = with_local_noise(
-                    images, linear, width, settings.coloured, separation, strain, residual_of
+                images, finer = estimated(
+                    images, linear, mesh, coefficients, posterior, prior, separation, windows.template
                 )
-                # flow and prior so far are those of a noise that was far too large
-                if iteration == settings.noise_round and images.white < white:
-                    rounds += settings.rounds_finer
                 in_single = images.single()
             linear = linearised(in_single, single, coefficients.float(), settings)
             posterior = solve(linear, single, coefficients, prior, settings, iteration)
             coefficients = posterior.coefficients.to(like)
             # the first flow on coarse knots is too far off to estimate the prior from
             if iteration or level:
-                prior = prior.updated(*posterior.evidence(), settings, noise_known)
-            iteration += 1
+                prior = prior.updated(*posterior.evidence(), settings)
         flow = mesh.field(coefficients)
     assert prior is not None  # settings have a level at least
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
-    evened = posterior
-    if noise_known:
-        evened = solve(linear, mesh, coefficients, prior.evened(), settings, settings.rounds[-1])
     flow = mesh.field(posterior.coefficients.to(like))
-    # a flow that depends on how much is assumed to move otherwise is not in the images
-    undetermined = images.out_of_plane > 0 and _differ(flow, displaced_only, 1.0)
-    if images.coherent and not undetermined:
-        farther = images._replace(coherent=_FARTHER**2 * images.coherent)
-        there = linearised(farther, mesh, posterior.coefficients.to(like), settings)
-        other = solve(there, mesh, posterior.coefficients, prior, settings, settings.rounds[-1])
-        undetermined = _differ(flow, mesh.field(other.coefficients.to(like)), _ALIKE)
+    from lidar_mi.retrieval.flow.components import DEBUG
+    res=(linear.warped-linear.warped.mean(0)).square().sum(0)*images.weight/images.noise**2
+    dd=(images.time.reshape(-1,1,1)*linear.warped).sum(0)/images.time.square().sum()*images.weight.sqrt()*linear.valid
+    from lidar_mi.retrieval.images.band_limit import radii, shell_means
+    from lidar_mi.retrieval.images.spline import transform_sizes
+    sz=transform_sizes(images.spline.shape,images.spline.settings); _,sh=radii(tuple(sz),images.spline.shape,dd.dtype,dd.device)
+    den,_=shell_means(dd[None]*images.time.square().sum().sqrt()/images.noise,sh,sz,5)
+    DEBUG.append({"chi2":float(res[linear.valid].mean()),**{f"s{i}":float(den[i]) for i in range(0,len(den),8)}})
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     at_centres = Mesh(mesh.axes, centres)
     d = at_centres.field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
-    known = (found.flag == 0) & ~no_skill(d, covariance)
-    known = interpolated(known.to(like), centres, pixels) > 0.5
-    # where the noise is not given, little is known of what it makes; in strips and in volumes a
-    # draw takes as long as a step to the flow, and changes errors by 1 %
-    of_noise = None
-    if noise_known and isinstance(posterior, direct.Posterior):
-        of_noise = flows_of_noise(linear, mesh, posterior.response)
-    finer = unresolved_variance(flow, separation, known, of_noise)
+    from lidar_mi.retrieval.flow.components import DEBUG; DEBUG.append({"post": float(covariance.diagonal().mean()**.5*5),"fin":float(finer.mean().clamp(min=0)**.5*5)})
     finer = interpolated(finer, pixels, centres)
-    # neither what the splines do not resolve nor the prior's strength is in the posterior
-    off = at_centres.field((evened.coefficients - posterior.coefficients).to(like))
-    additional = with_unresolved(_beyond_chance(off.to(covariance), covariance), finer)
+    additional = with_unresolved(torch.zeros_like(covariance), finer)
     covariance = covariance + additional
     found = found._replace(covariance=covariance)
     if windows.dims > 2:
         return found, None
     found = found._replace(flag=found.flag | unskilled(found.d, covariance))
-    if undetermined:
-        found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
-    if undetermined or not (keep and isinstance(posterior, direct.Posterior)):
+    if not (keep and isinstance(posterior, direct.Posterior)):
         return found, None
     return found, flow_of(
         posterior, linear, images, given_weight, before, additional, windows, settings

@@ -45,6 +45,10 @@ class Filter(NamedTuple):
     excess: float
     efficiency: float
     noisy_slopes: float
+    values: torch.Tensor
+    slopes: torch.Tensor
+    values_passed: float
+    slopes_noise: float
 
 
 class PowerSpectrum(NamedTuple):
@@ -140,6 +144,8 @@ def best_filter(
     # times sqrt(noise^2 / N) the filter whitens the mismatch (Hannan & Thomson 1973)
     white = level / floor if mismatch is not None else torch.ones_like(response)
     gain = (response * white).sqrt()
+    # without blur differences keep their noise, and slopes are the likeliest ones of the texture
+    values, slopes = (gain, gain) if blur else (white.sqrt(), response * white.sqrt())
     # power of the filtered slopes with noise, the part of it from texture, and its variance
     # the mean of two images has half the variance of their noise
     both = texture + floor / 2
@@ -155,6 +161,11 @@ def best_filter(
         informed / spread if informed > 0 else 1.0,
         # slopes per px have radians, frequencies have cycles
         (2 * math.pi) ** 2 * _mean(steep * (floor / 2).expand(len(gain))[shell], sizes),
+        values,
+        slopes,
+        passed if blur else 1.0,
+        (2 * math.pi) ** 2
+        * _mean((radius * slopes[shell]).square() * (floor / 2).expand(len(gain))[shell], sizes),
     )
 
 
@@ -163,6 +174,7 @@ def flat_if_nearly(
     mismatch: torch.Tensor,
     threshold: float,
     least_reduction: float = LEAST_REDUCTION,
+    strain: float = 0.0,
 ) -> torch.Tensor:
     """The mismatch, at one level if whitening it would lessen errors by little.
 
@@ -202,9 +214,12 @@ def flat_if_nearly(
     steep = number * wavenumbers(density, shape)[above].square() * texture
     level = (steep * response.square() * noise).sum() / (steep * response.square()).sum()
     # g here is the square of the docstring's: the weight of a wave
+    # where air is strained, images after a filter that is not flat differ by its slope
+    steepness = torch.gradient(noise.log() / 2)[0] / torch.gradient(wavenumbers(density, shape)[above].log())[0]
+    mismatched = strain * steepness.square() * texture
     flat, white = (
-        (steep * g.square() * noise).sum() / (steep * g).sum().square()
-        for g in (response, response / noise)
+        (steep * g.square() * n).sum() / (steep * g).sum().square()
+        for g, n in ((response, noise), (response / noise, noise + mismatched))
     )
     if flat > (1 + least_reduction) * white:
         return mismatch

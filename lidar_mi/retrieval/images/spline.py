@@ -317,6 +317,16 @@ def filtered_spline(images: torch.Tensor, chosen: Filter, settings: FilterSettin
     return filtered_splines(images, [chosen], settings)[0]
 
 
+def values_and_slopes(
+    images: torch.Tensor, chosen: Filter, settings: FilterSettings
+) -> tuple[Spline, Spline]:
+    """Splines through finite images: for their differences, and for their slopes."""
+    values = chosen._replace(gain=chosen.values, passed=chosen.values_passed)
+    slopes = chosen._replace(gain=chosen.slopes, noisy_slopes=chosen.slopes_noise)
+    first, second = filtered_splines(images, [values, slopes], settings)
+    return first, second
+
+
 def filtered_splines(
     images: torch.Tensor, filters: Sequence[Filter], settings: FilterSettings
 ) -> list[Spline]:
