@@ -44,12 +44,16 @@ def mean_over_groups(total: np.ndarray, number: np.ndarray) -> tuple[float, floa
 def sums_of_blocks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum and number of the finite values in each block of the image, over all images.
 
+    The last block of a row or column has what is left of it.
+
     Parameters
     ----------
     values : (images, z, y) array
     """
-    rows, columns = (n // BLOCK * BLOCK for n in values.shape[1:])
-    parts = values[:, :rows, :columns]
-    parts = parts.reshape(-1, rows // BLOCK, BLOCK, columns // BLOCK, BLOCK)
-    known = np.isfinite(parts)
-    return np.where(known, parts, 0.0).sum((0, 2, 4)).ravel(), known.sum((0, 2, 4)).ravel()
+    rows, columns = (np.arange(0, max(n - BLOCK, 0) + 1, BLOCK) for n in values.shape[1:])
+    known = np.isfinite(values)
+
+    def sums(of):
+        return np.add.reduceat(np.add.reduceat(of.sum(0), rows, axis=0), columns, axis=1).ravel()
+
+    return sums(np.where(known, values, 0.0)), sums(known.astype(float))

@@ -26,7 +26,7 @@ from .turbulence import Wind, turbulence
 Purpose = Literal["build", "judge"]
 Draw = Callable[[np.random.Generator], Wind]
 
-HEIGHT, WIDTH = 69.0, 109.0
+WIDTH, HEIGHT = 109.0, 69.0
 """Of an image, m: 139 x 219 px of 0.5 m."""
 
 VOLUME = Path(__file__).resolve().parents[2] / "scenes" / "wake_volume_40s.nc"
@@ -291,6 +291,12 @@ FAMILIES = (
         "build",
         isotropic(60, 3, 3.0, slope=3.0, planar=True),
     ),
+    Family(
+        "planar turbulence 50 to 3.5 m",
+        "two-dimensional, E ~ k^-5/3, 2.5 m/s",
+        "build",
+        isotropic(50, 3.5, 2.5, planar=True),
+    ),
     Family("shear", "linear, 0.08 to 0.2 s^-1, any direction", "build", linear(shear)),
     Family(
         "shear in turbulence",
@@ -327,10 +333,16 @@ FAMILIES = (
         isotropic(40, 3, 2.0),
     ),
     Family(
-        "turbulence 60 to 5 m",
-        "three-dimensional, E ~ k^-5/3, 5 m/s",
+        "planar turbulence 40 to 3 m",
+        "two-dimensional, E ~ k^-5/3, 2 m/s",
         "judge",
-        isotropic(60, 5, 5.0),
+        isotropic(40, 3, 2.0, planar=True),
+    ),
+    Family(
+        "planar turbulence 60 to 5 m",
+        "two-dimensional, E ~ k^-5/3, 5 m/s",
+        "judge",
+        isotropic(60, 5, 5.0, planar=True),
     ),
     Family(
         "flat turbulence 40 to 2 m",
@@ -367,15 +379,15 @@ FAMILIES = (
     ),
     Family(
         "close pair in turbulence",
-        "20 m apart, cores of 1.5 m, 0.8 m/s from 30 to 3 m",
+        "20 m apart, cores of 1.5 m; planar, 0.8 m/s from 30 to 3 m",
         "judge",
-        together(CLOSE, isotropic(30, 3, 0.8)),
+        together(CLOSE, isotropic(30, 3, 0.8, planar=True)),
     ),
     Family(
         "uniform wind, 0.2 m/s of turbulence",
-        "5 m/s, turbulence from 40 to 3 m",
+        "5 m/s, planar turbulence from 40 to 3 m",
         "judge",
-        together(uniform(5.0), isotropic(40, 3, 0.2)),
+        together(uniform(5.0), isotropic(40, 3, 0.2, planar=True)),
     ),
     Family(
         "simulated wake, x = 25 to 30 m",

@@ -87,7 +87,7 @@ TEXTURED = (
     "turbulence 60 to 4 m",
     "wide pair in turbulence",
     "simulated wake, x = 11 to 15 m",
-    "turbulence 40 to 3 m",
+    "planar turbulence 40 to 3 m",
     "jet",
     "simulated wake, x = 25 to 30 m",
 )
