@@ -20,6 +20,8 @@ METHODS = ("variational", "multipass", "cc")
 OTHERS = {"DIS": PEERS["OpenCV DIS"], "OpenPIV": PEERS["OpenPIV window deformation"]}
 """Other programs, with their packages: all their vectors count, and none has a standard error."""
 
+BATCH = 4
+"""Seeds that are added at a time where rows have to be resolved."""
 STRIDE = 4
 """Vectors of one template share their pixels; every fourth one is nearly as informative as all."""
 LEAST_VALID = 0.02
@@ -27,6 +29,7 @@ LEAST_VALID = 0.02
 VARIANCE = (0.8, 1.25)
 """Limits of the variance of normalised errors."""
 FAR_VARIANCE = (0.5, 2.0)
+"""Limits that no row may exceed."""
 WITHIN_ONE, TOLERANCE = 0.683, 0.05
 """Fraction within one standard error, and its limit either way."""
 
@@ -68,6 +71,14 @@ class Accuracy:
         return self.valid >= LEAST_VALID and np.isfinite(self.stated)
 
     @property
+    def inside(self) -> bool:
+        return self.variance_inside and self.coverage_inside
+
+    @property
+    def far(self) -> bool:
+        return not FAR_VARIANCE[0] <= self.variance[0] <= FAR_VARIANCE[1]
+
+    @property
     def variance_inside(self) -> bool:
         return VARIANCE[0] <= self.variance[0] <= VARIANCE[1]
 
@@ -103,7 +114,7 @@ def missing(method: str) -> str:
 def errors_of(images: ImagePair, method: str) -> Errors:
     """Of all vectors of a method on an image pair."""
     if method in OTHERS:
-        return _errors_of_other(images, OTHERS[method][0])
+        return errors_of_field(images, program(images, OTHERS[method][0]))
     wind = retrieve_wind(
         images.first,
         images.second,
@@ -120,21 +131,28 @@ def errors_of(images: ImagePair, method: str) -> Errors:
     return error - true, stated, true, (wind["flag"] == 0).values
 
 
-def _errors_of_other(images: ImagePair, find: Callable[[Pair], Field]) -> Errors:
-    y, z = (images.first[name].values for name in "yz")
-    v, w = (images.first.copy(data=component) for component in images.wind(*np.meshgrid(y, z)))
-    field = find(Pair(images.first, images.second, v, w, ()))
+def program(images: ImagePair, find: Callable[[Pair], Field]) -> Field:
+    """What another program finds in the images."""
+    grid = np.meshgrid(images.first["y"].values, images.first["z"].values)
+    v, w = (images.first.copy(data=component) for component in images.wind(*grid))
+    return find(Pair(images.first, images.second, v, w, ()))
+
+
+def errors_of_field(images: ImagePair, field: Field) -> Errors:
+    """Of displacements without standard errors, as densely as those of other methods.
+
+    Vectors within `benchmarks.methods.RIM` pixels of the edge do not count.
+    """
     found = np.stack([field.dy, field.dz])
-    # as many vectors per area as of the other methods, and none at the rim
     start = int(np.ceil(max(RIM - field.start, 0)))
-    rows, columns = (
-        slice(start, min(n, int(size - RIM - field.start)), STRIDE)
-        for n, size in zip(found.shape[1:], images.first.shape, strict=True)
+    z, y = (
+        np.arange(start, min(n, int(size - RIM - field.start)), STRIDE)
+        for n, size in zip(field.dy.shape, images.first.shape, strict=True)
     )
-    found = found[:, rows, columns] * SPACING
+    found = found[:, z[:, None], y] * SPACING
+    first = [float(images.first[name][0]) for name in "yz"]
     places = np.meshgrid(
-        y[0] + (field.start + np.arange(field.dy.shape[1])[columns]) * SPACING,
-        z[0] + (field.start + np.arange(field.dy.shape[0])[rows]) * SPACING,
+        *(low + (field.start + n) * SPACING for low, n in zip(first, (y, z), strict=True))
     )
     true = np.stack(images.wind(*(np.array(places) + field.moved * np.nan_to_num(found))))
     error = found / DT - true
@@ -172,14 +190,32 @@ def accuracy(found: list[Errors], names: tuple[str, str, str]) -> Accuracy:
 
 
 def measured(
-    family: Family, condition: Condition, methods: Sequence[str], seeds: Iterable[int]
+    family: Family,
+    condition: Condition,
+    methods: Sequence[str],
+    seeds: Iterable[int],
+    until_resolved: bool = False,
 ) -> list[Accuracy]:
-    """A row for each method, all on the same image pairs."""
+    """A row for each method, all on the same image pairs.
+
+    Parameters
+    ----------
+    until_resolved : bool
+        After every `BATCH` seeds, omit the others if all rows that are judged are resolved.
+    """
     found: dict[str, list[Errors]] = {method: [] for method in methods}
-    for seed in seeds:
+    for count, seed in enumerate(seeds, 1):
         images = pair(family, condition, seed)
         for method, errors in found.items():
             errors.append(errors_of(images, method))
+        if until_resolved and count % BATCH == 0:
+            rows = _rows(family, condition, found)
+            if all(row.resolved for row in rows if row.judged):
+                return rows
+    return _rows(family, condition, found)
+
+
+def _rows(family, condition, found: dict[str, list[Errors]]) -> list[Accuracy]:
     return [
         accuracy(errors, (family.name, condition.name, method)) for method, errors in found.items()
     ]
