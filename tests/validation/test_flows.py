@@ -525,11 +525,26 @@ def test_part_of_the_families_does_not_overwrite_the_page(monkeypatch, tmp_path,
     assert "<!-- flows: begin -->\n\n## T\n\nI\n\n| None |" in page.read_text()
 
 
-def test_quick_look(capsys):
+def test_quick_look(capsys, tmp_path):
     given = ["--family", "jet", "--condition", "1 % known", "--methods", "cc", "--seeds", "1"]
-    assert quick_look.main(given) == 0
-    head, line = capsys.readouterr().out.splitlines()
+    stored = tmp_path / "rows.json"
+    assert quick_look.main([*given, "-o", str(stored)]) == 0
+    head, line, *counts = capsys.readouterr().out.splitlines()
     assert head.startswith("family") and line.startswith("jet") and " cc " in line
-    with pytest.raises(SystemExit):
-        quick_look.main(["--family", "jet", "--condition", "fog"])
-    assert "none of the families" in capsys.readouterr().err
+    assert counts[-1].startswith("| judge | cc | 1 |")
+    assert quick_look.main([*given, "--against", str(stored)]) == 0
+    assert "error x 1.000, valid +0.00" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--family", "jet", "--condition", "coarse texture", "--purpose", "build"], "no family"),
+        (["--condition", "fog"], "invalid choice: 'fog'"),
+        (["--seeds", "0"], "--seeds: 0 is not allowed"),
+    ],
+)
+def test_quick_look_refuses(given, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        quick_look.main(given)
+    assert stop.value.code == 2 and message in capsys.readouterr().err
