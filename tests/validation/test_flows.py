@@ -487,7 +487,7 @@ def test_required_rows_pass_inside_and_fail_outside():
 
 def test_check_has_the_table_of_both_halves(monkeypatch):
     def fake(cases, methods, seeds):
-        assert seeds == 2 and set(measure.METHODS) <= set(methods)
+        assert seeds == 4 and set(measure.METHODS) <= set(methods)
         for family, condition in cases:
             yield (family, condition), [row(family=family.name, condition=condition.name)]
 
@@ -497,6 +497,16 @@ def test_check_has_the_table_of_both_halves(monkeypatch):
     assert all(f"**{family.name}**" in check.text for family in FAMILIES)
     build = table.flows(Effort(purpose="build"))
     assert "--purpose build" in build.text and "**jet**" not in build.text
+
+
+@pytest.mark.slow
+def test_lines_from_other_processes_are_in_order(capfd):
+    cases = [(BY_NAME[name], BASE[1]) for name in ("jet", "cells")]
+    found = list(table.lines(cases, ["cc"], 1))
+    assert [case for case, _ in found] == cases
+    here = measure.measured(*cases[1], ["cc"], [1])
+    assert found[1][1] == here and found[0][1] != here
+    assert "2 of 2: cells, 1 % known" in capfd.readouterr().err
 
 
 def test_part_of_the_families_does_not_overwrite_the_page(monkeypatch, tmp_path, capsys):

@@ -9,6 +9,7 @@ scatter over seeds is that over flows. Flows are steady and fill more than the i
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 from zlib import crc32
@@ -29,7 +30,7 @@ Draw = Callable[[np.random.Generator], Wind]
 WIDTH, HEIGHT = 109.0, 69.0
 """Of an image, m: 139 x 219 px of 0.5 m."""
 
-VOLUME = Path(__file__).resolve().parents[2] / "scenes" / "wake_volume_40s.nc"
+VOLUME = Path(str(files("lidar_mi.scenes"))) / "wake_volume_40s.nc"
 """The simulated wake: 20 planes 1 m apart, of which the shipped experiments show x = 20.5 m."""
 
 

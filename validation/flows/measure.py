@@ -106,7 +106,7 @@ Errors = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def missing(method: str) -> str:
-    """How to install what a method needs; empty if it is there."""
+    """Why a method cannot run; empty if it can."""
     package = OTHERS[method][1] if method in OTHERS else ""
     return f"{package} is not installed" if package and find_spec(package) is None else ""
 
