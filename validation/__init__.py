@@ -16,6 +16,8 @@ track                track of a vortex pair: errors over simulated flights are a
 timing               winds of beams with times and poses: closed forms
 coverage             standard errors of winds where air changes: its section, by name or --slow
 instrument           winds by an etalon with defects; only by name
+flows                winds of families of flows that judge, and of those that build: its section
+                     of the page; only by name
 resolution           winds from fewer, larger pixels, against their bound; only by name
 """
 
@@ -35,9 +37,9 @@ GROUPS = (
     "timing",
     "coverage",
 )
-OPEN = ("instrument", "resolution")
+OPEN = ("instrument", "flows", "resolution")
 """Run only by name: some of their rows fail."""
-SECTIONS = ("coverage",)
+SECTIONS = ("coverage", "flows")
 """Groups whose text is a section of the page, between marks, that short runs leave as it is."""
 FORMER_NAMES = {"error_bars": "standard_errors"}
 """Groups by the names of earlier versions, which the command line still accepts."""

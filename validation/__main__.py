@@ -33,6 +33,11 @@ def main(arguments: list[str] | None = None) -> int:
         help="interpreter with eradiate-mitsuba, to compute its numbers (default: stored ones)",
     )
     parser.add_argument(
+        "--purpose",
+        choices=("build", "judge"),
+        help="of the families of `flows`: these alone, and nothing is written",
+    )
+    parser.add_argument(
         "-o", "--out", type=Path, default=PAGE, help="page to write when all groups run"
     )
     options = parser.parse_args(arguments)
@@ -42,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"NAME: {unknown[0]!r} is none of {', '.join((*GROUPS, *OPEN))}")
 
     folder = options.out.parent / options.out.stem
-    effort = Effort(16 if options.slow else 1, folder, options.eradiate)
+    effort = Effort(16 if options.slow else 1, folder, options.eradiate, options.purpose)
     by_hand = options.out.parent / "accuracy.md"
     console = Console(width=None if sys.stdout.isatty() else 140)
     found, failed = [], []
@@ -56,7 +61,8 @@ def main(arguments: list[str] | None = None) -> int:
         found.append(future.result())
         for check in found[-1][-1]:
             report.show(check, console)
-            if name in SECTIONS and (options.slow or options.groups):
+            whole = not (name == "flows" and options.purpose)
+            if name in SECTIONS and whole and (options.slow or options.groups):
                 title, introduction, _ = found[-1]
                 text = "\n\n".join([f"## {title}", introduction, check.text])
                 report.write(report.with_section(_stored(options.out), name, text), options.out)

@@ -19,6 +19,7 @@ from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
+from .normalised import indicator, mean_over_groups, rms, sums_of_blocks
 from .report import Check, Row
 
 TITLE = "Standard errors of winds where air changes"
@@ -47,8 +48,6 @@ LEAST_VALID = 0.01
 """Fraction of valid vectors below which a row is not judged."""
 STRIDE = 4
 """Vectors of one template share their pixels; every fourth one is nearly as informative as all."""
-BLOCK = 10
-"""Vectors along the side of a block: 20 m, several correlation lengths of the errors."""
 
 PARAMETERS = {"vortex_fit": 10}
 """Of methods whose errors all over an image have few parameters in common."""
@@ -314,11 +313,11 @@ def measured(case: str, method: str, seeds) -> Coverage:
     return Coverage(
         case,
         method,
-        _rms(error),
-        _rms(stderr),
-        _rms(np.stack(winds)),
-        _mean_and_error(_indicator(score, 1.0), most),
-        _mean_and_error(_indicator(score, 1.96), most),
+        rms(error),
+        rms(stderr),
+        rms(np.stack(winds)),
+        _mean_and_error(indicator(score, 1.0), most),
+        _mean_and_error(indicator(score, 1.96), most),
         _mean_and_error(score**2, most),
         float(np.mean(valid)),
     )
@@ -406,15 +405,6 @@ def _line(one: Coverage) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _rms(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
-
-
-def _indicator(score: np.ndarray, limit: float) -> np.ndarray:
-    return np.where(np.isfinite(score), np.abs(score) < limit, np.nan)
-
-
 def independent_pairs(error: np.ndarray) -> float:
     """Number of image pairs whose errors are independent, from how much all are alike.
 
@@ -441,20 +431,10 @@ def _mean_and_error(values: np.ndarray, most: float | None = None) -> tuple[floa
     """Mean, and its standard error from the scatter of the sums over blocks.
 
     Both components of a block in all images count as one: (images, z, y), images of v and w in
-    turn. The standard error is at least that of ``most`` independent values.
+    turn. The standard error is at least that of ``most`` independent values, and that of a single
+    one where all values are in one block.
     """
-    rows, columns = (n // BLOCK * BLOCK for n in values.shape[1:])
-    parts = values[:, :rows, :columns]
-    parts = parts.reshape(-1, rows // BLOCK, BLOCK, columns // BLOCK, BLOCK)
-    known = np.isfinite(parts)
-    number = known.sum((0, 2, 4)).ravel()
-    total = np.where(known, parts, 0.0).sum((0, 2, 4)).ravel()
-    if number.sum() == 0:
-        return np.nan, np.nan
-    mean = total.sum() / number.sum()
-    blocks = (number > 0).sum()
-    deviation = total - mean * number
-    error = np.sqrt((deviation**2).sum() * blocks / max(blocks - 1, 1)) / number.sum()
-    if most:
-        error = max(error, np.nanstd(values) / np.sqrt(most))
-    return float(np.nanmean(values)), float(error)
+    mean, error = mean_over_groups(*sums_of_blocks(values))
+    if np.isfinite(mean) and (most or np.isnan(error)):
+        error = np.fmax(error, np.nanstd(values) / np.sqrt(most or 1))
+    return mean, float(error)

@@ -3,6 +3,7 @@
 import gc
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import mitsuba as mi
 import numpy as np
@@ -20,6 +21,8 @@ class Effort:
     folder: Path = DOCS
     eradiate: str | None = None
     """Interpreter with eradiate-mitsuba; None: its stored numbers."""
+    purpose: Literal["build", "judge"] | None = None
+    """Of the families of flows that are measured; None: all."""
 
 
 def medium(extinction: float, phase="rayleigh_polarized", albedo: float = 1.0) -> dict:

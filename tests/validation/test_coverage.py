@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from validation import coverage
+from validation.normalised import BLOCK
 
 
 def test_standard_error_of_independent_values():
@@ -20,7 +21,7 @@ def test_standard_error_of_independent_values():
 
 def test_standard_error_of_uniform_blocks():
     blocks = np.random.default_rng(2).normal(size=(1, 12, 16))
-    size = coverage.BLOCK
+    size = BLOCK
     values = np.tile(np.kron(blocks, np.ones((1, size, size))), (2, 1, 1))
     assert coverage._mean_and_error(values)[1] == pytest.approx(1 / np.sqrt(blocks.size), rel=0.3)
 
