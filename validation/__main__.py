@@ -48,7 +48,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     folder = options.out.parent / options.out.stem
     effort = Effort(16 if options.slow else 1, folder, options.eradiate, options.purpose)
-    by_hand = options.out.parent / "accuracy.md"
+    docs = options.out.parent
+    pages = (docs / "accuracy.md", *sorted(docs.glob("experiments/*.md")))
+    by_hand = [hand for hand in pages if hand.exists()]
     console = Console(width=None if sys.stdout.isatty() else 140)
     found, failed = [], []
     for name in options.groups or GROUPS:
@@ -66,11 +68,11 @@ def main(arguments: list[str] | None = None) -> int:
                 title, introduction, _ = found[-1]
                 text = "\n\n".join([f"## {title}", introduction, check.text])
                 report.write(report.with_section(_stored(options.out), name, text), options.out)
-            if by_hand.exists():
-                text = by_hand.read_text(encoding="utf-8")
+            for hand in by_hand:
+                text = hand.read_text(encoding="utf-8")
                 if (renewed := report.with_table(text, check)) != text:
-                    report.write(renewed, by_hand)
-                    console.print(f"written: table {check.name} of {by_hand}", highlight=False)
+                    report.write(renewed, hand)
+                    console.print(f"written: table {check.name} of {hand}", highlight=False)
             if name in (*OPEN, *SECTIONS):
                 console.print(check.text, highlight=False, soft_wrap=True)
             failed += [

@@ -188,14 +188,14 @@ def carried_volume(noise: float, seed: int) -> Pair:
 
 @lru_cache(maxsize=8)
 def rendered_images(seed: int) -> xr.Dataset:
-    """Winds of `wake_changing` by all methods: the simulation's true second state, all orders.
+    """Winds of `wake_backscatter` by all methods: the simulation's stored second state, all orders.
 
     Its lidar has no detector, so that the noise is that of the Monte Carlo samples.
     """
     experiment = lm.load_experiment(
-        "wake_changing",
+        "wake_backscatter",
         seed=seed,
-        detector=None,
+        wake={"second": "40.1 s"},
         retrieval={
             "methods": METHODS,
             "stride": STRIDE,

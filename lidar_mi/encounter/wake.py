@@ -84,9 +84,8 @@ def vortices_in_plane(wake: WakeAlongPath, x: float, time: float) -> tuple[Vorte
 def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> VolumeAlongPath:
     """A simulated wake: one plane, extruded, or a volume, repeated along its axis."""
     if wake.second != "advect":
-        raise InputError(
-            f"wake.second: {wake.second:g} s is not allowed in an encounter; expected advect"
-        )
+        value = wake.second if wake.stored is None else f"{wake.stored:g} s"
+        raise InputError(f"wake.second: {value} is not allowed in an encounter; expected advect")
     for key, given in (
         ("decay_time", encounter.wake.decay_time),
         ("crow.amplitude", encounter.wake.crow.amplitude),

@@ -25,6 +25,8 @@ from lidar_mi.rendering.settings import RenderSettings
 
 PER_NODE = 160
 """Bytes of a node of the wake: twenty fields in double precision."""
+PER_ADVECTED = 450
+"""Bytes of a node of a volume while it is advected along x; measured: 360 to 440."""
 PER_VECTOR = 400
 """Bytes of a vector, per method and source: 25 variables, twice where they are concatenated."""
 PER_VOXEL = 200
@@ -117,10 +119,16 @@ class Footprint:
         )
 
     def most_nodes(self) -> int:
-        """Nodes of the wake that a run can have in memory; each has a beam with ``aim: grid``."""
-        beams = self.scan.aim == "grid" and self.wake is not None and self.wake.depth == "plane"
+        """Nodes of the wake that a run can have in memory.
+
+        Each node of a plane has a beam with ``aim: grid``.
+        """
+        wake, each = self.wake, float(PER_NODE)
         # the memory of the gates is checked by `check_size`
-        each = self._per_beam(1) if beams else PER_NODE
+        if wake is not None and wake.second == "advect_3d":
+            each = PER_ADVECTED
+        elif wake is not None and wake.depth == "plane" and self.scan.aim == "grid":
+            each = self._per_beam(1)
         left = ceiling(self.render.memory) - PROGRAM
         return max(1, min(MOST_NODES, int(left / each)))
 

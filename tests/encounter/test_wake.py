@@ -126,6 +126,9 @@ def test_what_is_not_known_along_the_axis_is_refused(crow_file, tmp_path):
         wake_along_path(lm.load_experiment("wake_sensor"))
     with pytest.raises(InputError, match=r"wake\.x: missing"):
         wake_along_path(from_file(crow_file, depth="plane"))
+    for second, shown in (("advect_3d", "advect_3d"), ("41 s", "41 s")):
+        with pytest.raises(InputError, match=rf"wake\.second: {shown} is not allowed in an enc"):
+            wake_along_path(from_file(crow_file, second=second))
     part = tmp_path / "part.nc"
     crow_volume(waves=1, amplitude=3.0).isel(x=slice(0, 20)).to_netcdf(part)
     with pytest.raises(InputError, match="not periodic along x"):

@@ -11,9 +11,10 @@ import pytest
 import xarray as xr
 
 from lidar_mi import load_experiment
+from lidar_mi.atmosphere.wake import resample
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
-from lidar_mi.experiment.memory import Footprint
+from lidar_mi.experiment.memory import PER_ADVECTED, Footprint
 from lidar_mi.experiment.preflight.check import duration, sections
 from lidar_mi.experiment.stages.brightness import check_brightness, overlap
 from lidar_mi.experiment.stages.timed_beams import timed_plans
@@ -191,6 +192,28 @@ def test_check_refuses_from_the_forecast_before_the_truth(changes, says, tmp_pat
     data["render"] = data["render"] | {"memory": "8 GB"}
     with pytest.raises(InputError, match=says):
         list(sections(check(data), tmp_path))
+
+
+def test_memory_of_a_volume_that_is_advected(monkeypatch):
+    """As much as is used, to a factor of two, and no beam for each of its nodes."""
+    asked = load_experiment("wake_changing", wake={"spacing": "1 m"})
+    counts = []
+
+    def counted(*given):
+        fine = resample(*given)
+        counts.append(fine["v"].size)
+        return fine
+
+    monkeypatch.setattr("lidar_mi.experiment.truth.flows.resample", counted)
+    tracemalloc.start()
+    flows = flows_of(asked)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert counts[0] > 5 * flows[0]["v"].size
+    assert 0.5 < counts[0] * PER_ADVECTED / peak < 2
+    most = call(Footprint, load_experiment("wake_changing", render={"memory": "1 GB"})).most_nodes()
+    few = load_experiment("wake_changing", wake={"second": "advect"}, render={"memory": "1 GB"})
+    assert most > 2 * call(Footprint, few).most_nodes()
 
 
 def test_a_spacing_that_memory_does_not_hold_is_refused_before_the_air_is_made():

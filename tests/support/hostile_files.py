@@ -233,8 +233,8 @@ def wake_file(engine: str) -> bytes:
 def wake_cases(draw: st.DrawFn) -> Case:
     """NetCDF files, checked and used as a wake."""
     data = BASE | {"wake": {"file": "a.nc", "time": 1, "x": 1}, "retrieval": {"search": 10}}
-    asked = draw(st.sampled_from(({}, {}, {"time": 0}, {"depth": "volume"}, {"second": 1})))
-    data["wake"] = data["wake"] | asked
+    asked = ({}, {}, {"time": 0}, {"depth": "volume"}, {"second": 1}, {"second": "advect_3d"})
+    data["wake"] = data["wake"] | draw(st.sampled_from(asked))
     files = {"a.nc": draw(wake_files()), "a.yaml": as_yaml(data)}
     return Case("netcdf", draw(st.sampled_from((("info", "a.nc"), ("check", "a.yaml")))), files)
 

@@ -276,6 +276,14 @@ def test_comparison_is_printed_and_on_the_page(quick, monkeypatch, capsys):
     assert command.main(["-o", str(quick)]) == 0
     lines = "| receiver | m/s |\n| --- | --- |\n| rings | 0.1 |\n"
     assert lines in capsys.readouterr().out and f"\n\n{lines}\n" in quick.read_text()
+    pages = [quick.parent / "accuracy.md", quick.parent / "experiments" / "wake.md"]
+    pages[1].parent.mkdir()
+    begin, end = (f"<!-- lidar_equation.one: {what} -->" for what in ("begin", "end"))
+    for hand in pages:
+        hand.write_text(f"before\n{begin}\n| old |\n{end}\nafter\n")
+    assert command.main(["lidar_equation", "-o", str(quick)]) == 0
+    for hand in pages:
+        assert hand.read_text() == f"before\n{begin}\n\n{lines}\n{end}\nafter\n"
 
 
 def test_command_names_unknown_arguments(capsys):
@@ -374,6 +382,12 @@ def test_page_is_in_date(page, effort, name):
         assert line[6] == row.reference
         assert float(line[1]) == pytest.approx(row.expected, rel=1e-5)
         assert float(line[2]) == pytest.approx(row.got, rel=1e-5, abs=0.1 * row.tolerance)
+
+
+def test_table_on_the_page_of_an_experiment_is_that_of_the_validation(page):
+    text = (PAGE.parent / "experiments" / "wake_changing.md").read_text()
+    table = report.section_of(text, "stored_state.residual").strip()
+    assert table.count("\n") == 4 and f"\n\n{table}\n\n" in page
 
 
 def test_figures_of_the_page_are_there_and_small(page):

@@ -27,6 +27,7 @@ from lidar_mi.experiment.stages.light_budget import light_budget
 from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth.extinction import Truth
+from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.experiment.truth.in_time import values_of_states
 from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.lidar import BackscatterLidar
@@ -138,11 +139,20 @@ def _backscatter(
         ("warning time", _warning(plan.gate_start, platform.speed)),
         ("samples per beam", _samples(asked, chosen)),
         ("time between the images", f"{platform.dt:g} s"),
+        ("air of the second image", _second(asked, wake)),
         *_light(asked, truth, plan, air),
     ]
     if not asked.volume:
         rows += _displacements(asked, wind, plan)
     yield "backscatter lidar", rows
+
+
+def _second(asked: Experiment, wake: Wake) -> str:
+    """Where the state at t2 is from."""
+    if wake.stored is not None:
+        return f"the state stored at {wake.stored:.15g} s"
+    along = wake.second == "advect_3d" or moves_along(wake, asked.volume)
+    return "that of the first, advected by " + ("u, v and w" if along else "v and w")
 
 
 def _samples(asked: Experiment, chosen: Samples | None) -> str:

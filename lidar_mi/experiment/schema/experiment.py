@@ -85,9 +85,10 @@ class Experiment(Tabular, Section):
                 "volume: not allowed without a wake in three dimensions; expected "
                 "wake.depth: volume"
             )
-        if wake.second != "advect":
+        if wake.stored is not None:
             raise ValueError(
-                f"wake.second: {wake.second:g} s is not allowed with volume; expected advect"
+                f"wake.second: {wake.stored:g} s is not allowed with volume; expected advect or "
+                "advect_3d"
             )
         if self.sensor or self.retrieval != Retrieval():
             key = "sensor" if self.sensor else "retrieval"

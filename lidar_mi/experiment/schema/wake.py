@@ -116,7 +116,9 @@ class Wake(Section):
     vortex_pair: VortexPair | None = None
     turbine: Turbine | None = None
     time: _Moment | None = Field(None, description="needed when the file holds several")
-    second: Literal["advect"] | _Moment = Field("advect", description="t2: advected, or a time")
+    second: Literal["advect", "advect_3d"] | _Moment = Field(
+        "advect", description="t2: advected by v, w; by u, v, w of a volume; or a time of the file"
+    )
     x: _Place | None = Field(None, description="plane placed in the middle of the gates")
     depth: Literal["plane", "volume"] = Field(
         "plane", description="one plane extruded over the gates, or all planes of the file"
@@ -134,14 +136,19 @@ class Wake(Section):
     @field_validator("second", mode="before")
     @classmethod
     def _advect_or_time(cls, value: object) -> object:
-        if value == "advect":
+        if value in ("advect", "advect_3d"):
             return value
         try:
             return to_si(value, "s", "40.1 s")
         except ValueError:
             raise ValueError(
-                f"{value!r} is not allowed; expected advect or a time such as '40.1 s'"
+                f"{value!r} is not allowed; expected advect, advect_3d or a time such as '40.1 s'"
             ) from None
+
+    @property
+    def stored(self) -> float | None:
+        """Time of the file whose state is that at t2, s; None: that of t1 is advected."""
+        return None if isinstance(self.second, str) else self.second
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -149,12 +156,27 @@ class Wake(Section):
         if len(sources) != 1:
             raise ValueError("expected one of file, vortex_pair and turbine")
         if sources == ["file"]:
+            self._check_tracers()
             return self
         if self.second != "advect":
-            raise ValueError(f"second: {self.second!r} is not allowed with {sources[0]}")
+            raise ValueError(
+                f"second: {self.second!r} is not allowed with {sources[0]}; expected advect"
+            )
         if self.depth == "volume":
             raise ValueError(f"depth: 'volume' is not allowed with {sources[0]}")
         for key in ("time", "x", "centre", "names"):
             if getattr(self, key):
                 raise ValueError(f"{key}: {getattr(self, key)!r} is not allowed with {sources[0]}")
         return self
+
+    def _check_tracers(self) -> None:
+        """Refuse a plane of extinction by speed that is advected: it is a state of its tracers."""
+        if (
+            self.second == "advect_3d"
+            and self.depth == "plane"
+            and self.extinction.source == "speed"
+        ):
+            raise ValueError(
+                "second: 'advect_3d' is not allowed with depth: plane and extinction.source: "
+                "speed; expected extinction.source: tracer, or depth: volume"
+            )

@@ -25,8 +25,9 @@ from lidar_mi.experiment.stages.ring_reference import (
     shared_covariance,
 )
 from lidar_mi.experiment.stages.ring_velocities import FRAMES, speeds_to_laser
-from lidar_mi.experiment.truth.extinction import Truth, slab_mean
+from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows
+from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_lines
 from lidar_mi.instrument.scan import Scan

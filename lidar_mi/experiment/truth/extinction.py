@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from scipy import integrate
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
@@ -17,6 +16,7 @@ from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.experiment.truth.flows import Advection, Flows, advection_by, flows_of, mean_flow
+from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.scan import Scan
 
 
@@ -170,25 +170,3 @@ def extinction_of(
             reference=densest,
         )
     return field.transpose("x", "y", "z")
-
-
-def slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
-    """Mean over the depth of planar gates, (..., z, y); linear between planes, as rendered."""
-    x = field["x"].values
-    weights = np.ones(1)
-    if len(x) > 1:
-        half = (x[1] - x[0]) / 2
-        first, last = x[0] - half, x[-1] + half
-        if gates[0] < first - 1e-6 or gates[1] > last + 1e-6:
-            raise InputError(
-                f"scan.thickness: gates from {gates[0]:g} to {gates[1]:g} m reach beyond the wake, "
-                f"whose planes fill {first:g} to {last:g} m; expected gates inside"
-            )
-        nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
-        linear = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
-        weights = integrate.trapezoid(linear, nodes) / (gates[1] - gates[0])
-    image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose(..., "z", "y")
-    image.attrs = field.attrs
-    for axis in ("y", "z"):
-        image[axis].attrs["units"] = "m"
-    return image

@@ -22,11 +22,25 @@ from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Turbine, Wake
+from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.io.wake_file import read_wake
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
 Advection = Callable[[xr.DataArray], xr.DataArray]
+
+_LEAST_PLANES = 4
+"""Of a file, along x: a cubic spline needs four."""
+_EDGE = 2
+"""Nodes at either end along x that air in the gates must not come from.
+
+Beyond the ends a spline has the value at the end.
+"""
+_BEYOND = 4
+"""Planes of a file that are read beyond the air of the gates, on either side.
+
+The response of a cubic spline falls by a factor 0.27 a plane: 0.5 % are left.
+"""
 
 
 def mean_flow(flows: Flows) -> xr.Dataset:
@@ -37,7 +51,8 @@ def mean_flow(flows: Flows) -> xr.Dataset:
 
 def moves_along(wake: Wake, volume: Volume | None) -> bool:
     """Whether air moves along x between the images; a plane of air is uniform along it."""
-    return wake.turbine is not None or volume is not None
+    in_volume = wake.second == "advect_3d" and wake.depth == "volume"
+    return wake.turbine is not None or volume is not None or in_volume
 
 
 def advection_by(
@@ -119,31 +134,96 @@ def _flows(
     assert wake.file is not None  # of the three kinds of wake, the schema asks for one
     needed, names = tracers_of(wake)
     path = find_file(wake.file, search_path, "wake.file")
-    if wake.second != "advect" and wake.time is not None:
-        passed = wake.second - wake.time
+    if wake.stored is not None and wake.time is not None:
+        passed = wake.stored - wake.time
         if abs(passed - platform.dt) > 1e-3 * platform.dt:
             raise InputError(
-                f"wake.second: {wake.second:.15g} s is not allowed; expected platform.dt = "
+                f"wake.second: {wake.stored:.15g} s is not allowed; expected platform.dt = "
                 f"{platform.dt:g} s after wake.time = {wake.time:.15g} s"
             )
 
+    along = wake.second == "advect_3d"
+    axes = "xyz" if along or moves_along(wake, volume) else "yz"
+
     def state(when: float | None) -> xr.Dataset:
-        plane = wake.x if wake.depth == "plane" else None
+        plane = wake.x if wake.depth == "plane" and not along else None
         flow = read_wake(path, when, names, plane, require=needed)
-        if wake.depth == "plane" and flow.sizes["x"] > 1:
-            places = flow["x"].values
+        places = flow["x"].values
+        if wake.depth == "plane" and wake.x is None and len(places) > 1:
             raise InputError(
                 f"wake.x: missing; {path.name} has {len(places)} planes, expected one of "
                 f"{places[0]:g} to {places[-1]:g} m (or wake.depth: volume)"
             )
-        y, z = wake.centre or (None, None)
-        fine = resample(flow, wake.spacing, "xyz" if volume else "yz", most)
-        flow = centre(fine, y, z).drop_vars("time", errors="ignore")
         middle = wake.x if wake.x is not None else float(flow["x"].mean())
+        if along:
+            first, last = _air_of_gates(wake, platform, scan, flow, middle, path.name)
+            if wake.depth == "plane":
+                beyond = _BEYOND * (places[1] - places[0])
+                flow = flow.sel(x=slice(first - beyond, last + beyond))
+        y, z = wake.centre or (None, None)
+        fine = resample(flow, wake.spacing, axes, most)
+        flow = centre(fine, y, z).drop_vars("time", errors="ignore")
         return flow.assign_coords(x=flow["x"] - middle + gate_middle)
 
     first = state(wake.time)
-    return first, None if wake.second == "advect" else state(wake.second)
+    if along and wake.depth == "plane":
+        return _advected_along(first, platform, scan)
+    return first, None if wake.stored is None else state(wake.stored)
+
+
+def _air_of_gates(
+    wake: Wake, platform: Platform, scan: Scan, flow: xr.Dataset, middle: float, name: str
+) -> tuple[float, float]:
+    """Ends along x of the air that is in the gates at t1 or at t2, with `_EDGE`, in a file, m.
+
+    Parameters
+    ----------
+    flow : xr.Dataset
+        As it is in the file.
+    middle : float
+        Place in it that is put in the middle of the gates, m.
+    name : str
+        Of the file.
+
+    Raises
+    ------
+    InputError
+        A file without u, or whose planes do not hold that air.
+    """
+    if "u" not in flow:
+        raise InputError(
+            f"wake.second: advect_3d is not allowed, as {name} has no wind along x (u); expected "
+            "u in it, wake.names: {u: its name there}, or wake.second: advect"
+        )
+    moved = (flow["u"] - scan.follow) * platform.dt
+    half, edge = scan.thickness / 2, _EDGE * wake.spacing
+    first = middle - half - max(float(moved.max()), 0.0) - edge
+    last = middle + half - min(float(moved.min()), 0.0) + edge
+    planes = flow["x"].values
+    if planes.size < _LEAST_PLANES or planes[0] > first or planes[-1] < last:
+        raise InputError(
+            f"wake.second: advect_3d is not allowed with {planes.size} planes of {name} from x = "
+            f"{planes[0]:g} to {planes[-1]:g} m; expected at least {_LEAST_PLANES}, from "
+            f"{first:.4g} m or less to {last:.4g} m or more: scan.thickness, the way of the air "
+            f"along x in platform.dt and {_EDGE} wake.spacing at either end"
+        )
+    return first, last
+
+
+def _advected_along(flow: xr.Dataset, platform: Platform, scan: Scan) -> Flows:
+    """Planes at t1 and t2: a volume, and the same advected by its own wind, means over the gates.
+
+    The wind is that of t1 in both.
+    """
+    advected = carrier(flow["v"], flow["w"], platform.dt, u=flow["u"] - scan.follow)
+    tracers = {name: advected(flow[name]) for name in ("tracer", "aerosol") if name in flow}
+    gates = scan.range, scan.range + scan.thickness
+
+    def plane(state: xr.Dataset) -> xr.Dataset:
+        mean = state.map(slab_mean, keep_attrs=True, gates=gates)
+        return mean.expand_dims(x=[sum(gates) / 2]).transpose("x", "y", "z")
+
+    return plane(flow), plane(flow.assign(tracers))
 
 
 def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
@@ -175,7 +255,7 @@ def _turbine(
     )
     # air from beyond the ends must not reach the gates: the wake's air moves at 0 to the full wind
     fastest = max(abs(scan.follow), abs(turbine.wind_speed - scan.follow))
-    margin = fastest * platform.dt + 2 * wake.spacing
+    margin = fastest * platform.dt + _EDGE * wake.spacing
     half = math.ceil((scan.thickness / 2 + margin) / wake.spacing)
     y, z = analytic_axes(wake, "turbine", most)
     x = gate_middle + wake.spacing * np.arange(-half, half + 1)

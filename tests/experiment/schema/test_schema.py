@@ -186,8 +186,8 @@ FAULTS = [
     ("lidar.fov_half=5", "lidar.fov_half: 5 has no unit; expected an angle such as '2 mrad'"),
     ("wake.extinction.maximum=1.8 km", "wake.extinction.maximum: '1.8 km' is not allowed"),
     ("platform.dt=0,1 s", "platform.dt: '0,1 s' is not allowed; expected a quantity in s"),
-    ("wake.second=41 m", "wake.second: '41 m' is not allowed; expected advect or a time"),
-    ("wake.second=later", "wake.second: 'later' is not allowed; expected advect or a time"),
+    ("wake.second=41 m", "wake.second: '41 m' is not allowed; expected advect, advect_3d or a"),
+    ("wake.second=later", "wake.second: 'later' is not allowed; expected advect, advect_3d or"),
     ("wake.centre=[1 m, 2 s]", "wake.centre.1: '2 s' is not allowed"),
     ("wake.centre=[1 m]", "wake.centre.1: missing"),
     # out of range
