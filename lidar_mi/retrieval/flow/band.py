@@ -16,8 +16,8 @@ from lidar_mi.retrieval.flow.flow_spline import REACH, Mesh
 def form(
     weight: torch.Tensor,
     mesh: Mesh,
-    first: tuple[int, int] = (0, 0),
-    second: tuple[int, int] = (0, 0),
+    first: tuple[int, ...] = (0, 0),
+    second: tuple[int, ...] = (0, 0),
     cells: slice | None = None,
 ) -> torch.Tensor:
     """Band (..., shift z, knot z, shift y, knot y) of sum(weight * D1 f * D2 f) over a mesh.
@@ -47,8 +47,8 @@ def form(
 def spread(
     band: torch.Tensor,
     mesh: Mesh,
-    first: tuple[int, int] = (0, 0),
-    second: tuple[int, int] = (0, 0),
+    first: tuple[int, ...] = (0, 0),
+    second: tuple[int, ...] = (0, 0),
     cells: slice | None = None,
 ) -> torch.Tensor:
     """Covariance (..., *mesh.shape) of two derivatives of components, from `Band.covariance`.

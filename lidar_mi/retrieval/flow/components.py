@@ -1,220 +1,385 @@
 """What makes warped images differ: variance components, by restricted maximum likelihood.
 
-About the fitted flow the difference of two warped images is linear in everything that is not known:
-the flow, motion finer than its splines, noise, texture that is replaced, and structure that moves
-through the plane. Each is a Gaussian field of known covariance but for its amplitude. The fit
-leaves of each what it leaves of random draws of it; amplitudes are those that make the squares of
-the residuals likeliest, by place and by scale.
+To first order about a flow the difference of two warped images is
+
+    D = -J (u + u_f) + e + r + m,
+
+with the slopes J, the error u of the flow, the motion u_f that its splines do not resolve, white
+noise e, texture r that is replaced and structure m that moves through the plane. Each is a
+zero-mean Gaussian field: its covariance is known but for one amplitude.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple
+from itertools import pairwise
 
-import numpy as np
 import torch
 
 from lidar_mi.retrieval.flow.flow_spline import Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
 from lidar_mi.retrieval.flow.prior import Prior
-from lidar_mi.retrieval.images.band_limit import flat_if_nearly, radii, shell_means, wavenumbers
+from lidar_mi.retrieval.images.band_limit import flat_if_better, radii, shell_means, wavenumbers
+from lidar_mi.retrieval.images.intensity import rms
 from lidar_mi.retrieval.images.quality import filled
 from lidar_mi.retrieval.images.spline import filter_of, spectrum_of, transform_sizes
-from lidar_mi.retrieval.images.windows import averaged, stored, working
+from lidar_mi.retrieval.images.windows import averaged, separable, stored, working
 from lidar_mi.retrieval.reml import most_likely
 
 Response = Callable[[torch.Tensor], torch.Tensor]
+"""From a gradient of the log-likelihood (components, knots) to the flow's change."""
 
-DRAWS = 4
-REGION = 8
+_DRAWS = 4
+"""Random fields of each component: a mean square over all places is known to 2 %."""
+_SCALES = (1.5, 3.0)
+"""Standard deviations, px, of the Gaussian means between which squares are told apart by scale."""
+_REGION = 8
+"""Standard deviation of the Gaussian mean of the squares, and the separation of its places, px."""
+_INTERPOLATION = 3e-4
+"""Error of splines on half-pixel nodes over the rms structure of texture of 3 px."""
 
 
-class Component(NamedTuple):
-    draws: torch.Tensor  # (draws, z, y) of the difference in dt, unit amplitude
-    least: float
-    most: float
+@dataclass(frozen=True)
+class Differences:
+    """The model of the differences of images, with its amplitudes.
+
+    Attributes
+    ----------
+    images : Images
+        With the filter and the weights by which the noise is white.
+    unresolved : torch.Tensor, shape (...)
+        Variance of a component of the motion that the splines do not resolve, px^2.
+    amplitudes : mapping of str to float
+        Variance of each component over that of its unit: of the noise per squared intensity,
+        fraction of the texture that is replaced, px^2 of motion through the plane, fraction of the
+        variance that the prior's spectrum has beyond the splines.
+    """
+
+    images: Images
+    unresolved: torch.Tensor
+    amplitudes: Mapping[str, float]
 
 
-def normal(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:
+def differences(
+    images: Images,
+    linear: Linear,
+    mesh: Mesh,
+    coefficients: torch.Tensor,
+    prior: Prior,
+    template: int,
+    response: Response | None,
+) -> Differences:
+    """The components of the differences about a fitted flow, estimated by REML.
+
+    A fit leaves of the differences r = R D, with R = I - J C J^T W and the posterior covariance C.
+    Random fields of every component are sent through R. So are flows drawn from the prior, of
+    which R J C (P u) is left with the prior's precision P. Squares of the residuals, by three
+    scales and by place, have gamma distributions whose means are sums of those of the components.
+    The amplitudes are the likeliest (`reml.most_likely`): what the fit absorbs is counted, as in
+    restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545-554).
+
+    What differs from the sum of the components by place, and by wavenumber, multiplies it: the
+    variance of the ratio beyond chance says how freely (`_shrunk`).
+
+    Parameters
+    ----------
+    images : Images
+    linear : Linear
+        Of the images, about the flow.
+    mesh : Mesh
+        Of the pixels.
+    coefficients : torch.Tensor
+        Of the flow.
+    prior : Prior
+    template : int
+        px; half of it is the width over which amplitudes vary with the images.
+    response : callable, optional
+        See `Response`. Without it nothing counts as absorbed: in volumes it is 2 to 10 %.
+
+    Returns
+    -------
+    Differences
+    """
+    valid, spline = linear.valid, images.spline
+    width = 0.5 * template
+    times = float(images.time.square().sum())
+    time = images.time.to(linear.warped).reshape(-1, *[1] * mesh.dims)
+    difference = working((time * linear.warped).sum(0) / times * valid)
+    unresolved = _variance_beyond(prior, mesh)
+    if not bool((difference != 0).any()):
+        return Differences(images, torch.zeros_like(unresolved), {})
+    kinds = _drawn(images, linear, mesh, unresolved, times, width)
+    told = images.known_noise**2
+    absorb = _residual_operator(linear, mesh, response)
+    rests = {name: absorb(draws) for name, draws in kinds.items()}
+    own = _flows_left(linear, mesh, prior, response)
+    squares = _Squares(valid)
+    found = squares(difference[None])[0]
+    held, *terms = (squares(draws) for draws in (own, *rests.values()))
+    use = squares.inside & (found > 0)
+    chance = _chance(terms[0])
+    number = (1 / chance).expand_as(found)
+    known = held.mean(0) + told * terms[0].mean(0)
+    # a noise that is known is not estimated
+    most = {"noise": 0.0 if images.noise_known else math.inf, "unresolved": 1.0}
+    names = [name for name in kinds if most.get(name, math.inf) > 0]
+    _, factors = most_likely(
+        found[use].cpu().numpy(),
+        torch.stack([rests_of.mean(0)[use] for rests_of in _named(kinds, terms, names)])
+        .cpu()
+        .numpy(),
+        torch.tensor([most.get(name, math.inf) for name in names]).numpy(),
+        number[use].cpu().numpy(),
+        known[use].cpu().numpy(),
+    )
+    amplitudes = {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
+    amplitudes["noise"] = amplitudes.get("noise", 0.0) + told
+
+    def total(parts: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        return reduce(torch.add, (amplitudes[name] ** 0.5 * parts[name] for name in parts))
+
+    noise, after = total(kinds), total(rests) + own
+    expected = squares(after).mean(0).clamp(min=1e-30)
+    weighted = (number * found / expected).where(use, 0.0).sum(0)
+    count = number.where(use, 0.0).sum(0)
+    ratio = weighted / count.clamp(min=1e-30)
+    local = squares.on_pixels(_shrunk(ratio, count, use.any(0)))
+    floor = (_INTERPOLATION * rms(images.stack)) ** 2
+    level = (
+        times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)
+    )
+    level = level.clamp(min=max(floor, 1e-30))
+    mean = float(level[valid].mean())
+    weight = mean / level
+    sizes = transform_sizes(spline.shape, spline.settings)
+    _, shell = radii(tuple(sizes), spline.shape, noise.dtype, noise.device)
+
+    def density(fields: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        whole = fields * (weight * times).sqrt() * valid
+        return shell_means(whole, shell, sizes, spline.settings.smoothing)
+
+    of_noise, of_rest = (density(part * local.sqrt())[0] for part in (noise, after))
+    of_found, uncertainty = density(difference[None])
+    ratio = of_found / of_rest.clamp(min=1e-30)
+    colour = _shrunk(ratio, uncertainty**-2, torch.ones_like(ratio, dtype=torch.bool))
+    # before the filter
+    mismatch = of_noise * colour / spline.gain.square().clamp(min=1e-6)
+    mismatch = mismatch.clamp(min=max(floor, 1e-6 * mean))
+    if mesh.dims == 2:
+        mismatch = flat_if_better(
+            spectrum_of(images.stack, weight.sqrt(), spline.settings),
+            mismatch,
+            spline.settings.threshold,
+            _mean_square_strain(mesh.slopes(coefficients)),
+        )
+    chosen = filter_of(
+        images.stack, mean**0.5, mismatch, weight.sqrt(), images.blur, spline.settings
+    )
+    white = min(images.white, max(amplitudes["noise"], floor) ** 0.5)
+    again = images.filtered(chosen)._replace(weight=weight, noise_updated=True, white=white)
+    # where the residual is smaller than expected, so is the motion that would make it
+    unresolved = unresolved * amplitudes["unresolved"] * local.clamp(max=1.0)
+    return Differences(again, unresolved, amplitudes)
+
+
+def _named(
+    kinds: Mapping[str, torch.Tensor], terms: Sequence[torch.Tensor], names: Sequence[str]
+) -> list[torch.Tensor]:
+    by_name = dict(zip(kinds, terms, strict=True))
+    return [by_name[name] for name in names]
+
+
+def _drawn(
+    images: Images, linear: Linear, mesh: Mesh, unresolved: torch.Tensor, times: float, width: float
+) -> dict[str, torch.Tensor]:
+    """Random differences in dt of unit amplitude, (draws, ...), after the images' filter."""
+    spline, valid = images.spline, linear.valid
+    slope = working(linear.slope)
+    like, shape = slope, (_DRAWS, *slope.shape[1:])
+    steep = averaged(slope.square().sum(0), valid, width)
+    # texture is stronger where slopes are
+    local = (steep / steep[valid].mean()).sqrt()
+
+    def textured(density: torch.Tensor, seed: int) -> torch.Tensor:
+        shaped = spline._replace(gain=spline.gain * density[: len(spline.gain)].sqrt())
+        return local * shaped.filtered(normal_fields(shape, like, seed))
+
+    texture = _texture_density(images)
+    wave = wavenumbers(texture, spline.shape)
+    white = normal_fields(shape, like, 1) / images.given_weight.sqrt()
+    finer = _motion_beyond(shape, mesh, like, 4) * unresolved.sqrt()
+    return {
+        "noise": spline.filtered(white) / times**0.5,
+        "replaced": textured(texture, 2),
+        "through the plane": textured(_density_of_displaced(wave, texture), 3),
+        "unresolved": (slope * finer).sum(1),
+    }
+
+
+def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:
     """Independent standard normal numbers, the same on every device."""
     random = torch.Generator().manual_seed(seed)
     return torch.randn(tuple(shape), generator=random, dtype=like.dtype).to(like.device)
 
 
-def structure_density(images: Images) -> torch.Tensor:
-    """Spectral density of the structure that stands out of the noise, by shells."""
-    spline, stack = images.spline, images.stack
-    known = torch.stack([torch.isfinite(image) for image in stack])
-    stack = torch.stack([stored(filled(image)) for image in stack])
+def _texture_density(images: Images) -> torch.Tensor:
+    """Spectral density of the texture that stands out of the noise, (shells,)."""
+    spline = images.spline
+    known = torch.stack([torch.isfinite(image) for image in images.stack])
+    stack = torch.stack([stored(filled(image)) for image in images.stack])
     sizes = transform_sizes(spline.shape, spline.settings)
     _, shell = radii(tuple(sizes), spline.shape, stack.dtype, stack.device)
     density, uncertainty = shell_means(stack, shell, sizes, spline.settings.smoothing, known)
-    floor = images.white**2
-    out = density > floor * (1 + spline.settings.threshold * uncertainty)
-    return torch.where(out, density - floor, 0.0)
+    # the means of shells of noise alone scatter about its variance
+    above = density > images.white**2 * (1 + spline.settings.threshold * uncertainty)
+    return torch.where(above, density - images.white**2, 0.0)
 
 
-def displaced(wave: torch.Tensor, structure: torch.Tensor) -> torch.Tensor:
-    return (wave * structure).flip(0).cumsum(0).flip(0) * (wave[1] - wave[0])
+def _density_of_displaced(wave: torch.Tensor, texture: torch.Tensor) -> torch.Tensor:
+    """Spectral density of the differences made by 1 px of motion through the plane, (shells,).
+
+    Texture changes by the displacement times its gradient across the plane. If it is isotropic in
+    space, its spectral density T gives that of a slice, S(k) = integral T(|(k, q)|) dq, and that
+    of the gradient, F(k) = integral q^2 T(|(k, q)|) dq, over the wavenumbers q across the plane.
+    Then dF/dk = -k S, so that F(k) is the integral of k' S(k') from k on.
+    """
+    return (wave * texture).flip(0).cumsum(0).flip(0) * (wave[1] - wave[0])
 
 
-def tail(prior: Prior, knots: float, places) -> torch.Tensor:
-    """Variance of a component of the displacement below the knots, if the spectrum goes on as -5/3."""
-    wave, fraction = _unresolved_fraction(knots, prior.local)
-    step = (wave[1] / wave[0]).log()
-    strength, variance = prior.strength, 0.0
+def _unresolved_fraction(mesh: Mesh, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Wavenumbers, rad per px, and the fraction of a wave's variance that the splines leave.
+
+    Of cubic splines of least squares it is 1 - s(0) / sum_n s(n), with s(n) the eighth power of
+    sinc(f + n) at f waves per knot (Unser, Aldroubi & Eden 1993, IEEE Trans. Signal Process. 41,
+    834-848).
+    """
+    axis = mesh.axes[0]
+    knots = (axis.size - 1) / axis.cells
+    lowest, highest = 0.1 * math.pi / max(knots, 1.0), math.pi
+    wave = torch.exp(torch.linspace(math.log(lowest), math.log(highest), 24).to(like))
+    per_knot = wave * knots / (2 * math.pi)
+    power = torch.sinc(per_knot[:, None] + torch.arange(-8, 9).to(like)).pow(8)
+    return wave, 1 - torch.sinc(per_knot).pow(8) / power.sum(1)
+
+
+def _variance_beyond(prior: Prior, mesh: Mesh) -> torch.Tensor:
+    """Variance of a component of the motion that the splines leave of the prior, px^2, (...)."""
+    wave, fraction = _unresolved_fraction(mesh, prior.local)
+    step = float((wave[1] / wave[0]).log())
+    total = torch.zeros_like(prior.local[0])
     for k, part in zip(wave, fraction, strict=True):
-        for plain, gradient in ((0, 2), (1, 3)):
-            # spectral density of a component, 1 / (2 k^2 (L + M k^2))
-            variance = variance + part * step / (4 * math.pi * (strength[plain] + strength[gradient] * k**2))
-    return interpolated(variance, prior.mesh.places, places)
+        # waves in an octave, per radian^dims: k^2 / 2 pi of a plane, k^3 / 2 pi^2 of a volume
+        waves = k**2 / (2 * math.pi) if mesh.dims == 2 else k**3 / (2 * math.pi**2)
+        total += part * step * waves * prior.density(k)
+    return interpolated(total, prior.mesh.places, mesh.places)
 
 
-def _unresolved_fraction(knots: float, like: torch.Tensor):
-    """Wavenumbers, rad per px, and the fraction of a wave's variance that cubic splines leave."""
-    wave = torch.exp(torch.linspace(math.log(0.1 * math.pi / knots), math.log(math.pi), 24).to(like))
-    turns = wave * knots / (2 * math.pi)
-    images = turns[:, None] + torch.arange(-8, 9).to(like)
-    power = torch.sinc(images).pow(8)
-    return wave, 1 - torch.sinc(turns).pow(8) / power.sum(1)
-
-
-def fine_motion(shape, knots: float, like: torch.Tensor, seed: int) -> torch.Tensor:
-    """Random motion (draws, 2, z, y) of unit variance in waves that splines leave."""
-    field = normal((DRAWS, 2, *shape), like, seed)
-    k = torch.hypot(*torch.meshgrid(torch.fft.fftfreq(shape[0]).to(like), torch.fft.rfftfreq(shape[1]).to(like), indexing="ij"))
-    wave, fraction = _unresolved_fraction(knots, like)
-    at = (torch.searchsorted(wave, 2 * math.pi * k)).clamp(max=len(wave) - 1)
-    gain = torch.where(k > 0, (fraction / wave**3).sqrt()[at], 0.0)
-    field = torch.fft.irfft2(torch.fft.rfft2(field) * gain, s=tuple(shape))
+def _motion_beyond(shape: Sequence[int], mesh: Mesh, like: torch.Tensor, seed: int) -> torch.Tensor:
+    """Random motion (draws, components, ...) of unit variance in waves that the splines leave."""
+    draws, *sizes = shape
+    field = normal_fields((draws, mesh.dims, *sizes), like, seed)
+    dims = tuple(range(-len(sizes), 0))
+    along = [torch.fft.fftfreq(n) for n in sizes[:-1]] + [torch.fft.rfftfreq(sizes[-1])]
+    k = reduce(torch.hypot, torch.meshgrid(*along, indexing="ij")).to(like) * 2 * math.pi
+    wave, fraction = _unresolved_fraction(mesh, like)
+    # of the inertial range, whose spectrum falls by k^(-5/3)
+    power = fraction * wave ** (-2 / 3 - mesh.dims)
+    at = torch.searchsorted(wave, k.contiguous()).clamp(max=len(wave) - 1)
+    gain = torch.where(k > 0, power[at], 0.0).sqrt()
+    field = torch.fft.irfftn(torch.fft.rfftn(field, dim=dims) * gain, s=tuple(sizes), dim=dims)
     return field / field.square().mean().sqrt()
 
 
-def residuals_of(linear: Linear, mesh: Mesh, response: Response):
+def _residual_operator(
+    linear: Linear, mesh: Mesh, response: Response | None
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """What a fit leaves of differences (draws, ...), to first order."""
     slope, weight = working(linear.slope), working(linear.weight)
 
-    def left(difference: torch.Tensor) -> torch.Tensor:
-        difference = working(difference) * linear.valid
-        change = response(mesh.transposed(-difference * slope * weight))
-        return (difference + (slope * mesh.field(change)).sum(0)) * linear.valid
+    def left(differences: torch.Tensor) -> torch.Tensor:
+        if response is None:
+            return differences * linear.valid
+        rests = []
+        for one in working(differences) * linear.valid:
+            change = response(mesh.transposed(-one * slope * weight))
+            rests.append((one + (slope * mesh.field(change)).sum(0)) * linear.valid)
+        return torch.stack(rests)
 
     return left
 
 
-def squares(rest: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Mean squares by scale and place, (scales, z, y)."""
-    fine, coarse = averaged(rest, valid, 1.5), averaged(rest, valid, 3.0)
-    bands = (rest - fine, fine - coarse, coarse)
-    return torch.stack([averaged((b * valid).square(), valid, REGION)[::REGION, ::REGION] for b in bands])
-
-
-DEBUG = []
-
-
-def _shrunk(ratio, number, use):
-    """Ratios of squares to what is expected, with as much freedom as their scatter shows."""
-    known = ratio[use]
-    chance = (1 / number[use]).mean()
-    scatter = (known - 1).square().mean()
-    free = (scatter - chance).clamp(min=1e-6)
-    more = 1 / free
-    return (number * ratio + more) / (number + more)
-
-
-def estimated(images: Images, linear: Linear, mesh: Mesh, coefficients, posterior, prior: Prior, separation: float, template: float):
-    valid, spline = linear.valid, images.spline
-    if not bool(valid.any()):
-        return images, None
-    times = images.time.square().sum()
-    time = images.time.to(linear.warped).reshape(-1, 1, 1)
-    difference = working((time * linear.warped).sum(0) / times * valid)
+def _flows_left(
+    linear: Linear, mesh: Mesh, prior: Prior, response: Response | None
+) -> torch.Tensor:
+    """What a fit leaves of the differences by flows drawn from the prior, (draws, ...)."""
     slope = working(linear.slope)
-    shape, like = difference.shape, difference
-    given = images.given_weight
-    # white noise
-    white = normal((DRAWS, *shape), like, 1) / given.sqrt()
-    unit = images.known_noise if images.noise_known else 1.0
-    white = unit * spline.filtered(white) / times.sqrt()
-    # texture
-    structure = structure_density(images)
-    wave = wavenumbers(structure, spline.shape)
-    steep = averaged(slope.square().sum(0), valid, 0.5 * template)
-    modulation = (steep / steep[valid].mean()).sqrt()
+    if response is None:
+        return torch.zeros_like(slope[:1]).expand(_DRAWS, *slope.shape[1:])
+    weights = prior.weights
+    drawn = weights.sqrt() * normal_fields((_DRAWS, *weights.shape), weights, 5)
+    flows = prior.rates_transposed(drawn)
+    return torch.stack([(slope * mesh.field(response(one))).sum(0) * linear.valid for one in flows])
 
-    def of_spectrum(density, seed):
-        density = density[: len(spline.gain)]
-        shaped = spline._replace(gain=spline.gain * density.clamp(min=0).sqrt())
-        return modulation * shaped.filtered(normal((DRAWS, *shape), like, seed))
 
-    replaced = of_spectrum(structure, 2)
-    moved = of_spectrum(displaced(wave, structure), 3)
-    variance = tail(prior, separation, mesh.places)
-    fine = (slope * fine_motion(shape, separation, like, 4)).sum(1) * variance.sqrt()
-    left = residuals_of(linear, mesh, posterior.response)
-    # what the prior leaves of the flow itself
-    flows = prior.rates_transposed(prior.weights.sqrt() * normal((DRAWS, *prior.weights.shape), prior.local, 5))
-    own = [(slope * mesh.field(posterior.response(one))).sum(0) * valid for one in flows]
-    q = lambda part: squares(part, valid)
-    found = q(difference)
-    held = torch.stack([q(one) for one in own])
-    kinds = {"noise": white, "replaced": replaced, "moved": moved, "fine": fine}
-    rests = {name: [left(one) for one in part] for name, part in kinds.items()}
-    drawn = {name: torch.stack([q(one) for one in part]) for name, part in rests.items()}
-    use = (averaged(valid.to(found), torch.ones_like(valid), REGION)[::REGION, ::REGION] > 0.5).expand_as(found)
-    use = use & (found > 0)
-    # independent squares in each mean, from the scatter of the noise's
-    rel = drawn["noise"] / drawn["noise"].mean(0)
-    chance = rel.var(0).mean((1, 2), keepdim=True).expand_as(found) * DRAWS / (DRAWS - 1)
-    number = (1 / chance)[use].cpu().numpy()
-    terms = np.stack([part.mean(0)[use].cpu().numpy() for part in drawn.values()])
-    own_term = held.mean(0)[use].cpu().numpy()
-    if images.noise_known:
-        own_term = own_term + terms[0]
-    observed = found[use].cpu().numpy()
-    limits = np.array([1e-6 if images.noise_known else np.inf, np.inf, np.inf, 1.0])
-    misfit, factors = most_likely(observed, terms, limits, number, own_term)
-    DEBUG.append(dict(zip(kinds, factors), misfit=misfit, n=number.mean()))
-    if images.noise_known:
-        factors = factors + np.array([1.0, 0, 0, 0])
-    amplitude = {name: max(float(f), 0.0) for name, f in zip(kinds, factors)}
-    total = reduce(torch.add, [amplitude[n] ** 0.5 * part for n, part in kinds.items()])
-    after = [
-        reduce(torch.add, [amplitude[n] ** 0.5 * part[d] for n, part in rests.items()]) + own[d]
-        for d in range(DRAWS)
-    ]
-    expected = torch.stack([q(one) for one in after]).mean(0)
-    count = (1 / chance) * use
-    local = (count * (found / expected.clamp(min=1e-30))).sum(0) / count.sum(0).clamp(min=1e-30)
-    seen = use.any(0)
-    local = torch.where(seen, _shrunk(local, count.sum(0), seen), 1.0)
-    places = [torch.arange(0, n, REGION).to(like) for n in shape]
-    local = interpolated(local.log(), places, [torch.arange(n).to(like) for n in shape]).exp()
-    level = averaged(total.square().mean(0), valid, 0.75 * template) * local * times / max(spline.passed, 1e-6)
-    floor = (1e-5 * float(images.stack[torch.isfinite(images.stack)].std())) ** 2
-    level = level.clamp(min=floor)
-    mean = float(level[valid].mean())
-    weight = mean / level
-    sizes = transform_sizes(spline.shape, spline.settings)
-    _, shell = radii(tuple(sizes), spline.shape, total.dtype, total.device)
-    def shells(part):
-        return shell_means(part * (weight * times).sqrt() * valid, shell, sizes, spline.settings.smoothing)
-    total = total * local.sqrt()
-    density, uncertainty = shells(total)
-    there, _ = shells(torch.stack(after) * local.sqrt())
-    seen_there, chance_there = shells(difference[None])
-    inside = torch.ones_like(there, dtype=torch.bool)
-    colour = _shrunk(seen_there / there.clamp(min=1e-30), 1 / chance_there.square(), inside)
-    density = density * colour
-    density = density / spline.gain.square().clamp(min=1e-6)
-    density = density.clamp(min=1e-6 * mean)
-    spectrum = spectrum_of(images.stack, weight.sqrt(), spline.settings)
-    along_z, along_y = mesh.slopes(coefficients)
+class _Squares:
+    """Mean squares of fields (n, ...) by scale and place: (n, scales, places ...)."""
+
+    def __init__(self, valid: torch.Tensor):
+        like = torch.empty(0, dtype=torch.float64, device=valid.device)
+        self.shape = valid.shape
+        self._means = [[_gaussian(n, n, 1, width, like) for n in valid.shape] for width in _SCALES]
+        self._region = [_gaussian(-(-n // _REGION), n, _REGION, _REGION, like) for n in valid.shape]
+        self._valid = valid.to(like)
+        self._share = separable(self._valid, self._region)
+        self.inside = (self._share > 0.5).expand(len(_SCALES) + 1, *self._share.shape)
+
+    def __call__(self, fields: torch.Tensor) -> torch.Tensor:
+        fields = fields.to(self._valid) * self._valid
+        means = [fields, *(separable(fields, mean) for mean in self._means)]
+        bands = [*(a - b for a, b in pairwise(means)), means[-1]]
+        square = torch.stack(bands, 1) * self._valid
+        return separable(square.square(), self._region) / self._share.clamp(min=1e-3)
+
+    def on_pixels(self, values: torch.Tensor) -> torch.Tensor:
+        """Positive values at the places, at the pixels."""
+        places = [torch.arange(0, n, _REGION).to(values) for n in self.shape]
+        pixels = [torch.arange(n).to(values) for n in self.shape]
+        return interpolated(values.log(), places, pixels).exp()
+
+
+def _gaussian(
+    places: int, pixels: int, separation: int, width: float, like: torch.Tensor
+) -> torch.Tensor:
+    """Weights (places, pixels) of a Gaussian mean about places; of sum 1 at the rim too."""
+    at, of = torch.arange(places).to(like) * separation, torch.arange(pixels).to(like)
+    kernel = torch.exp(-((at[:, None] - of) / width).square() / 2)
+    return kernel / kernel.sum(1, keepdim=True)
+
+
+def _chance(squares: torch.Tensor) -> torch.Tensor:
+    """Variance of a mean square over its mean by scale, from the scatter of the draws."""
+    ratio = squares / squares.mean(0).clamp(min=1e-30)
+    dims = tuple(range(1, ratio.ndim - 1))
+    variance = ratio.var(0).mean(dims, keepdim=True) * len(squares) / (len(squares) - 1)
+    return variance.clamp(min=1e-6)
+
+
+def _shrunk(ratio: torch.Tensor, number: torch.Tensor, use: torch.Tensor) -> torch.Tensor:
+    """Ratios of squares to what is expected, with as much freedom as their scatter shows.
+
+    A ratio of `number` independent squares scatters by 1 / number about its true value, and that
+    scatters about 1 by what is left (moments; DerSimonian & Laird 1986, Control. Clin. Trials 7,
+    177-188). Where not in `use` it is 1.
+    """
+    chance = 1 / number.clamp(min=1e-3)
+    free = ((ratio[use] - 1).square().mean() - chance[use].mean()).clamp(min=1e-6)
+    shrunk = (free * ratio + chance) / (free + chance)
+    return torch.where(use, shrunk, 1.0).clamp(min=1e-6)
+
+
+def _mean_square_strain(slopes: Sequence[torch.Tensor]) -> float:
+    """Of a flow in a plane without its divergence, along any direction."""
+    along_z, along_y = slopes
     stretched, sheared = along_z[0] - along_y[1], along_z[1] + along_y[0]
-    # mean square of the strain in dt along any direction
-    strain = float(((stretched.square() + sheared.square()) / 8)[valid].mean())
-    density = flat_if_nearly(spectrum, density, spline.settings.threshold, 0.0, strain)
-    DEBUG.append({"local": float(local.min()), "localmax": float(local.max())})
-    chosen = filter_of(images.stack, mean**0.5, density, weight.sqrt(), images.blur, spline.settings)
-    out = images.filtered(chosen, chosen.level)._replace(weight=weight, noise_updated=True, white=min(images.white, max(amplitude["noise"],1e-12) ** 0.5 * unit))
-    return out, amplitude["fine"] * variance * local.clamp(max=1.0)
+    return float((stretched.square() + sheared.square()).mean()) / 8

@@ -24,11 +24,6 @@ _SINGLE = 1e-3
 _MOST_PRODUCTS = 12
 
 
-# Least information over second derivative at which steps take the information: each then leaves
-# less than half of the distance.
-_LEAST_INFORMATION = 0.7
-
-
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, and the factor of the posterior's precision there.
 
@@ -75,9 +70,7 @@ def solved(
     band = _band(mesh)
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
-    # standard errors follow the information; steps with less than the second derivative overshoot
-    step = root if informative(linear) else band.factor(curvature(linear, mesh) + stiff)
-    return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
+    return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
 
 
 class PriorTerm(NamedTuple):
@@ -119,7 +112,7 @@ def solved_in_single(
     precision.
     """
     gradient = mesh.transposed(linear.gradient) + prior_term.gradient
-    whole = (data_form if informative(linear) else curvature)(linear, mesh) + prior_term.whole
+    whole = data_form(linear, mesh) + prior_term.whole
     if near is not None:
         step = solved_near(near, whole, gradient, _SINGLE, _MOST_PRODUCTS)
         if step is not None:
@@ -157,11 +150,6 @@ def in_single(band: Band, form: torch.Tensor) -> Factor | None:
         return None
 
 
-def informative(linear: Linear) -> bool:
-    """Whether information and second derivative are alike: steps by either converge."""
-    return bool((linear.information >= _LEAST_INFORMATION * linear.weight).all())
-
-
 def prior_and_gradient(
     linear: Linear, mesh: Mesh, coefficients: torch.Tensor, prior: Prior, ridge: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -177,12 +165,7 @@ def prior_and_gradient(
 
 def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
     """Quadratic form of the images' information, of all cells along z or some (`band.form`)."""
-    return form_of_slopes(linear.information, linear.damped, mesh, cells)
-
-
-def curvature(linear: Linear, mesh: Mesh) -> torch.Tensor:
-    """The log-likelihood's quadratic form: steps with less than it would overshoot."""
-    return form_of_slopes(linear.weight, linear.damped, mesh)
+    return form_of_slopes(linear.weight, linear.slope, mesh, cells)
 
 
 def form_of_slopes(
@@ -200,13 +183,13 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
     rows = mesh.axes[0].knots if cells is None else cells.stop - cells.start + REACH
     total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
     # kinds of motion share products of derivatives: each product is summed once
-    pairs: dict[tuple[tuple[int, int], tuple[int, int]], list[tuple[int, int, int, float]]] = {}
-    for kind, terms in _kinds(prior):
+    pairs: dict[tuple[tuple[int, ...], ...], list[tuple[int, int, int, float]]] = {}
+    for kind, terms in prior.motions:
         for a, first, one in terms:
             for b, second, other in terms:
                 pairs.setdefault((first, second), []).append((kind, a, b, one * other))
     # the integral over the plane is a sum over the cells of the mesh
-    weight = prior.cell * prior.strength
+    weight = prior.cell * prior.local
     for (first, second), members in pairs.items():
         parts = form(weight, mesh, first, second, cells)
         for kind, a, b, scale in members:
@@ -227,7 +210,7 @@ def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None
                         for b, second, other in terms
                     ),
                 )
-                for _, terms in _kinds(prior)
+                for _, terms in prior.motions
             ]
         )
     )
@@ -246,8 +229,3 @@ def rounding(form: torch.Tensor) -> float:
     more than the floating-point precision.
     """
     return _ROUNDING * float(form.amax())
-
-
-def _kinds(prior: Prior):
-    """Each kind's terms as (component, orders of its derivative along z and y, factor)."""
-    return prior.motions

@@ -120,9 +120,9 @@ def solved(
     # lumped to the nodes of the prior, for draws and the preconditioner alone
     curvature = coefficients.new_empty(dims, dims, *prior.mesh.shape)
     for a, b in combinations_with_replacement(range(dims), 2):
-        squares = linear.information * linear.slope[a] * linear.slope[b]
+        squares = linear.weight * linear.slope[a] * linear.slope[b]
         curvature[a, b] = curvature[b, a] = separable(squares, lumps)
-    # the step itself has every voxel, and the second derivative instead of the information
+    # the step itself has every voxel
     steep = linear.weight * linear.slope
 
     def applied(c: torch.Tensor) -> torch.Tensor:
@@ -167,16 +167,16 @@ def _preconditioner(
     """The inverse of each knot's diagonal block (components, components)."""
     mesh = prior.mesh
     dims = mesh.dims
-    # the diagonal of a form has the squares of the basis functions
-    bases = [[mesh.basis(axis, order).square().T for axis in range(dims)] for order in (0, 1)]
 
-    def diagonal(values: torch.Tensor, axis: int | None = None) -> torch.Tensor:
-        return separable(values, [bases[a == axis][a] for a in range(dims)])
+    def diagonal(values: torch.Tensor, orders: Sequence[int] = (0,) * dims) -> torch.Tensor:
+        # the diagonal of a form has the squares of the basis functions
+        bases = [mesh.basis(axis, n).square().T for axis, n in enumerate(orders)]
+        return separable(values, bases)
 
     block = diagonal(curvature)
     for weight, (_, motion) in zip(prior.weights, prior.motions, strict=True):
-        for a, b, scale in motion:
-            block[a, a] += diagonal(weight, b) * scale**2
+        for a, orders, scale in motion:
+            block[a, a] += diagonal(weight, orders) * scale**2
     for a in range(dims):
         block[a, a] += ridge
     inverse = torch.linalg.inv(block.movedim((0, 1), (-2, -1)).double()).to(curvature)

@@ -9,13 +9,18 @@ import torch
 
 from lidar_mi.retrieval.flow.flow_spline import Mesh
 from lidar_mi.retrieval.flow.settings import VariationalSettings
+from lidar_mi.retrieval.images.band_limit import Filter
 from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
 from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import misfit_variance
-from lidar_mi.retrieval.images.band_limit import Filter
-from lidar_mi.retrieval.images.inpainting import filled_in
-from lidar_mi.retrieval.images.spline import Spline, filter_of, nearest, values_and_slopes
-from lidar_mi.retrieval.images.windows import averaged, stored
+from lidar_mi.retrieval.images.spline import (
+    Spline,
+    filter_of,
+    finite,
+    nearest,
+    splines_of_values_and_slopes,
+)
+from lidar_mi.retrieval.images.windows import averaged
 
 # Interpolation error of the splines over an image's rms structure: the least noise assumed.
 _INTERPOLATION = 1e-5
@@ -25,12 +30,6 @@ _LEAST_KNOWN = 0.1
 # Width of the means that separate texture from noise, in cells between knots: at 0.8 too few
 # pixels, at 3 the rim of smoke counts as texture next to it.
 _FRACTION_WIDTH = 1.5
-# Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
-_STRUCTURE = 3.0
-# Of the mean that passes the long waves in which structure moves alike over an area; and the
-# variance of its motion in the other waves over that in these. Chosen on seeds 41 to 43 of the
-# true second states of ``validation/coverage.py``: 0.8 to 1.5 px and 0.1 to 0.3 are alike.
-_LONG, _SHORT = 1.0, 0.17
 
 
 class Images(NamedTuple):
@@ -39,7 +38,9 @@ class Images(NamedTuple):
     Attributes
     ----------
     spline : Spline
-        Of the images, band-limited.
+        Of the images for their differences, whose noise is white.
+    smooth : Spline
+        Of the images for their slopes, see `band_limit.Filter`.
     usable : torch.Tensor of bool, shape (images, ...)
         Away from non-finite pixels.
     time : torch.Tensor, shape (images,)
@@ -48,22 +49,22 @@ class Images(NamedTuple):
         Standard deviation of the images' white noise.
     weight : torch.Tensor, shape of an image
         Inverse-variance weight: mean variance of the noise over its own at each pixel.
+    given_weight : torch.Tensor, shape of an image
+        The same by the noise as given.
     stack : torch.Tensor, shape (images, ...)
         The images, of one brightness.
     blur : float
         Standard deviation of the Gaussian that blurred the images, px.
     white : float
-        The noise before it contained the local misfit.
-    noise_updated : bool
-        Whether noise and weight contain the local misfit already.
-    out_of_plane : float
-        Mean square displacement out of the plane, from the misfit, px^2.
-    noise_known : bool
-        Whether the noise is as given; else it is that of the images' spectra.
+        The white noise alone, without other differences.
     known_noise : float
-        The noise that was given, a lower limit; 0 if none was.
-    coherent : float
-        Variance of the displacement of non-advected structure, times its correlated area, px^4.
+        The noise that was given; 0 if none was.
+    chosen : Filter
+        Of the images.
+    noise_known : bool
+        Whether that is the noise; else it is a lower limit.
+    noise_updated : bool
+        Whether noise and weight are those of `components.differences`.
     """
 
     spline: Spline
@@ -72,33 +73,37 @@ class Images(NamedTuple):
     time: torch.Tensor
     noise: float
     weight: torch.Tensor
+    given_weight: torch.Tensor
     stack: torch.Tensor
     blur: float
     white: float
     known_noise: float
-    noise_updated: bool = False
-    out_of_plane: float = 0.0
+    chosen: Filter
     noise_known: bool = True
-    coherent: float = 0.0
-    given_weight: torch.Tensor | None = None
+    noise_updated: bool = False
 
     def single(self) -> "Images":
         """The same to be warped in single precision: places to 1e-5 px."""
         spline, smooth = (
-            s._replace(coefficients=s.coefficients.float()) for s in (self.spline, self.smooth)
+            one._replace(coefficients=one.coefficients.float())
+            for one in (self.spline, self.smooth)
         )
         return self._replace(
             spline=spline, smooth=smooth, time=self.time.float(), weight=self.weight.float()
         )
 
-    def filtered(self, chosen: Filter, level: float) -> "Images":
-        """The images after another filter."""
-        finite = torch.stack([stored(filled_in(image)) for image in self.stack])
-        spline, smooth = values_and_slopes(finite, chosen, self.spline.settings)
-        return self._replace(spline=spline, smooth=smooth, noise=level)
+    def only(self, number: int) -> "Images":
+        """With the splines of one of the images."""
+        return self._replace(spline=self.spline.only(number), smooth=self.smooth.only(number))
+
+    def filtered(self, chosen: Filter) -> "Images":
+        """The images after another filter, with its noise."""
+        settings = self.spline.settings
+        spline, smooth = splines_of_values_and_slopes(finite(self.stack), chosen, settings)
+        return self._replace(spline=spline, smooth=smooth, noise=chosen.level, chosen=chosen)
 
     def sample(self, *places: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Values, smooth values and slopes at places (images, ...)."""
+        """Values, smooth values and their slopes at places (images, ...)."""
         return self.spline.values(*places), *self.smooth.sample(*places)
 
 
@@ -108,32 +113,24 @@ class Linear(NamedTuple):
     Attributes
     ----------
     slope : torch.Tensor, shape (components, ...)
-        Of the mean of the warped images.
-    damped : torch.Tensor, shape (components, ...)
-        The same without what is `coarse`: slopes that inform the flow.
-    coarse : torch.Tensor, shape (z, y), or None
-        Fraction of the long waves of differences and slopes that is removed at each pixel, as
-        structure is not advected there: the residual is as white as the noise.
+        The likeliest slopes of the air, mean of the warped images.
     gradient : torch.Tensor, shape (components, ...)
         Of the log-likelihood with respect to the flow at each pixel.
     weight : torch.Tensor
-        Of the products of slopes in the second derivative.
-    information : torch.Tensor
-        Of the same in the information on the flow: slopes of noise have none.
+        Of the products of slopes in the information.
     variance : float
         Of the noise.
+    smooth : torch.Tensor, shape (images, ...)
+        The images at mid-time, equal in brightness, after the filter of their slopes.
     warped : torch.Tensor, shape (images, ...)
-        The images at mid-time, equal in brightness.
+        The same after that of their differences.
     valid : torch.Tensor of bool
         Where all of them are.
     """
 
     slope: torch.Tensor
-    damped: torch.Tensor
-    coarse: torch.Tensor | None
     gradient: torch.Tensor
     weight: torch.Tensor
-    information: torch.Tensor
     variance: float
     smooth: torch.Tensor
     warped: torch.Tensor
@@ -159,26 +156,24 @@ def prepared(
         blur=blur,
         settings=settings.filter,
     )
-    finite = torch.stack([stored(filled_in(image)) for image in images])
-    spline, smooth = values_and_slopes(finite, chosen, settings.filter)
-    level = chosen.level
-    level = max(level, _INTERPOLATION * rms(images))
+    spline, smooth = splines_of_values_and_slopes(finite(images), chosen, settings.filter)
+    level = max(chosen.level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
-    # mid-time is that of the whole burst
-    time = time - time.mean()
     return Images(
         spline,
         smooth,
         known_at,
-        time,
+        # mid-time is that of the whole burst
+        time - time.mean(),
         level,
+        weight,
         weight,
         images,
         blur,
         level,
         known_noise,
-        noise_known=noise_known,
-        given_weight=weight,
+        chosen,
+        noise_known,
     )
 
 
@@ -197,11 +192,16 @@ def linearised_there(
     sampled: Sequence[torch.Tensor],
     settings: VariationalSettings,
 ) -> Linear:
-    """`linearised`, with the images' values and slopes at the places of `path`."""
+    """`linearised`, with what `Images.sample` gives at the places of `path`.
+
+    Differences of the images times their slopes inform the flow. Noise is in both. The slopes are
+    those of the air that are expected from the images (Wiener), so that the information is their
+    square over the variance of the differences' white noise, for waves of every length.
+    """
     value, smooth, *slopes = sampled
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
     # over air that is in all images: bright air that enters would change the brightness of all
-    smooth, gain = normalised_intensity(smooth, images.weight * valid)
+    smooth, _ = normalised_intensity(smooth, images.weight * valid)
     value, gain = normalised_intensity(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])
     residual = (value - value.mean(0)) * images.weight.sqrt()
@@ -221,20 +221,7 @@ def linearised_there(
     slope = slope * _fraction_of_texture(images, slope, valid, mesh)
     gradient = -informed * difference * slope
     information = images.time.square().sum() * informed
-    return Linear(slope, slope, None, gradient, information, information, variance, smooth, value, valid)
-
-
-def steepness_of_structure(slope: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Squared slope (z, y) of what images (2, z, y) show coarsely, in a Gaussian mean of 3 px."""
-    structure = torch.stack([averaged(part, valid, _STRUCTURE) for part in slope])
-    return structure.square().sum(0)
-
-
-def without_coarse(
-    field: torch.Tensor, coarse: torch.Tensor | None, valid: torch.Tensor
-) -> torch.Tensor:
-    """A field (z, y) without a fraction of its long waves at each pixel, see `Linear.coarse`."""
-    return field if coarse is None else field - coarse * averaged(field, valid, _LONG)
+    return Linear(slope, gradient, information, variance, smooth, value, valid)
 
 
 def information_of_first(

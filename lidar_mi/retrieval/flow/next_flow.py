@@ -28,12 +28,11 @@ from lidar_mi.retrieval.flow.likelihood import (
 )
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
-from lidar_mi.retrieval.images.band_limit import Filter
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.intensity import normalised
 from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import informative, misfit_variance
-from lidar_mi.retrieval.images.spline import filtered_spline
+from lidar_mi.retrieval.images.spline import Spline, splines_of_values_and_slopes
 from lidar_mi.retrieval.images.windows import Windows
 
 # Largest step (px, of 99 in 100 pixels) after which the images are not warped again, and how often
@@ -60,7 +59,7 @@ class Flow:
         Covariance of the flow a priori, px^2.
     additional : torch.Tensor, shape (2, 2, *windows.count)
         Covariance in addition to the posterior's, px^2: of motion that the splines do not resolve
-        (`unresolved`), and by the prior's strength (`Prior.evened`).
+        (`components.differences`).
     images : Images
         Their filter and noise.
     local : torch.Tensor, shape (z, y)
@@ -128,7 +127,6 @@ def flow_of(
     posterior: Posterior,
     linear: Linear,
     images: Images,
-    given: torch.Tensor,
     before: torch.Tensor,
     additional: torch.Tensor,
     windows: Windows,
@@ -136,7 +134,7 @@ def flow_of(
 ) -> Flow:
     """What the next retrieval may start from, after one from scratch.
 
-    `given` is the weight (z, y) by the noise as given; the other arguments are those of its end.
+    The arguments are those of its end.
     """
     return Flow(
         posterior.coefficients,
@@ -145,7 +143,7 @@ def flow_of(
         before,
         additional,
         images,
-        images.weight / given,
+        images.weight / images.given_weight,
         _misfit(linear, torch.zeros_like(linear.slope), images),
         windows,
         settings,
@@ -198,7 +196,7 @@ def expected_flow(
     axes = placed.prior.mesh.axes
     mesh = _of_pixels(axes, start.windows, images.spline.coefficients)
     places = path(mesh, start.coefficients.float(), images.time, start.settings.path_order)
-    sampled = images.spline.sample(*places[:, :1])
+    sampled = images.sample(*places[:, :1])
     slope, information = information_of_first(images, mesh, places, sampled, len(images.time))
     prior_term = prior_term_of(placed.prior, start.coefficients, start.settings.ridge)
     root = factor_in_single(form_of_slopes(information, slope, mesh) + prior_term.whole)
@@ -237,7 +235,7 @@ def next_flow(
     start, placed, mesh = ready.start, ready.placed, ready.mesh
     windows, settings, prior = start.windows, start.settings, placed.prior
     images = _completed(ready.images, placed, stack, noise)
-    second = images.spline.only(1).sample(*ready.places[:, 1:])
+    second = images.only(1).sample(*ready.places[:, 1:])
     sampled = [torch.cat(pair) for pair in zip(ready.first, second, strict=True)]
     linear = linearised_there(images, mesh, ready.places, sampled, settings)
     coefficients, prior_term = start.coefficients, ready.prior_term
@@ -274,7 +272,7 @@ def _as_informed(ready: ExpectedFlow, linear: Linear) -> torch.Tensor:
     1 / (1 + f (r - 1)).
     """
     found, before, windows = ready.covariance, ready.placed.before, ready.start.windows
-    known = information_near(linear.damped, linear.information, ready.mesh)
+    known = information_near(linear.slope, linear.weight, ready.mesh)
     ratio = (known / ready.information.clamp(min=1e-30)).to(found)
     pixels, centres = _pixels(windows, found), _centres(windows, found)
     ratio = interpolated(ratio, pixels, centres)
@@ -321,13 +319,15 @@ def _back(places: Sequence[torch.Tensor], shift: Sequence[float]) -> list[torch.
 def _prepared(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None) -> Images:
     """The first of new images with the filter and the noise of those before."""
     known, weight = known_and_weight([first], noise, start.settings.noise_width)
-    pair = normalised([first])
+    image = normalised([first])
+    spline, smooth = _splines(start, image)
     return start.images._replace(
-        spline=filtered_spline(pair.nan_to_num(0.0).float(), _filter(start), start.settings.filter),
+        spline=spline,
+        smooth=smooth,
         usable=known,
         time=start.images.time.float(),
         weight=(weight * start.local).float(),
-        stack=pair,
+        stack=image,
     )
 
 
@@ -339,19 +339,19 @@ def _completed(
     if isinstance(noise, torch.Tensor) and noise.ndim:
         known = known & informative([noise])
     pair = normalised(stack)
-    second = pair[1:].nan_to_num(0.0).float()
-    both = images.spline.stacked_with(
-        filtered_spline(second, _filter(start), start.settings.filter)
+    spline, smooth = _splines(start, pair[1:])
+    return images._replace(
+        spline=images.spline.stacked_with(spline),
+        smooth=images.smooth.stacked_with(smooth),
+        usable=known,
+        stack=pair,
     )
-    return images._replace(spline=both, usable=known, stack=pair)
 
 
-def _filter(start: Flow) -> Filter:
-    """The filter that was learnt, in single precision."""
-    used, noise = start.images.spline, start.images.noise
-    return Filter(
-        used.gain.float(), noise, used.passed, used.excess, used.efficiency, used.noisy_slopes
-    )
+def _splines(start: Flow, images: torch.Tensor) -> tuple[Spline, Spline]:
+    """With the filter that was learnt, in single precision."""
+    finite = images.nan_to_num(0.0).float()
+    return splines_of_values_and_slopes(finite, start.images.chosen.single(), start.settings.filter)
 
 
 def _energy(prior: Prior, coefficients: torch.Tensor) -> float:

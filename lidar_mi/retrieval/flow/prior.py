@@ -1,8 +1,14 @@
-"""The prior of a flow: vorticity is concentrated, divergence small.
+"""The prior of a flow: vorticity and divergence of a spectrum and strength that images tell.
 
-Vorticity and divergence are white noise. Their variances, for each kind and place, are those of
-largest evidence (MacKay 1992, Neural Comput. 4, 415-447): the retrieved flow's energy then equals
-the prior variance less the posterior variance.
+With the vorticity w and the divergence d the energy of a flow is the sum over four kinds of motion
+
+    s(x) (L w^2 + M |grad w|^2 + D d^2 + N |grad d|^2),
+
+so that vorticity has the spectral density 1 / (s (L + M k^2)). Small M is the spectrum of
+turbulence, nearly white vorticity; large M that of smooth flows. The strength s varies over the
+image: precisions that have a gamma distribution make vorticity heavy-tailed, concentrated in cores.
+All follow from the largest evidence (MacKay 1992, Neural Comput. 4, 415-447): the energy of each
+kind in the retrieved flow equals the prior variance less the posterior variance.
 """
 
 import math
@@ -16,13 +22,13 @@ from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, halves, interpolated
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.windows import separable
 
-# Least rate at which the estimated ratio is taken to fall as a strength grows.
-_SLOWEST = 0.15
-# Width over that of the strengths by which `Prior.evened` averages variances.
-_EVENED = 0.5
-# Least standard deviation of a rate in a cell between knots, px per px: images of a flow without
-# vorticity would make the prior stronger for ever.
-_LEAST = 1e-4
+# Of the gamma distribution of the strengths: from Student's vorticity of one degree of freedom to
+# nearly uniform strength.
+_SHAPES = 0.5 * 2.0 ** torch.arange(7)
+# Rounds of the fixed point for the mean of that distribution.
+_ROUNDS = 20
+# Limits of the strengths, of displacements in px.
+_WEAKEST, _STRONGEST = 1e-6, 1e10
 
 Motion = tuple[tuple[int, tuple[int, ...], float], ...]
 """A rate of the flow as terms (component, orders of its derivative along the axes, sign)."""
@@ -44,7 +50,10 @@ def _gradient(motion: Motion) -> tuple[Motion, ...]:
     """Derivatives of a motion along all axes."""
     dims = len(motion[0][1])
     return tuple(
-        tuple((a, tuple(n + int(axis == c) for axis, n in enumerate(orders)), sign) for a, orders, sign in motion)
+        tuple(
+            (a, tuple(n + int(axis == c) for axis, n in enumerate(orders)), sign)
+            for a, orders, sign in motion
+        )
         for c in range(dims)
     )
 
@@ -56,16 +65,16 @@ KINDS: dict[int, tuple[tuple[Motion, ...], ...]] = {
         _gradient(_rotation(2, 0, 1)),
         _gradient(_divergence(2)),
     ),
-    3: (
-        (_rotation(3, 1, 2),),
-        (_rotation(3, 0, 1), _rotation(3, 0, 2)),
-        (_divergence(3),),
-    ),
+    3: ((_rotation(3, 1, 2),), (_rotation(3, 0, 1), _rotation(3, 0, 2)), (_divergence(3),)),
 }
 """Kinds of motion by number of dimensions.
 
 In a volume vorticity along x and across x are two kinds: the vortices of a wake lie along x.
 """
+
+
+DIVERGENT: dict[int, tuple[tuple[int, int], ...]] = {2: ((1, 0), (3, 2)), 3: ()}
+"""Kinds of divergence in a plane, each with the kind of vorticity of the same order."""
 
 
 class Prior(NamedTuple):
@@ -74,7 +83,7 @@ class Prior(NamedTuple):
     Attributes
     ----------
     local : torch.Tensor, shape (kinds, *mesh.shape)
-        Strength of the kinds whose strength varies from place to place.
+        Strength of each kind; the same from place to place but for a factor.
     mesh : Mesh
         At half the spacing of the knots.
     width : float
@@ -87,17 +96,12 @@ class Prior(NamedTuple):
     mesh: Mesh
     width: float
     spacing: tuple[float, ...]
-    trend: tuple | None = None
 
     @property
     def cell(self) -> float:
         """Area or volume of a cell of the mesh, px^2 or voxels."""
         # the mesh has two steps between knots
         return math.prod((axis.size - 1) / (2 * axis.cells) for axis in self.mesh.axes)
-
-    @property
-    def strength(self) -> torch.Tensor:
-        return self.local
 
     @property
     def motions(self) -> list[tuple[int, Motion]]:
@@ -107,13 +111,30 @@ class Prior(NamedTuple):
             (
                 kind,
                 tuple(
-                    (a, orders, sign * self.spacing[a] / math.prod(s**n for s, n in zip(self.spacing, orders, strict=True)))
+                    (a, orders, sign * self.spacing[a] / self._unit(orders))
                     for a, orders, sign in motion
                 ),
             )
             for kind, motions in enumerate(KINDS[self.mesh.dims])
             for motion in motions
         ]
+
+    def _unit(self, orders: tuple[int, ...]) -> float:
+        return math.prod(s**n for s, n in zip(self.spacing, orders, strict=True))
+
+    def density(self, wavenumber: torch.Tensor | float) -> torch.Tensor:
+        """Spectral density of a component of the displacement, (*mesh.shape).
+
+        Per (rad per px)^dims, at a wavenumber in rad per px. A motion of variance 1 has a
+        displacement of 1 / k^2, which is shared by the components.
+        """
+        dims = self.mesh.dims
+        if dims == 2:
+            kinds = [self.local[k] + self.local[k + 2] * wavenumber**2 for k in (0, 1)]
+        else:
+            kinds = [self.local[kind] for kind, _ in self.motions]
+        total = reduce(torch.add, [1 / kind for kind in kinds])
+        return total / (dims * wavenumber**2)
 
     def rates(self, coefficients: torch.Tensor) -> torch.Tensor:
         """Motions of flows (..., components, knots) on the mesh: (..., motions, *mesh.shape)."""
@@ -149,40 +170,46 @@ class Prior(NamedTuple):
     @property
     def weights(self) -> torch.Tensor:
         """Of the squares of what `rates` gives, (motions, *mesh.shape)."""
-        strength = self.cell * self.strength
+        strength = self.cell * self.local
         return strength[[kind for kind, _ in self.motions]]
 
-    def updated(self, informed: torch.Tensor, energy: torch.Tensor, settings: VariationalSettings) -> "Prior":
-        """The prior after a step toward largest evidence (MacKay's fixed point).
+    def updated(
+        self, informed: torch.Tensor, energy: torch.Tensor, settings: VariationalSettings
+    ) -> "Prior":
+        """The prior after a step toward largest evidence.
+
+        The strength of a place follows from all kinds of motion around it, the ratio of the kinds
+        from all places. Divergence is as likely as in a plane of isotropic turbulence before the
+        images: `VariationalSettings.ratio`, known as from `VariationalSettings.modes` motions.
 
         Parameters
         ----------
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
             Variance of each kind of motion removed by the images, and its square in the flow.
+        settings : VariationalSettings
         """
+        known, square = (self.local * self.cell * part for part in (informed, energy))
         around = self._number_around()
-        known = self.local * self.cell * informed
-        square = self.local * self.cell * energy
-        strength, _ = _strengths(
+        base = self.local[0]
+        strength = _gamma_mean(
             around * self.smooth(known.sum(0)).clamp(min=0),
-            around * self.smooth(square.sum(0)) / self.local[0],
+            # over the prior variance, so that the mean is not that of the strongest motion
+            around * self.smooth(square.sum(0)) / base,
         )
-        change = strength / self.local[0]
+        change = strength / base
         whole = known.flatten(1).sum(1).clamp(min=1e-3)
         spent = (square * change).flatten(1).sum(1).clamp(min=1e-6)
-        ratio = (self.local / self.local[0]).flatten(1)[:, 0]
-        if self.mesh.dims == 2:
-            for kind in (1, 3):
-                whole[kind] += settings.pseudo
-                spent[kind] += settings.pseudo * ratio[kind] / (settings.ratio * ratio[kind - 1])
-        factor = (whole / spent).reshape(-1, *[1] * self.mesh.dims)
-        most = settings.largest
-        step = (change * factor).clamp(1 / most, most) ** settings.relaxation
-        HYPER.append([float("%.3g" % r) for r in ratio])
-        return self._replace(local=(self.local * step).clamp(1e-6, 1e10))
+        for kind, of in DIVERGENT[self.mesh.dims]:
+            ratio = float((self.local[kind] / self.local[of]).mean())
+            whole[kind] += settings.modes
+            spent[kind] += settings.modes * ratio / settings.ratio
+        step = change * (whole / spent).reshape(-1, *[1] * self.mesh.dims)
+        most = settings.largest_change
+        step = step.clamp(1 / most, most) ** settings.relaxation
+        return self._replace(local=(self.local * step).clamp(_WEAKEST, _STRONGEST))
 
     def _number_around(self) -> float:
-        """Nodes of the mesh that a Gaussian mean of the prior's width counts."""
+        """Nodes of the mesh that count in a Gaussian mean of the prior's width."""
         return (4 * math.pi) ** (self.mesh.dims / 2) * self.width**self.mesh.dims / self.cell
 
     def to(self, like: torch.Tensor) -> "Prior":
@@ -200,23 +227,31 @@ class Prior(NamedTuple):
         return separable(values, kernels)
 
 
-def _strengths(known, square):
-    half, energy = known.reshape(1, -1) / 2, square.reshape(1, -1) / 2
-    shape = SHAPES.to(half)[:, None]
-    mean = (half / energy).median() * torch.ones_like(shape)
-    for _ in range(_ROUNDS):
-        rate = shape / mean
-        rate = shape / ((shape + half) / (rate + energy)).mean(1, keepdim=True)
-        mean = shape / rate
-    like = shape * rate.log() - torch.lgamma(shape) + torch.lgamma(shape + half) - (shape + half) * (rate + energy).log()
-    best = int(like.mean(1).argmax())
-    HYPER.append((float(shape[best]), float("%.2g" % mean[best])))
-    return ((shape[best] + half[0]) / (rate[best] + energy[0])).reshape(known.shape), None
+def _gamma_mean(known: torch.Tensor, square: torch.Tensor) -> torch.Tensor:
+    """Expected strengths by place, of the likeliest gamma distribution.
 
-SHAPES = 0.05 * 2.0 ** torch.arange(10)
-HYPER=[]
-_SHAPES = [0.1 * 2 ** (0.5*k) for k in range(16)]
-_ROUNDS = 20
+    If S times the strength has a chi-square distribution of n degrees of freedom, and strengths
+    are distributed as gamma of shape a and rate b, the strength of a place is expected to be
+    (a + n / 2) / (b + S / 2), and a and b are those of the largest marginal likelihood (empirical
+    Bayes; Berger 1985, Statistical Decision Theory, sect. 4.5).
+
+    Parameters
+    ----------
+    known : torch.Tensor
+        Motions n about each place that the images determine.
+    square : torch.Tensor
+        Sum S of their squares.
+    """
+    half, energy = known.reshape(1, -1) / 2, square.reshape(1, -1) / 2
+    energy = energy.clamp(min=1e-30)
+    shape = _SHAPES.to(half)[:, None]
+    rate = shape * (energy / half.clamp(min=1e-9)).median()
+    for _ in range(_ROUNDS):
+        rate = shape / ((shape + half) / (rate + energy)).mean(1, keepdim=True)
+    likelihood = shape * rate.log() - torch.lgamma(shape) + torch.lgamma(shape + half)
+    likelihood = likelihood - (shape + half) * (rate + energy).log()
+    best = int(likelihood.mean(1).argmax())
+    return ((shape[best] + half[0]) / (rate[best] + energy[0])).reshape(known.shape)
 
 
 def _cells(mesh: Mesh) -> float:
@@ -238,15 +273,14 @@ def first_prior(
     prior = Prior(one, mesh, width, tuple(spacing))
     vorticity = prior.by_kind(prior.rates(coefficients).square())[: dims - 1].sum(0)
     vorticity = vorticity.mean() if dims == 2 else prior.smooth(vorticity)
-    strength = (dims - 1) * _cells(mesh) / (vorticity + settings.least_vorticity**2)
-    local = strength * one
+    local = (dims - 1) * _cells(mesh) / (vorticity + settings.least_vorticity**2) * one
     if dims == 2:
-        width = (axes[0].size - 1) / axes[0].cells
-        local[1] *= settings.ratio
-        local[2] *= width**2
-        local[3] *= width**2 * settings.ratio
+        # waves of one radian per knot have half of their variance by either order
+        local[2:] *= ((axes[0].size - 1) / axes[0].cells) ** 2
+        for kind, _ in DIVERGENT[dims]:
+            local[kind] *= settings.ratio
     else:
-        local[-1] *= 100.0
+        local[-1] *= settings.volume_ratio
     return prior._replace(local=local)
 
 
@@ -255,4 +289,4 @@ def refined(prior: Prior, axes: Sequence[Axis]) -> Prior:
     mesh = halves(axes, prior.local)
     # from core to still air the strength changes by decades: its logarithm is smoother
     local = interpolated(prior.local.log(), prior.mesh.places, mesh.places).exp()
-    return prior._replace(local=local, mesh=mesh, trend=None)
+    return prior._replace(local=local, mesh=mesh)

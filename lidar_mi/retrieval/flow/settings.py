@@ -93,49 +93,36 @@ class VariationalSettings:
     knots : tuple of float
         Spacing of the knots over the template on each level.
     rounds : tuple of int
-        Rounds of flow and evidence on each level. In volumes further ones make the prior too
+        Rounds of flow and prior on each level. In volumes further ones make the prior too
         strong: it takes vorticity for white, and that of a wake has more of its variance in long
         waves.
-    noise_round : int
-        Round of the last level before which noise is estimated from the misfit.
-    rounds_changed : int
-        Further rounds of the last level if structure moves out of the plane (`change`), after a
-        second estimate of the noise: the first flow absorbed part of the misfit.
-    rounds_finer : int
-        Further rounds of the last level if the misfit takes the place of a noise that was not
-        given: the prior is then that of images with more noise.
+    noise_rounds : tuple of tuples of int
+        Rounds of each level before which the components of the differences are estimated.
     robust : float
         Standard deviations beyond which residuals enter linearly (Huber 1964, Ann. Math. Stat.
         35, 73-101).
     path_order : int
         Terms of the path's series in time.
-    coloured : bool
-        Whether the misfit is resolved by wavenumber as well as by place. In a thin volume few
-        shells hold the texture, and in none can its misfit be separated from edge effects.
-    misfit_width, misfit_width_trusted : float
-        Standard deviation over the template of the Gaussian that averages the misfit; the second
-        one in images whose noise is given. Without noise the misfit varies as steeply as cores do.
     noise_width : float
-        The same for a known noise map, px.
+        Standard deviation of the Gaussian that averages a known noise map, px.
     ridge : float
         Precision of each coefficient in addition to the prior's, px^-2: negligible for
         displacements of some px.
     ratio : float
-        Initial strength of the divergence over the vorticity's; 100 is a standard deviation of
-        10 % of the vorticity's.
+        Strength of divergence over that of vorticity, of images before they inform. In a plane of
+        isotropic turbulence the mean squares of vorticity and divergence have the ratio 5 (Taylor
+        1935, Proc. R. Soc. Lond. A 151, 421-444: <w_x^2> = 5 <(du/dx)^2>).
+    modes : float
+        Motions from which that ratio counts as known.
+    volume_ratio : float
+        Initial ratio in volumes, where divergence is small.
     least_vorticity : float
         Lower limit of the initial standard deviation of the vorticity, px per px, of volumes at
         each place: a coarse flow may be rigid.
-    largest_ratio : float
-        Upper limit of the ratio, images only; 1e5 is 0.3 % of the standard deviation. Images of
-        weak texture without measurable divergence do not prove that there is none.
-    prior_width, prior_width_trusted : float
-        Standard deviation over the template within which the prior's strength varies little; the
-        second one in images whose noise is given. Wider, errors are smaller in steady noise, and
-        stated too large.
-    largest_change, largest_change_trusted, largest_change_divergence : float
-        Factor by which a strength may change per round; the second one in images whose noise is
-        given.
+    prior_width : float
+        Standard deviation over the template within which the prior's strength varies little.
+    largest_change, relaxation : float
+        Factor by which a strength may change per round, and the power of that of the fixed point.
     filter : FilterSettings
     solver : IterativeSettings
         Of volumes.
@@ -144,30 +131,19 @@ class VariationalSettings:
     """
 
     knots: tuple[float, ...] = (1.25, 0.5)
-    rounds: tuple[int, ...] = (6, 8)
-    noise_rounds: tuple = ((2, 4), (2, 5))
-    noise_round: int = 2
-    rounds_changed: int = 2
-    rounds_finer: int = 5
+    rounds: tuple[int, ...] = (6, 7)
+    noise_rounds: tuple[tuple[int, ...], ...] = ((3,), (1, 4))
     robust: float = 3.0
     path_order: int = 6
-    coloured: bool = True
-    misfit_width: float = 0.3
-    misfit_width_trusted: float = 0.75
     noise_width: float = MAP_WIDTH
     ridge: float = 1e-4
     ratio: float = 5.0
-    pseudo: float = 10
-    largest: float = 16.0
-    relaxation: float = 1.5
-    wide: float = 3.0
+    modes: float = 10.0
+    volume_ratio: float = 100.0
     least_vorticity: float = 1e-3
-    largest_ratio: float = 1e5
     prior_width: float = 0.65
-    prior_width_trusted: float = 0.85
-    largest_change: float = 4.0
-    largest_change_trusted: float = 16.0
-    largest_change_divergence: float = 16.0
+    largest_change: float = 16.0
+    relaxation: float = 1.5
     filter: FilterSettings = field(default_factory=FilterSettings)
     solver: IterativeSettings = field(default_factory=IterativeSettings)
     strips: StripSettings = field(default_factory=StripSettings)
@@ -176,11 +152,10 @@ class VariationalSettings:
 VOLUME_VARIATIONAL = VariationalSettings(
     knots=(0.625,),
     rounds=(7,),
-    noise_round=3,
-    coloured=False,
-    misfit_width=0.75,
+    noise_rounds=((3,),),
     least_vorticity=0.03,
     prior_width=0.5,
+    relaxation=1.0,
     filter=VOLUME_FILTER,
 )
 """Of volumes: the flow of the multi-pass correlation makes a coarse level unnecessary."""

@@ -13,10 +13,8 @@ import torch
 from lidar_mi.retrieval.flow.band import Band, spread
 from lidar_mi.retrieval.flow.block_banded import Factor
 from lidar_mi.retrieval.flow.direct import (
-    curvature,
     data_form,
     in_single,
-    informative,
     prior_and_gradient,
     prior_form,
     rounding,
@@ -167,11 +165,9 @@ def solved(
     whole = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     both = data_form(linear, mesh) + stiff
-    # with less than the second derivative of the log-likelihood steps overshoot
-    steep = both if informative(linear) else curvature(linear, mesh) + stiff
     cut = strips(mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
     some = _grouped(cut, solver.solved_at_once)
-    roots = mapped(lambda part: _root(steep, part), some)
+    roots = mapped(lambda part: _root(both, part), some)
 
     def inverse(part: tuple[list[Strip], Factor], right: torch.Tensor) -> torch.Tensor:
         members, root = part
@@ -189,7 +185,7 @@ def solved(
 
     def response(right: torch.Tensor, tolerance: float) -> torch.Tensor:
         (change,) = conjugate_gradients(
-            lambda c: whole.apply(steep, c[0])[None],
+            lambda c: whole.apply(both, c[0])[None],
             right[None],
             preconditioned,
             tolerance,

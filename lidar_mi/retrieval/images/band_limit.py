@@ -15,8 +15,6 @@ from lidar_mi.retrieval.images.settings import FilterSettings
 _SHELL_WAVES = 200
 # Least number of shells per cycle per pixel.
 _SHELLS = 16
-# Fraction by which whitening must lessen the variance of displacements.
-LEAST_REDUCTION = 0.1
 
 
 class Filter(NamedTuple):
@@ -34,9 +32,13 @@ class Filter(NamedTuple):
     efficiency : float
         Fraction of the information in the slopes that is left: 1 unless blur is corrected, which
         amplifies the noise of short waves.
+    values, slopes : torch.Tensor, shape (shells,)
+        The same filter divided between the two factors that inform a displacement: differences of
+        the images, whose noise becomes white, and their slopes, which become the likeliest ones of
+        the texture (Wiener). Where blur is corrected both are `gain`.
     noisy_slopes : float
-        Mean square of the slopes that noise alone makes in the mean of two filtered images, summed
-        over the axes, per px^2.
+        Mean square of the slopes that noise alone makes in the mean of two images after the filter
+        of the slopes, summed over the axes, per px^2.
     """
 
     gain: torch.Tensor
@@ -44,11 +46,24 @@ class Filter(NamedTuple):
     passed: float
     excess: float
     efficiency: float
-    noisy_slopes: float
     values: torch.Tensor
     slopes: torch.Tensor
-    values_passed: float
-    slopes_noise: float
+    noisy_slopes: float
+
+    def of_values(self) -> "Filter":
+        """That of the differences alone."""
+        passed = self.passed if self.values is self.gain else 1.0
+        return self._replace(gain=self.values, passed=passed)
+
+    def of_slopes(self) -> "Filter":
+        """That of the slopes alone."""
+        return self._replace(gain=self.slopes)
+
+    def single(self) -> "Filter":
+        """The same in single precision."""
+        gain = self.gain.float()
+        values = gain if self.values is self.gain else self.values.float()
+        return self._replace(gain=gain, values=values, slopes=self.slopes.float())
 
 
 class PowerSpectrum(NamedTuple):
@@ -144,7 +159,6 @@ def best_filter(
     # times sqrt(noise^2 / N) the filter whitens the mismatch (Hannan & Thomson 1973)
     white = level / floor if mismatch is not None else torch.ones_like(response)
     gain = (response * white).sqrt()
-    # without blur differences keep their noise, and slopes are the likeliest ones of the texture
     values, slopes = (gain, gain) if blur else (white.sqrt(), response * white.sqrt())
     # power of the filtered slopes with noise, the part of it from texture, and its variance
     # the mean of two images has half the variance of their noise
@@ -159,28 +173,22 @@ def best_filter(
         passed,
         power / informed if informed > 0 else 1.0,
         informed / spread if informed > 0 else 1.0,
-        # slopes per px have radians, frequencies have cycles
-        (2 * math.pi) ** 2 * _mean(steep * (floor / 2).expand(len(gain))[shell], sizes),
         values,
         slopes,
-        passed if blur else 1.0,
+        # slopes per px have radians, frequencies have cycles
         (2 * math.pi) ** 2
         * _mean((radius * slopes[shell]).square() * (floor / 2).expand(len(gain))[shell], sizes),
     )
 
 
-def flat_if_nearly(
-    spectrum: PowerSpectrum,
-    mismatch: torch.Tensor,
-    threshold: float,
-    least_reduction: float = LEAST_REDUCTION,
-    strain: float = 0.0,
+def flat_if_better(
+    spectrum: PowerSpectrum, mismatch: torch.Tensor, threshold: float, strain: float
 ) -> torch.Tensor:
-    """The mismatch, at one level if whitening it would lessen errors by little.
+    """The mismatch, at one level if whitening it would not lessen errors.
 
     A filter of one image and one of an image that strain has deformed are not the same filter in
-    the air: where the gain changes by the factor e per factor e of the wavenumber, a strain e in dt
-    makes the images differ by about e times their texture. So a filter that is not flat costs
+    the air: where the gain changes by the factor e^a per factor e of the wavenumber, a strain e in
+    dt makes the images differ by a e times their texture. So a filter that is not flat costs
     accuracy where there is strain and hardly any noise.
 
     Displacements from texture of spectral density S through a filter g have the variance
@@ -194,36 +202,34 @@ def flat_if_nearly(
         See `spline.band_limited`.
     threshold : float
         Standard errors by which a shell must exceed the mismatch to count as texture.
-    least_reduction : float
-        Fraction by which whitening must lessen the variance.
+    strain : float
+        Mean square of the strain in dt along any direction.
 
     Returns
     -------
     torch.Tensor, shape (shells,)
-        The mean of the mismatch, weighted as in the variance, if whitening lessens the variance by
-        less; infinite where the mismatch is. Else the mismatch.
+        The mean of the mismatch, weighted as in the variance, if whitening does not lessen the
+        variance. Else the mismatch.
     """
     density, uncertainty, shape, sizes = spectrum
-    above = mismatch.isfinite() & (density > mismatch * (1 + threshold * uncertainty))
-    if not bool(above.any()):
+    above = density > mismatch * (1 + threshold * uncertainty)
+    if int(above.sum()) < 3:
         return mismatch
     _, shell = radii(sizes, shape, density.dtype, density.device)
     number = torch.bincount(shell.flatten(), minlength=len(density)).to(density)[above]
     noise, texture = mismatch[above], (density - mismatch)[above]
+    wave = wavenumbers(density, shape)[above]
     response = texture / (texture + noise / 2)
-    steep = number * wavenumbers(density, shape)[above].square() * texture
+    steep = number * wave.square() * texture
     level = (steep * response.square() * noise).sum() / (steep * response.square()).sum()
+    slope = torch.gradient(noise.log() / 2)[0] / torch.gradient(wave.log())[0]
+    deformed = strain * slope.square() * texture
     # g here is the square of the docstring's: the weight of a wave
-    # where air is strained, images after a filter that is not flat differ by its slope
-    steepness = torch.gradient(noise.log() / 2)[0] / torch.gradient(wavenumbers(density, shape)[above].log())[0]
-    mismatched = strain * steepness.square() * texture
     flat, white = (
         (steep * g.square() * n).sum() / (steep * g).sum().square()
-        for g, n in ((response, noise), (response / noise, noise + mismatched))
+        for g, n in ((response, noise), (response / noise, noise + deformed))
     )
-    if flat > (1 + least_reduction) * white:
-        return mismatch
-    return torch.where(mismatch.isfinite(), level, torch.inf)
+    return mismatch if white < flat else level.expand_as(mismatch)
 
 
 def _mean(values: torch.Tensor, sizes: Sequence[int]) -> float:

@@ -268,7 +268,7 @@ def band_limited(
     """
     settings = settings or FilterSettings()
     chosen = filter_of(images, noise, mismatch, weight, blur, settings)
-    return filtered_spline(_finite(images), chosen, settings), chosen.level
+    return filtered_spline(finite(images), chosen, settings), chosen.level
 
 
 def filter_of(
@@ -293,7 +293,7 @@ def spectrum_of(
     """The power spectrum of images that `band_limited` filters."""
     known = torch.stack([torch.isfinite(image) for image in images])
     sizes = transform_sizes(images[0].shape, settings)
-    found = power_spectrum(_finite(images), sizes, settings, weight, known)
+    found = power_spectrum(finite(images), sizes, settings, weight, known)
     if bool(known.all()):
         return found
     # smooth values go on with the noise at the rim, the nearest ones make steps: both add power
@@ -302,7 +302,7 @@ def spectrum_of(
     return found._replace(density=torch.minimum(found.density, other.density))
 
 
-def _finite(images: torch.Tensor | Sequence[torch.Tensor]) -> torch.Tensor:
+def finite(images: torch.Tensor | Sequence[torch.Tensor]) -> torch.Tensor:
     """Images (images, ...) as they are stored, with smooth values where they are not finite."""
     return torch.stack([stored(filled_in(image)) for image in images])
 
@@ -317,14 +317,15 @@ def filtered_spline(images: torch.Tensor, chosen: Filter, settings: FilterSettin
     return filtered_splines(images, [chosen], settings)[0]
 
 
-def values_and_slopes(
+def splines_of_values_and_slopes(
     images: torch.Tensor, chosen: Filter, settings: FilterSettings
 ) -> tuple[Spline, Spline]:
-    """Splines through finite images: for their differences, and for their slopes."""
-    values = chosen._replace(gain=chosen.values, passed=chosen.values_passed)
-    slopes = chosen._replace(gain=chosen.slopes, noisy_slopes=chosen.slopes_noise)
-    first, second = filtered_splines(images, [values, slopes], settings)
-    return first, second
+    """Splines through finite images (images, ...) for their differences, and for their slopes.
+
+    See `band_limit.Filter`.
+    """
+    values, slopes = filtered_splines(images, [chosen.of_values(), chosen.of_slopes()], settings)
+    return values, slopes
 
 
 def filtered_splines(

@@ -363,7 +363,8 @@ class Builder:
         )
 
     def _splines(self, images: torch.Tensor, chosen: Filter) -> Splines:
-        everything = Filter(torch.ones_like(chosen.gain), 0.0, 1.0, 1.0, 1.0, 0.0)
+        one = torch.ones_like(chosen.gain)
+        everything = Filter(one, 0.0, 1.0, 1.0, 1.0, one, one, 0.0)
         sharp, whole = filtered_splines(images, [chosen, everything], FilterSettings())
         return Splines(sharp, whole, chosen, self.spectrum)
 

@@ -8,7 +8,6 @@ from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, uncertain
 from lidar_mi.retrieval.images.windows import Windows
-from lidar_mi.retrieval.wind.coherent_windows import coherent_change
 from lidar_mi.retrieval.wind.methods import Method
 
 
@@ -38,11 +37,7 @@ def bootstrapped(
     textured, clear : torch.Tensor of bool, shape windows.count
         Windows that pass the thresholds of texture, and that clearly do.
     """
-    structure: float | torch.Tensor = 0.0
-    stated = None
-    if method.centred:
-        structure, stated = coherent_change(pair, found, windows, noise)
-    return structure + bootstrap_covariance(
+    return bootstrap_covariance(
         pair,
         found,
         windows,
@@ -51,7 +46,6 @@ def bootstrapped(
         method.repeats,
         textured=textured,
         clear=clear,
-        stated=stated,
         noise=noise,
     )
 
