@@ -20,7 +20,13 @@ import torch
 from lidar_mi.retrieval.flow.flow_spline import Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
 from lidar_mi.retrieval.flow.prior import Prior
-from lidar_mi.retrieval.images.band_limit import flat_if_better, radii, shell_means, wavenumbers
+from lidar_mi.retrieval.images.band_limit import (
+    even_fast_len,
+    flat_if_better,
+    radii,
+    shell_means,
+    wavenumbers,
+)
 from lidar_mi.retrieval.images.intensity import rms
 from lidar_mi.retrieval.images.quality import filled
 from lidar_mi.retrieval.images.spline import filter_of, spectrum_of, transform_sizes
@@ -278,16 +284,17 @@ def _variance_beyond(prior: Prior, mesh: Mesh) -> torch.Tensor:
 def _motion_beyond(shape: Sequence[int], mesh: Mesh, like: torch.Tensor, seed: int) -> torch.Tensor:
     """Random motion (draws, components, ...) of unit variance in waves that the splines leave."""
     draws, *sizes = shape
-    field = normal_fields((draws, mesh.dims, *sizes), like, seed)
+    whole = [even_fast_len(n) for n in sizes]
     dims = tuple(range(-len(sizes), 0))
-    along = [torch.fft.fftfreq(n) for n in sizes[:-1]] + [torch.fft.rfftfreq(sizes[-1])]
-    k = reduce(torch.hypot, torch.meshgrid(*along, indexing="ij")).to(like) * 2 * math.pi
+    k = 2 * math.pi * radii(tuple(whole), tuple(sizes), like.dtype, like.device)[0]
     wave, fraction = _unresolved_fraction(mesh, like)
     # of the inertial range, whose spectrum falls by k^(-5/3)
     power = fraction * wave ** (-2 / 3 - mesh.dims)
     at = torch.searchsorted(wave, k.contiguous()).clamp(max=len(wave) - 1)
     gain = torch.where(k > 0, power[at], 0.0).sqrt()
-    field = torch.fft.irfftn(torch.fft.rfftn(field, dim=dims) * gain, s=tuple(sizes), dim=dims)
+    field = normal_fields((draws, mesh.dims, *whole), like, seed)
+    field = torch.fft.irfftn(torch.fft.rfftn(field, dim=dims) * gain, s=whole, dim=dims)
+    field = field[(..., *(slice(n) for n in sizes))]
     return field / field.square().mean().sqrt()
 
 
