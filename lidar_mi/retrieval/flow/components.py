@@ -29,19 +29,21 @@ from lidar_mi.retrieval.images.band_limit import (
 )
 from lidar_mi.retrieval.images.intensity import rms
 from lidar_mi.retrieval.images.quality import filled
-from lidar_mi.retrieval.images.spline import filter_of, spectrum_of, transform_sizes
+from lidar_mi.retrieval.images.spline import Spline, filter_of, spectrum_of, transform_sizes
 from lidar_mi.retrieval.images.windows import averaged, separable, stored, working
 from lidar_mi.retrieval.reml import most_likely
 
 Response = Callable[[torch.Tensor], torch.Tensor]
 """From a gradient of the log-likelihood (components, knots) to the flow's change."""
 
-_DRAWS = 4
-"""Random fields of each component: a mean square over all places is known to 2 %."""
+_DRAWS = {2: 4, 3: 2}
+"""Random fields of each component, by dimensions: a mean square over all places is known to 2 %."""
 _SCALES = (1.5, 3.0)
 """Standard deviations, px, of the Gaussian means between which squares are told apart by scale."""
 _REGION = 8
 """Standard deviation of the Gaussian mean of the squares, and the separation of its places, px."""
+_LEAST_DENSITY = 1e-6
+"""Of the differences, over their mean: what is less is rounding."""
 _INTERPOLATION = 3e-4
 """Error of splines on half-pixel nodes over the rms structure of texture of 3 px."""
 
@@ -155,24 +157,18 @@ def differences(
     level = (
         times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)
     )
-    level = level.clamp(min=max(floor, 1e-30))
+    # a noise that is known is a lower limit at each place
+    level = torch.maximum(level, told / images.given_weight).clamp(min=max(floor, 1e-30))
     mean = float(level[valid].mean())
     weight = mean / level
-    sizes = transform_sizes(spline.shape, spline.settings)
-    _, shell = radii(tuple(sizes), spline.shape, noise.dtype, noise.device)
-
-    def density(fields: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        whole = fields * (weight * times).sqrt() * valid
-        return shell_means(whole, shell, sizes, spline.settings.smoothing)
-
-    of_noise, of_rest = (density(part * local.sqrt())[0] for part in (noise, after))
-    of_found, uncertainty = density(difference[None])
-    ratio = of_found / of_rest.clamp(min=1e-30)
-    colour = _shrunk(ratio, uncertainty**-2, torch.ones_like(ratio, dtype=torch.bool))
-    # before the filter
-    mismatch = of_noise * colour / spline.gain.square().clamp(min=1e-6)
-    mismatch = mismatch.clamp(min=max(floor, 1e-6 * mean))
+    mismatch = None
+    # in a thin volume few shells hold the texture, and edges make most of what is in them
     if mesh.dims == 2:
+        whiten = (weight * times).sqrt() * valid
+        mismatch = _spectrum(
+            spline,
+            *(whiten * part for part in (noise * local.sqrt(), after * local.sqrt(), difference)),
+        ).clamp(min=max(floor, _LEAST_DENSITY * mean))
         mismatch = flat_if_better(
             spectrum_of(images.stack, weight.sqrt(), spline.settings),
             mismatch,
@@ -183,10 +179,32 @@ def differences(
         images.stack, mean**0.5, mismatch, weight.sqrt(), images.blur, spline.settings
     )
     white = min(images.white, max(amplitudes["noise"], floor) ** 0.5)
+    weight = weight.to(images.weight)
     again = images.filtered(chosen)._replace(weight=weight, noise_updated=True, white=white)
     # where the residual is smaller than expected, so is the motion that would make it
     unresolved = unresolved * amplitudes["unresolved"] * local.clamp(max=1.0)
     return Differences(again, unresolved, amplitudes)
+
+
+def _spectrum(
+    spline: Spline, noise: torch.Tensor, expected: torch.Tensor, found: torch.Tensor
+) -> torch.Tensor:
+    """Spectral density of the differences before the filter of a spline, (shells,).
+
+    That of draws of the noise, times the ratio of the residual found to the expected ones.
+    """
+    sizes = transform_sizes(spline.shape, spline.settings)
+    _, shell = radii(tuple(sizes), spline.shape, noise.dtype, noise.device)
+
+    def density(fields: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return shell_means(fields, shell, sizes, spline.settings.smoothing)
+
+    (of_noise, _), (of_rest, _), (of_found, uncertainty) = (
+        density(part) for part in (noise, expected, found[None])
+    )
+    ratio = of_found / of_rest.clamp(min=1e-30)
+    colour = _shrunk(ratio, uncertainty**-2, torch.ones_like(ratio, dtype=torch.bool))
+    return of_noise * colour / spline.gain.square().clamp(min=1e-6)
 
 
 def _named(
@@ -202,7 +220,7 @@ def _drawn(
     """Random differences in dt of unit amplitude, (draws, ...), after the images' filter."""
     spline, valid = images.spline, linear.valid
     slope = working(linear.slope)
-    like, shape = slope, (_DRAWS, *slope.shape[1:])
+    like, shape = slope, (_DRAWS[mesh.dims], *slope.shape[1:])
     steep = averaged(slope.square().sum(0), valid, width)
     # texture is stronger where slopes are
     local = (steep / steep[valid].mean()).sqrt()
@@ -215,12 +233,14 @@ def _drawn(
     wave = wavenumbers(texture, spline.shape)
     white = normal_fields(shape, like, 1) / images.given_weight.sqrt()
     finer = _motion_beyond(shape, mesh, like, 4) * unresolved.sqrt()
-    return {
+    kinds = {
         "noise": spline.filtered(white) / times**0.5,
         "replaced": textured(texture, 2),
-        "through the plane": textured(_density_of_displaced(wave, texture), 3),
         "unresolved": (slope * finer).sum(1),
     }
+    if mesh.dims == 2:
+        kinds["through the plane"] = textured(_density_of_displaced(wave, texture), 3)
+    return kinds
 
 
 def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:
@@ -278,7 +298,7 @@ def _variance_beyond(prior: Prior, mesh: Mesh) -> torch.Tensor:
         # waves in an octave, per radian^dims: k^2 / 2 pi of a plane, k^3 / 2 pi^2 of a volume
         waves = k**2 / (2 * math.pi) if mesh.dims == 2 else k**3 / (2 * math.pi**2)
         total += part * step * waves * prior.density(k)
-    return interpolated(total, prior.mesh.places, mesh.places)
+    return interpolated(total, prior.mesh.places, [place.to(total) for place in mesh.places])
 
 
 def _motion_beyond(shape: Sequence[int], mesh: Mesh, like: torch.Tensor, seed: int) -> torch.Tensor:
@@ -322,9 +342,9 @@ def _flows_left(
     """What a fit leaves of the differences by flows drawn from the prior, (draws, ...)."""
     slope = working(linear.slope)
     if response is None:
-        return torch.zeros_like(slope[:1]).expand(_DRAWS, *slope.shape[1:])
+        return torch.zeros_like(slope[:1]).expand(_DRAWS[mesh.dims], *slope.shape[1:])
     weights = prior.weights
-    drawn = weights.sqrt() * normal_fields((_DRAWS, *weights.shape), weights, 5)
+    drawn = weights.sqrt() * normal_fields((_DRAWS[mesh.dims], *weights.shape), weights, 5)
     flows = prior.rates_transposed(drawn)
     return torch.stack([(slope * mesh.field(response(one))).sum(0) * linear.valid for one in flows])
 

@@ -98,8 +98,9 @@ class Images(NamedTuple):
 
     def filtered(self, chosen: Filter) -> "Images":
         """The images after another filter, with its noise."""
-        settings = self.spline.settings
-        spline, smooth = splines_of_values_and_slopes(finite(self.stack), chosen, settings)
+        stack = finite(self.stack)
+        chosen = chosen.to(stack)
+        spline, smooth = splines_of_values_and_slopes(stack, chosen, self.spline.settings)
         return self._replace(spline=spline, smooth=smooth, noise=chosen.level, chosen=chosen)
 
     def sample(self, *places: torch.Tensor) -> tuple[torch.Tensor, ...]:

@@ -351,7 +351,8 @@ def _completed(
 def _splines(start: Flow, images: torch.Tensor) -> tuple[Spline, Spline]:
     """With the filter that was learnt, in single precision."""
     finite = images.nan_to_num(0.0).float()
-    return splines_of_values_and_slopes(finite, start.images.chosen.single(), start.settings.filter)
+    chosen = start.images.chosen.to(finite)
+    return splines_of_values_and_slopes(finite, chosen, start.settings.filter)
 
 
 def _energy(prior: Prior, coefficients: torch.Tensor) -> float:

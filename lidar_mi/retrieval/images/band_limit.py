@@ -59,11 +59,11 @@ class Filter(NamedTuple):
         """That of the slopes alone."""
         return self._replace(gain=self.slopes)
 
-    def single(self) -> "Filter":
-        """The same in single precision."""
-        gain = self.gain.float()
-        values = gain if self.values is self.gain else self.values.float()
-        return self._replace(gain=gain, values=values, slopes=self.slopes.float())
+    def to(self, like: torch.Tensor) -> "Filter":
+        """The same in the precision of a tensor."""
+        gain = self.gain.to(like)
+        values = gain if self.values is self.gain else self.values.to(like)
+        return self._replace(gain=gain, values=values, slopes=self.slopes.to(like))
 
 
 class PowerSpectrum(NamedTuple):
