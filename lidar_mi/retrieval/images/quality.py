@@ -44,7 +44,7 @@ class Flag(enum.IntFlag):
 
     Or one of the images is the one before it, bit for bit."""
     NO_SKILL = 2048
-    """The standard error approaches the wind's own spread, or noise assumed decides the wind."""
+    """The standard error approaches the wind's own spread."""
     RESAMPLED = 4096
     """What resampling of scattered beams lost exceeds the noise (`resampling_error`)."""
     ERROR_UNKNOWN = 8192
