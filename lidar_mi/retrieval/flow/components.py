@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
 
+import numpy as np
 import torch
 
 from lidar_mi.retrieval.flow.flow_spline import Mesh, interpolated
@@ -85,7 +86,9 @@ def differences(
     which R J C (P u) is left with the prior's precision P. Squares of the residuals, by three
     scales and by place, have gamma distributions whose means are sums of those of the components.
     The amplitudes are the likeliest (`reml.most_likely`): what the fit absorbs is counted, as in
-    restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545-554).
+    restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545-554). Unresolved
+    motion makes differences like those of noise. Its amplitude, 1 where the prior's spectrum goes
+    on, is the mean of the likeliest one and of the largest that the residuals leave room for.
 
     What differs from the sum of the components by place, and by wavenumber, multiplies it: the
     variance of the ratio beyond chance says how freely (`_shrunk`).
@@ -124,24 +127,26 @@ def differences(
     own = _flows_left(linear, mesh, prior, response)
     squares = _Squares(valid)
     found = squares(difference[None])[0]
-    held, *terms = (squares(draws) for draws in (own, *rests.values()))
+    held = squares(own).mean(0)
+    drawn = {name: squares(draws) for name, draws in rests.items()}
     use = squares.inside & (found > 0)
-    chance = _chance(terms[0])
-    number = (1 / chance).expand_as(found)
-    known = held.mean(0) + told * terms[0].mean(0)
+    number = (1 / _chance(drawn["noise"])).expand_as(found)
+    terms = {name: draws.mean(0) for name, draws in drawn.items()}
+    known = held + told * terms["noise"]
+
+    def likeliest(names: Sequence[str], known: torch.Tensor) -> dict[str, float]:
+        fields = (found, torch.stack([terms[name] for name in names]), number, known)
+        square, means, half, rest = (field[..., use].cpu().numpy() for field in fields)
+        most = np.array([1.0 if name == "unresolved" else np.inf for name in names])
+        _, factors = most_likely(square, means, most, half, rest)
+        return {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
+
     # a noise that is known is not estimated
-    most = {"noise": 0.0 if images.noise_known else math.inf, "unresolved": 1.0}
-    names = [name for name in kinds if most.get(name, math.inf) > 0]
-    _, factors = most_likely(
-        found[use].cpu().numpy(),
-        torch.stack([rests_of.mean(0)[use] for rests_of in _named(kinds, terms, names)])
-        .cpu()
-        .numpy(),
-        torch.tensor([most.get(name, math.inf) for name in names]).numpy(),
-        number[use].cpu().numpy(),
-        known[use].cpu().numpy(),
-    )
-    amplitudes = {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
+    names = [name for name in kinds if not (name == "noise" and images.noise_known)]
+    both = likeliest(["unresolved"], known), likeliest(names, known)
+    tail = sum(amplitudes["unresolved"] for amplitudes in both) / 2
+    others = [name for name in names if name != "unresolved"]
+    amplitudes = likeliest(others, known + tail * terms["unresolved"]) | {"unresolved": tail}
     amplitudes["noise"] = amplitudes.get("noise", 0.0) + told
 
     def total(parts: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -205,13 +210,6 @@ def _spectrum(
     ratio = of_found / of_rest.clamp(min=1e-30)
     colour = _shrunk(ratio, uncertainty**-2, torch.ones_like(ratio, dtype=torch.bool))
     return of_noise * colour / spline.gain.square().clamp(min=1e-6)
-
-
-def _named(
-    kinds: Mapping[str, torch.Tensor], terms: Sequence[torch.Tensor], names: Sequence[str]
-) -> list[torch.Tensor]:
-    by_name = dict(zip(kinds, terms, strict=True))
-    return [by_name[name] for name in names]
 
 
 def _drawn(
