@@ -286,6 +286,23 @@ def linear_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     return (1 - (at[:, None] - number).abs()).clamp(min=0)
 
 
+def cubic_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Matrix (place, known) of cubic convolution (a = -3/4; Keys 1981, IEEE ASSP 29, 1153-1160)."""
+    matrix = places.new_zeros(len(places), len(known))
+    step = float(known[1] - known[0]) if len(known) > 1 else math.inf
+    at = (places - known[0]) / step
+    low = at.floor()
+    for shift in (-1, 0, 1, 2):
+        x = (at - low - shift).abs()
+        inner = (1.25 * x - 2.25) * x * x + 1
+        outer = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
+        weight = torch.where(x <= 1, inner, outer)
+        # beyond the ends the last value goes on
+        column = (low.long() + shift).clamp(0, len(known) - 1)
+        matrix.scatter_add_(1, column[:, None], weight[:, None])
+    return matrix
+
+
 def strided(values: torch.Tensor, stride: int, axis: int) -> torch.Tensor:
     """Every `stride`-th value along `axis`, a view."""
     return values if stride == 1 else values.unfold(axis, 1, stride).squeeze(-1)
