@@ -30,7 +30,7 @@ from lidar_mi.retrieval.images.intensity import normalised
 from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
-from lidar_mi.retrieval.images.spline import band_limited
+from lidar_mi.retrieval.images.spline import likeliest
 from lidar_mi.retrieval.images.windows import (
     Windows,
     averaged,
@@ -78,7 +78,8 @@ def bootstrap_covariance(
     error of the algorithm (Timmins et al. 2012, Exp. Fluids 53, 1133-1147). One pair states both:
 
     - Its wind d is that of the vectors, outliers replaced, by cubics on the pixels.
-    - Image 1 is advected along paths in that wind.
+    - Image 1 after its Wiener filter, the mean of the air given the image, is advected along paths
+      in that wind.
     - The residual, image 2 less image 1 so advected, is moved by two templates along both axes,
       scaled to the level (over Gaussians of 1.5 templates, times the noise where that is known of
       each pixel) at its new place, and added. So noise and changes keep their size and correlation
@@ -142,7 +143,7 @@ def bootstrap_covariance(
     mean = of_windows(wind, windows, centred)
 
     first, second = normalised(images)
-    spline, _ = band_limited([first], settings=_FILTERS[windows.dims])
+    spline = likeliest(first, _FILTERS[windows.dims])
     moved = advected(spline, wind)
     # of air that came in nothing is known
     compared = second.isfinite() & moved.inside

@@ -141,7 +141,7 @@ def retrieve_wind_volume(
         if enough_windows(frame):
             textured = flag & Flag.LOW_TEXTURE.value == 0
             covariance = bootstrap_covariance(
-                volumes, found, frame, estimate, True, textured=textured
+                volumes, found, frame, estimate, True, textured=textured, noise=relative
             )
             flag, found = flag | of_bootstrap(covariance), found._replace(covariance=covariance)
         outlier = median_outliers(
