@@ -20,6 +20,7 @@ from lidar_mi.retrieval.correlation.known_motion import (
     at_mid_time,
     of_windows,
     on_pixels,
+    origin,
     places,
     read,
 )
@@ -30,7 +31,7 @@ from lidar_mi.retrieval.images.intensity import normalised
 from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
-from lidar_mi.retrieval.images.spline import likeliest
+from lidar_mi.retrieval.images.spline import band_limited, likeliest
 from lidar_mi.retrieval.images.windows import (
     Windows,
     averaged,
@@ -143,8 +144,13 @@ def bootstrap_covariance(
     mean = of_windows(wind, windows, centred)
 
     first, second = normalised(images)
-    spline = likeliest(first, _FILTERS[windows.dims])
-    moved = advected(spline, wind)
+    settings = _FILTERS[windows.dims]
+    spline, unfiltered = (
+        likeliest(first, settings),
+        band_limited([first], 0.0, settings=settings)[0],
+    )
+    came_from = origin(wind)
+    moved, sharp = (advected(one, came_from) for one in (spline, unfiltered))
     # of air that came in nothing is known
     compared = second.isfinite() & moved.inside
     residual = torch.where(compared, second - moved.image, 0.0)
@@ -169,11 +175,12 @@ def bootstrap_covariance(
     error = vectors - point + response * lacking
     on = on_pixels(error, coarse)
     valid = textured & ~replaced & ~wrong
+    again_moved = advected(spline, origin(at_mid_time(vectors, coarse, centred)))
     finer = unresolved(
         Residuals(
-            residual,
+            torch.where(compared, second - sharp.image, 0.0),
             added,
-            image.nan_to_num() - advected(spline, at_mid_time(vectors, coarse, centred)).image,
+            image.nan_to_num() - again_moved.image,
             level,
             moved.slopes,
             compared & _between(valid, coarse),

@@ -18,7 +18,7 @@ _GAUSSIAN, _SQUARE = MultipassSettings().sigma, 12**-0.5
 
 
 class Advected(NamedTuple):
-    """An image one time step later.
+    """An image whose air has moved.
 
     Attributes
     ----------
@@ -34,14 +34,19 @@ class Advected(NamedTuple):
     inside: torch.Tensor
 
 
-def advected(spline: Spline, wind: torch.Tensor) -> Advected:
-    """The first image of a spline along paths in a steady wind (axes, ...), px per time step."""
-    place = _pixels(spline.shape, wind)
+def origin(wind: torch.Tensor) -> torch.Tensor:
+    """Where the air of each pixel was one time step ago, px: paths in a steady wind (axes, ...)."""
+    place = _pixels(wind.shape[1:], wind)
     for _ in range(_STEPS):
         half = place - read(wind, place) / (2 * _STEPS)
         place = place - read(wind, half) / _STEPS
+    return place
+
+
+def advected(spline: Spline, place: torch.Tensor) -> Advected:
+    """The first image of a spline, with the air of each pixel from a place (axes, ...)."""
     at = place[:, None].to(spline.coefficients)
-    image, *slopes = (part[0].to(wind) for part in spline.sample(*at))
+    image, *slopes = (part[0].to(place) for part in spline.sample(*at))
     return Advected(image, torch.stack(slopes), spline.holds(*at)[0])
 
 
@@ -80,7 +85,7 @@ def _continued_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tenso
     last = torch.where(number < 0, 1, n - 1)
     difference = values[last] - values[last - 1]
     extended = values[edge] + (number - edge)[:, None] * difference
-    return cubic_weights(known[0] + step * number, places) @ extended
+    return cubic_weights(known[0] + step * number, places, -0.5) @ extended
 
 
 def of_windows(field: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:

@@ -286,16 +286,19 @@ def linear_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     return (1 - (at[:, None] - number).abs()).clamp(min=0)
 
 
-def cubic_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Matrix (place, known) of cubic convolution (a = -3/4; Keys 1981, IEEE ASSP 29, 1153-1160)."""
+def cubic_weights(known: torch.Tensor, places: torch.Tensor, a: float = -0.75) -> torch.Tensor:
+    """Matrix (place, known) of cubic convolution (Keys 1981, IEEE ASSP 29, 1153-1160).
+
+    With a = -1/2 it is exact for quadratic functions, with -3/4 it attenuates short waves less.
+    """
     matrix = places.new_zeros(len(places), len(known))
     step = float(known[1] - known[0]) if len(known) > 1 else math.inf
     at = (places - known[0]) / step
     low = at.floor()
     for shift in (-1, 0, 1, 2):
         x = (at - low - shift).abs()
-        inner = (1.25 * x - 2.25) * x * x + 1
-        outer = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
+        inner = ((a + 2) * x - (a + 3)) * x * x + 1
+        outer = ((a * x - 5 * a) * x + 8 * a) * x - 4 * a
         weight = torch.where(x <= 1, inner, outer)
         # beyond the ends the last value goes on
         column = (low.long() + shift).clamp(0, len(known) - 1)
