@@ -78,7 +78,7 @@ def bootstrap_covariance(
     Wieneke 2015, Meas. Sci. Technol. 26, 074002), and synthetic images of known motion state the
     error of the algorithm (Timmins et al. 2012, Exp. Fluids 53, 1133-1147). One pair states both:
 
-    - Its wind d is that of the vectors, outliers replaced, by cubics on the pixels.
+    - Its wind d is that of the vectors, outliers replaced, by cubic splines on the pixels.
     - Image 1 after its Wiener filter, the mean of the air given the image, is advected along paths
       in that wind.
     - The residual, image 2 less image 1 so advected, is moved by two templates along both axes,
@@ -145,12 +145,10 @@ def bootstrap_covariance(
 
     first, second = normalised(images)
     settings = _FILTERS[windows.dims]
-    spline, unfiltered = (
-        likeliest(first, settings),
-        band_limited([first], 0.0, settings=settings)[0],
-    )
+    # the Wiener filter smears rims, which would be taken for motion
+    spline, sharper = likeliest(first, settings), band_limited([first], settings=settings)[0]
     came_from = origin(wind)
-    moved, sharp = (advected(one, came_from) for one in (spline, unfiltered))
+    moved, sharp = (advected(one, came_from) for one in (spline, sharper))
     # of air that came in nothing is known
     compared = second.isfinite() & moved.inside
     residual = torch.where(compared, second - moved.image, 0.0)

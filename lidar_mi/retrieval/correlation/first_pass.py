@@ -1,5 +1,6 @@
 """The first displacement of a coarse-to-fine retrieval: correlation of large windows."""
 
+import math
 from collections.abc import Sequence
 from itertools import combinations_with_replacement, product
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from lidar_mi.retrieval.correlation.cross_correlation import cross_correlation
 from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.spline import Spline
-from lidar_mi.retrieval.images.windows import Windows, averaged, cubic_weights, separable
+from lidar_mi.retrieval.images.windows import Windows, averaged, separable
 
 # Voxels of shifted volumes that are correlated at once: more do not fit into a core's cache.
 _AT_ONCE = 2**17
@@ -64,7 +65,7 @@ class Grid(NamedTuple):
         Places outside take the nearest value.
         """
         weights = [
-            cubic_weights(at.to(self.like), torch.arange(n).to(self.like))
+            _cubic_weights(at.to(self.like), torch.arange(n).to(self.like))
             for n, at in zip(self.shape, known, strict=True)
         ]
         return separable(values.to(self.like), weights)
@@ -253,3 +254,20 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     offset = torch.where((peaked & (offset.abs() < 1).all(1))[:, None], offset, 0.0).T
     d = torch.where(rim | ~(flat.amax(0) > -1), torch.nan, place - reach + offset)
     return d.reshape(3, *scores.shape[1:])
+
+
+def _cubic_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Matrix (place, known) of cubic convolution (a = -3/4; Keys 1981, IEEE ASSP 29, 1153-1160)."""
+    matrix = places.new_zeros(len(places), len(known))
+    step = float(known[1] - known[0]) if len(known) > 1 else math.inf
+    at = (places - known[0]) / step
+    low = at.floor()
+    for shift in (-1, 0, 1, 2):
+        x = (at - low - shift).abs()
+        inner = (1.25 * x - 2.25) * x * x + 1
+        outer = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
+        weight = torch.where(x <= 1, inner, outer)
+        # beyond the ends the last value goes on
+        column = (low.long() + shift).clamp(0, len(known) - 1)
+        matrix.scatter_add_(1, column[:, None], weight[:, None])
+    return matrix

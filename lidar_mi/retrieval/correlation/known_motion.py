@@ -1,15 +1,16 @@
 """Images of air that moves as vectors say, and what windows make of that motion."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.interpolate import CubicSpline
 from torch.nn.functional import grid_sample
 
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.images.spline import Spline
-from lidar_mi.retrieval.images.windows import Windows, averaged, cubic_weights, separable
+from lidar_mi.retrieval.images.windows import Windows, averaged, separable
 
 # Steps of a path, rounds of the place at mid-time.
 _STEPS, _ROUNDS = 4, 3
@@ -51,7 +52,7 @@ def advected(spline: Spline, place: torch.Tensor) -> Advected:
 
 
 def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:
-    """Displacement (axes, ...) in dt of the air that is at each pixel at mid-time, by cubics."""
+    """Displacement (axes, ...) in dt of the air that is at each pixel at mid-time."""
     start = wind = on_pixels(flow, windows)
     if not centred:
         pixels = _pixels(windows.shape, flow)
@@ -61,31 +62,28 @@ def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Te
 
 
 def on_pixels(flow: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Values (n, *windows.count) of windows on pixels, by cubics; linear beyond the outermost."""
+    """Values (n, *windows.count) of windows on pixels, by cubic splines."""
     return separable(
         flow,
         [
-            _continued_weights(windows.centres(axis).to(flow), torch.arange(n).to(flow))
+            _spline_weights(windows.centres(axis).to(flow), torch.arange(n).to(flow))
             for axis, n in enumerate(windows.shape)
         ],
     )
 
 
-def _continued_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Matrix (place, known) of cubics; a constant would bend a shear at the outermost vectors."""
-    n = len(known)
-    if n == 1:
+def _spline_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Matrix (place, known) of natural cubic splines, which go on straight beyond their ends.
+
+    A constant would bend a shear at the outermost vectors, and curves would amplify their noise.
+    """
+    if len(known) == 1:
         return places.new_ones(len(places), 1)
-    step = known[1] - known[0]
-    beyond = math.ceil(float(max(known[0] - places[0], places[-1] - known[-1]) / step)) + 2
-    number = torch.arange(-beyond, n + beyond, device=known.device)
-    edge = number.clamp(0, n - 1)
-    values = torch.eye(n).to(known)
-    # the difference of the two vectors at the nearer end
-    last = torch.where(number < 0, 1, n - 1)
-    difference = values[last] - values[last - 1]
-    extended = values[edge] + (number - edge)[:, None] * difference
-    return cubic_weights(known[0] + step * number, places, -0.5) @ extended
+    at, x = (part.double().cpu().numpy() for part in (known, places))
+    spline = CubicSpline(at, np.eye(len(at)), bc_type="natural")
+    inside = x.clip(at[0], at[-1])
+    weights = spline(inside) + (x - inside)[:, None] * spline(inside, 1)
+    return torch.as_tensor(weights).to(known)
 
 
 def of_windows(field: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:

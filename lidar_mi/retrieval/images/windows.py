@@ -286,26 +286,6 @@ def linear_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     return (1 - (at[:, None] - number).abs()).clamp(min=0)
 
 
-def cubic_weights(known: torch.Tensor, places: torch.Tensor, a: float = -0.75) -> torch.Tensor:
-    """Matrix (place, known) of cubic convolution (Keys 1981, IEEE ASSP 29, 1153-1160).
-
-    With a = -1/2 it is exact for quadratic functions, with -3/4 it attenuates short waves less.
-    """
-    matrix = places.new_zeros(len(places), len(known))
-    step = float(known[1] - known[0]) if len(known) > 1 else math.inf
-    at = (places - known[0]) / step
-    low = at.floor()
-    for shift in (-1, 0, 1, 2):
-        x = (at - low - shift).abs()
-        inner = ((a + 2) * x - (a + 3)) * x * x + 1
-        outer = ((a * x - 5 * a) * x + 8 * a) * x - 4 * a
-        weight = torch.where(x <= 1, inner, outer)
-        # beyond the ends the last value goes on
-        column = (low.long() + shift).clamp(0, len(known) - 1)
-        matrix.scatter_add_(1, column[:, None], weight[:, None])
-    return matrix
-
-
 def strided(values: torch.Tensor, stride: int, axis: int) -> torch.Tensor:
     """Every `stride`-th value along `axis`, a view."""
     return values if stride == 1 else values.unfold(axis, 1, stride).squeeze(-1)
