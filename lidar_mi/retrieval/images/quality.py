@@ -203,6 +203,13 @@ def uncertain(covariance: torch.Tensor, limit: float = 0.5) -> torch.Tensor:
     return worst_variance(covariance.nan_to_num(torch.inf, torch.inf)) > limit**2
 
 
+def of_fit(covariance: torch.Tensor | None) -> torch.Tensor | int:
+    """Flags of displacements whose standard errors by the method's own fit are too large."""
+    if covariance is None:
+        return 0
+    return (Flag.LOW_TEXTURE * uncertain(covariance)).to(torch.int16)
+
+
 def of_bootstrap(covariance: torch.Tensor) -> torch.Tensor:
     """Flags of displacements with standard errors from `bootstrap`: not known, or too large."""
     unknown = ~covariance.isfinite().all(0).all(0)

@@ -272,6 +272,24 @@ def band_limited(
     return filtered_spline(finite(images), chosen, settings), chosen.level
 
 
+def likeliest(image: torch.Tensor, settings: FilterSettings) -> Spline:
+    """Spline through what an image most likely is without its white noise: its Wiener filter.
+
+    Of texture of spectral density S with noise N, S / (S + N) of the image is the mean of the
+    texture given the image. The filter of `band_limited` is g = sqrt(S / (S + N / 2)), so that this
+    one is g^2 / (2 - g^2).
+
+    Parameters
+    ----------
+    image : torch.Tensor, shape (z, y), or (x, z, y) of a volume
+    settings : FilterSettings
+    """
+    chosen = filter_of([image], settings=settings)
+    square = chosen.gain.square()
+    chosen = chosen._replace(gain=square / (2 - square))
+    return filtered_spline(_finite([image]), chosen, settings)
+
+
 def filter_of(
     images: torch.Tensor | Sequence[torch.Tensor],
     noise: float | None = None,

@@ -31,8 +31,8 @@ class Method:
     reach : int
         Range of its first displacements over that of its windows. 0: the method checks by itself
         whether the images are related.
-    repeats : int
-        Retrievals of a known motion that the standard errors are from (`bootstrap`). 0: the method
+    bootstrapped : bool
+        Standard errors are from the retrieval of a known motion (`bootstrap`). Else the method
         states its errors by itself.
     name : str
         As data sets have it.
@@ -44,7 +44,7 @@ class Method:
     centred: bool = False
     local: bool = True
     reach: int = 1
-    repeats: int = 0
+    bootstrapped: bool = False
     name: str = ""
 
     @property
@@ -58,13 +58,13 @@ METHODS: Mapping[str, Method] = {
         cross_correlation,
         ("correlation", "normalised cross-correlation at the peak"),
         ("min_correlation",),
-        repeats=2,
+        bootstrapped=True,
         name="cc",
     ),
     "ws": Method(
         weight_shift,
         ("mismatch", "misfit of weight and centre of mass over their spread"),
-        repeats=2,
+        bootstrapped=True,
         name="ws",
     ),
     "multipass": Method(
@@ -73,7 +73,7 @@ METHODS: Mapping[str, Method] = {
         ("min_correlation", "noise", "settings", "partly"),
         centred=True,
         reach=2,
-        repeats=1,
+        bootstrapped=True,
         name="multipass",
     ),
     "variational": Method(

@@ -8,6 +8,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
+from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
@@ -16,10 +17,15 @@ from lidar_mi.retrieval.defects.unrelated import unrelated
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.beam_times import vector_times
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, clearly_textured, low_texture, of_bootstrap
+from lidar_mi.retrieval.images.quality import (
+    Flag,
+    clearly_textured,
+    low_texture,
+    of_bootstrap,
+    of_fit,
+)
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.threads import threads_for
-from lidar_mi.retrieval.wind.errors import bootstrapped, flags_of_fit
 from lidar_mi.retrieval.wind.methods import Method
 from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.options import IMAGE_WINDOWS, VALIDATION, VectorValidation, WindowSizes
@@ -155,12 +161,12 @@ def _vectors(
     level = 0.0 if given.noise is None else given.noise
     limits = validation.min_texture, validation.min_isotropy
     texture, low = low_texture(clean.filled[0], windows, *limits, level)
-    flag = flag | flags_of_fit(found.covariance)
-    if method.repeats:
+    flag = flag | of_fit(found.covariance)
+    if method.bootstrapped:
         clear, covariance = clearly_textured(texture, *limits), None
         if standard_errors:
-            covariance = bootstrapped(
-                estimate, method, seen[:2], found, windows, given.noise, ~low, clear
+            covariance = bootstrap_covariance(
+                seen[:2], found, windows, estimate, method.centred, ~low, clear, given.noise
             )
             flag = flag | of_bootstrap(covariance)
         found = found._replace(covariance=covariance)

@@ -20,7 +20,7 @@ from lidar_mi.retrieval.defects.unrelated import unrelated
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, uncertain
+from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, of_fit
 from lidar_mi.retrieval.images.windows import working
 from lidar_mi.retrieval.wind.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
@@ -136,14 +136,12 @@ def retrieve_wind_volume(
         options |= {"more": volumes[2:], "spacing": steps}
     estimate = partial(METHODS[method], template=frame.template, search=frame.search, **options)
     found = estimate(*volumes[:2], stride=frame.stride)
-    flag = defects.flags(found, raw, frame, True)
-    if found.covariance is not None:
-        flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+    flag = defects.flags(found, raw, frame, True) | of_fit(found.covariance)
     if method == "correlation":
         if enough_windows(frame):
             textured = flag & Flag.LOW_TEXTURE.value == 0
             covariance = bootstrap_covariance(
-                volumes, found, frame, estimate, True, textured=textured
+                volumes, found, frame, estimate, True, textured=textured, noise=relative
             )
             flag, found = flag | of_bootstrap(covariance), found._replace(covariance=covariance)
         outlier = median_outliers(
