@@ -151,7 +151,7 @@ def differences(
     )
     level = level.clamp(min=max(floor, 1e-30))
     mean = float(level[valid].mean())
-    weight = mean / level
+    weight = (mean / level).to(images.weight)
     sizes = transform_sizes(spline.shape, spline.settings)
     _, shell = radii(tuple(sizes), spline.shape, noise.dtype, noise.device)
 
@@ -165,7 +165,7 @@ def differences(
     colour = _shrunk(ratio, uncertainty**-2, torch.ones_like(ratio, dtype=torch.bool))
     # before the filter
     mismatch = of_noise * colour / spline.gain.square().clamp(min=1e-6)
-    mismatch = mismatch.clamp(min=max(floor, 1e-6 * mean))
+    mismatch = mismatch.clamp(min=max(floor, 1e-6 * mean)).to(images.stack)
     if mesh.dims == 2:
         mismatch = flat_if_better(
             spectrum_of(images.stack, weight.sqrt(), spline.settings),
@@ -272,7 +272,7 @@ def _variance_beyond(prior: Prior, mesh: Mesh) -> torch.Tensor:
         # waves in an octave, per radian^dims: k^2 / 2 pi of a plane, k^3 / 2 pi^2 of a volume
         waves = k**2 / (2 * math.pi) if mesh.dims == 2 else k**3 / (2 * math.pi**2)
         total += part * step * waves * prior.density(k)
-    return interpolated(total, prior.mesh.places, mesh.places)
+    return interpolated(total, prior.mesh.places, [place.to(total) for place in mesh.places])
 
 
 def _motion_beyond(shape: Sequence[int], mesh: Mesh, like: torch.Tensor, seed: int) -> torch.Tensor:

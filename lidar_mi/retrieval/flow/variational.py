@@ -204,7 +204,7 @@ def variational_and_flow(
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
     # what the splines do not resolve is not in the posterior
     eye = torch.eye(windows.dims).to(covariance)
-    finer = interpolated(unresolved, pixels, centres).to(covariance)
+    finer = interpolated(unresolved.to(like), pixels, centres).to(covariance)
     additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
     covariance = covariance + additional
     result = result._replace(covariance=covariance)

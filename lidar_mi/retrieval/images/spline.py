@@ -106,10 +106,12 @@ class Spline(NamedTuple):
         # per px from per node
         return value, *(self.settings.nodes * slope for slope in slopes)
 
-    def values(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """The first of `sample` alone, of images."""
-        row, column = self._in_nodes((z, y))
-        (value,) = _read_images(self.coefficients, row, column, slopes=False)
+    def values(self, *place: torch.Tensor) -> torch.Tensor:
+        """The first of `sample` alone."""
+        at = self._in_nodes(place)
+        if len(at) > 2:
+            return _read_volumes(self.coefficients, *at)[0]
+        (value,) = _read_images(self.coefficients, at[0], at[1], slopes=False)
         return value
 
     def _in_nodes(self, place: Sequence[torch.Tensor]) -> list[torch.Tensor]:
