@@ -244,7 +244,9 @@ def _density_of_displaced(wave: torch.Tensor, texture: torch.Tensor) -> torch.Te
     of the gradient, F(k) = integral q^2 T(|(k, q)|) dq, over the wavenumbers q across the plane.
     Then dF/dk = -k S, so that F(k) is the integral of k' S(k') from k on.
     """
-    return (wave * texture).flip(0).cumsum(0).flip(0) * (wave[1] - wave[0])
+    part = wave * texture * (wave[1] - wave[0])
+    # of the shell about k itself half is beyond k
+    return part.flip(0).cumsum(0).flip(0) - part / 2
 
 
 def _unresolved_fraction(mesh: Mesh, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
