@@ -199,7 +199,7 @@ def _drawn(
     like, shape = slope, (_DRAWS, *slope.shape[1:])
     steep = averaged(slope.square().sum(0), valid, width)
     # texture is stronger where slopes are
-    local = (steep / steep[valid].mean()).sqrt()
+    local = (steep / steep[valid].mean().clamp(min=1e-30)).sqrt()
 
     def textured(density: torch.Tensor, seed: int) -> torch.Tensor:
         shaped = spline._replace(gain=spline.gain * density[: len(spline.gain)].sqrt())
