@@ -165,7 +165,7 @@ def differences(
     # a noise that is known is a lower limit at each place
     level = torch.maximum(level, told / images.given_weight).clamp(min=max(floor, 1e-30))
     mean = float(level[valid].mean())
-    weight = mean / level
+    weight = (mean / level).to(images.weight)
     mismatch = None
     # in a thin volume few shells hold the texture, and edges make most of what is in them
     if mesh.dims == 2:
@@ -184,7 +184,6 @@ def differences(
         images.stack, mean**0.5, mismatch, weight.sqrt(), images.blur, spline.settings
     )
     white = min(images.white, max(amplitudes["noise"], floor) ** 0.5)
-    weight = weight.to(images.weight)
     again = images.filtered(chosen)._replace(weight=weight, noise_updated=True, white=white)
     # where the residual is smaller than expected, so is the motion that would make it
     unresolved = unresolved * amplitudes["unresolved"] * local.clamp(max=1.0)
@@ -221,7 +220,7 @@ def _drawn(
     like, shape = slope, (_DRAWS[mesh.dims], *slope.shape[1:])
     steep = averaged(slope.square().sum(0), valid, width)
     # texture is stronger where slopes are
-    local = (steep / steep[valid].mean()).sqrt()
+    local = (steep / steep[valid].mean().clamp(min=1e-30)).sqrt()
 
     def textured(density: torch.Tensor, seed: int) -> torch.Tensor:
         shaped = spline._replace(gain=spline.gain * density[: len(spline.gain)].sqrt())
@@ -268,7 +267,9 @@ def _density_of_displaced(wave: torch.Tensor, texture: torch.Tensor) -> torch.Te
     of the gradient, F(k) = integral q^2 T(|(k, q)|) dq, over the wavenumbers q across the plane.
     Then dF/dk = -k S, so that F(k) is the integral of k' S(k') from k on.
     """
-    return (wave * texture).flip(0).cumsum(0).flip(0) * (wave[1] - wave[0])
+    part = wave * texture * (wave[1] - wave[0])
+    # of the shell about k itself half is beyond k
+    return part.flip(0).cumsum(0).flip(0) - part / 2
 
 
 def _unresolved_fraction(mesh: Mesh, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -287,7 +287,7 @@ def likeliest(image: torch.Tensor, settings: FilterSettings) -> Spline:
     chosen = filter_of([image], settings=settings)
     square = chosen.gain.square()
     chosen = chosen._replace(gain=square / (2 - square))
-    return filtered_spline(_finite([image]), chosen, settings)
+    return filtered_spline(finite([image]), chosen, settings)
 
 
 def filter_of(

@@ -10,10 +10,8 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.flow.likelihood import linearised, path, prepared, without_coarse
-from lidar_mi.retrieval.flow.misfit import with_local_noise
+from lidar_mi.retrieval.flow.likelihood import linearised, path, prepared
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
-from lidar_mi.retrieval.images.band_limit import Filter
 from lidar_mi.retrieval.images.spline import filtered_spline
 from tests.support.flows import plane_waves, texture
 from tests.support.volumes import nodes, random_waves
@@ -102,34 +100,6 @@ def test_gradient_is_that_of_the_misfit_of_volumes():
     assert abs(at_truth) < 0.03 * gradient
 
 
-def noise_of_still_images(noise, given):
-    """Noise of two images of fine texture at rest, from their spectra and with their misfit."""
-    random = np.random.default_rng(4)
-    z, y = np.arange(80), np.arange(90)
-    still = texture(plane_waves(4, 1.2), *np.meshgrid(y, z))
-    stack = [torch.as_tensor(still + noise * random.standard_normal(still.shape)) for _ in "12"]
-    axes = [Axis(n, 8.0) for n in still.shape]
-    mesh = Mesh(axes, [torch.arange(n, dtype=torch.float64) for n in still.shape])
-    settings = VariationalSettings()
-    images = prepared(stack, given, 0.0, settings)
-    nothing = torch.zeros(2, *(axis.knots for axis in axes), dtype=torch.float64)
-    linear = linearised(images, mesh, nothing, settings)
-    return images.white, with_local_noise(images, linear, 6.0, True, 8.0).white
-
-
-def test_fine_texture_is_not_taken_for_noise():
-    """Its spectrum has no floor; warped images that agree have no noise."""
-    spectrum, after = noise_of_still_images(0.0, None)
-    assert after < 0.1 * spectrum
-
-
-def test_noise_that_is_there_or_given_stays():
-    spectrum, after = noise_of_still_images(0.3, None)
-    assert after == spectrum
-    spectrum, after = noise_of_still_images(0.0, 0.05)
-    assert after == spectrum
-
-
 def test_slopes_of_noise_are_those_of_filtered_noise():
     """Mean square over 8 pairs of images of noise alone, to 4 of its standard errors."""
     random = np.random.default_rng(6)
@@ -143,13 +113,12 @@ def test_slopes_of_noise_are_those_of_filtered_noise():
         ]
 
     images = prepared(stack(1.0), 0.1, 0.0, VariationalSettings())
-    spline = images.spline
-    chosen = Filter(spline.gain, 0.1, spline.passed, 1.0, 1.0, spline.noisy_slopes)
+    spline = images.smooth
     place = torch.meshgrid(*(torch.arange(8.0, n - 8) for n in still.shape), indexing="ij")
     place = [axis.double().expand(2, -1, -1) for axis in place]
     found = []
     for _ in range(8):
-        noise = filtered_spline(torch.stack(stack(0.0)), chosen, spline.settings)
+        noise = filtered_spline(torch.stack(stack(0.0)), images.chosen.of_slopes(), spline.settings)
         _, *slopes = noise.sample(*place)
         found.append(sum(float(slope.mean(0).square().mean()) for slope in slopes))
     mean, error = np.mean(found), np.std(found, ddof=1) / len(found) ** 0.5
@@ -157,7 +126,7 @@ def test_slopes_of_noise_are_those_of_filtered_noise():
 
 
 def test_where_there_is_no_texture_images_tell_nothing():
-    """A half of the image is dark: its information is that of noise taken for texture, a tenth."""
+    """A half of the image is dark: slopes of noise there do not count as those of the air."""
     random = np.random.default_rng(7)
     z, y = np.arange(80), np.arange(120)
     still = (y > 60) * (texture(plane_waves(7, 3.0), *np.meshgrid(y, z), 0.3) - 1)
@@ -167,8 +136,9 @@ def test_where_there_is_no_texture_images_tell_nothing():
     mesh = Mesh(axes, [torch.arange(n, dtype=torch.float64) for n in still.shape])
     nothing = torch.zeros(2, *(axis.knots for axis in axes), dtype=torch.float64)
     found = linearised(images, mesh, nothing, VariationalSettings())
-    told = found.information * found.slope.square().sum(0)
-    seems = found.weight * found.slope.square().sum(0)
+    told = found.weight * found.slope.square().sum(0)
+    _, _, *slopes = images.sample(*path(mesh, nothing, images.time, 1))
+    seems = found.weight * torch.stack([slope.mean(0) for slope in slopes]).square().sum(0)
     dark, bright = np.s_[10:-10, 10:45], np.s_[10:-10, 75:-10]
     assert float(told[dark].sum()) < 0.1 * float(seems[dark].sum())
     assert float(told[bright].sum()) > 0.5 * float(seems[bright].sum())
@@ -188,18 +158,3 @@ def test_a_noise_far_below_that_of_the_spectra_is_a_lower_limit():
         assert (found.noise, found.known_noise, found.noise_known) == (none.noise, told, False)
     given = prepared(images, 0.04, 0.0, settings)
     assert (given.noise, given.known_noise, given.noise_known) == (0.04, 0.04, True)
-
-
-def test_long_waves_are_left_out_and_short_ones_stay():
-    """Of waves of 60 and 2.5 px half is left out: half of the one, nothing of the other."""
-    z, y = torch.meshgrid(torch.arange(120.0), torch.arange(120.0), indexing="ij")
-    valid, half = torch.ones_like(z, dtype=torch.bool), torch.full_like(z, 0.5)
-    inside = slice(20, -20), slice(20, -20)
-    for length, left in ((60.0, 0.5), (2.5, 1.0)):
-        wave = torch.sin(2 * torch.pi * y / length)
-        found = without_coarse(wave, half, valid)
-        # of a Gaussian mean of 1 px
-        passed = np.exp(-((2 * np.pi / length) ** 2) / 2)
-        assert torch.allclose(found[inside], (1 - 0.5 * passed) * wave[inside], atol=2e-3)
-        assert abs((1 - 0.5 * passed) - left) < 0.03
-    assert without_coarse(z, None, valid) is z

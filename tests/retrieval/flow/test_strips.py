@@ -92,8 +92,8 @@ def test_evidence_is_that_of_the_whole_system(systems):
     for step, whole in systems:
         (own, energy), (exact, same) = strips.solved(*step).evidence(), whole.evidence()
         torch.testing.assert_close(energy, same, rtol=1e-2, atol=1e-3 * float(same.mean()))
-        weight = step[3].strength
-        for kind in (0, 1):
+        weight = step[3].cell * step[3].local
+        for kind in range(len(weight)):
             parts = [(weight * field)[kind] for field in (own, exact)]
             assert float(parts[0].sum() / parts[1].sum()) == pytest.approx(1, abs=0.05)
             assert float((parts[0] - parts[1]).abs().mean()) < 0.05 * float(parts[1].mean())
