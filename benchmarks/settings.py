@@ -136,8 +136,6 @@ def varied(settings, path: str = "") -> Iterator[tuple[str, object, object, obje
         name = path + field.name
         if is_dataclass(value):
             yield from varied(value, f"{name}.")
-        elif isinstance(value, tuple):
-            yield name, value, *(tuple(_times(v, f) for v in value) for f in (0.5, 2))
         elif name.endswith("smoothing"):
             # odd numbers of shells
             yield name, value, max(1, value // 2 | 1), 2 * value + 1
@@ -146,6 +144,8 @@ def varied(settings, path: str = "") -> Iterator[tuple[str, object, object, obje
 
 
 def _times(value, factor: float):
+    if isinstance(value, tuple):
+        return tuple(_times(part, factor) for part in value)
     if isinstance(value, bool):
         return not value if factor > 1 else value
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor

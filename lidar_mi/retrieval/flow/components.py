@@ -107,17 +107,17 @@ def differences(
     time = images.time.to(linear.warped).reshape(-1, *[1] * mesh.dims)
     difference = working((time * linear.warped).sum(0) / times * valid)
     unresolved = _variance_beyond(prior, mesh)
-    if not bool((difference != 0).any()):
+    squares = _Squares(valid)
+    found = squares(difference[None])[0]
+    use = squares.inside & (found > 0)
+    if not bool(use.any()):
         return Differences(images, torch.zeros_like(unresolved), {})
     kinds = _drawn(images, linear, mesh, unresolved, times, width)
     told = images.known_noise**2
     absorb = _residual_operator(linear, mesh, response)
     rests = {name: absorb(draws) for name, draws in kinds.items()}
     own = _flows_left(linear, mesh, prior, response)
-    squares = _Squares(valid)
-    found = squares(difference[None])[0]
     held, *terms = (squares(draws) for draws in (own, *rests.values()))
-    use = squares.inside & (found > 0)
     chance = _chance(terms[0])
     number = (1 / chance).expand_as(found)
     known = held.mean(0) + told * terms[0].mean(0)
