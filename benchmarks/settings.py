@@ -22,8 +22,8 @@ VOLUME = (16, 40, 56)
 VOLUME_NOISE = 0.01
 # images of this size are solved directly; a seed has no magnitude
 UNUSED = {
-    "images": ("solver", "strips", "volume_ratio"),
-    "volumes": ("strips", "solver.seed", "ratio", "modes"),
+    "images": ("solver", "strips"),
+    "volumes": ("strips", "solver.seed", "largest_ratio", "largest_change_divergence"),
 }
 
 Errors = tuple[float, float]
@@ -145,7 +145,7 @@ def varied(settings, path: str = "") -> Iterator[tuple[str, object, object, obje
 
 def _times(value, factor: float):
     if isinstance(value, tuple):
-        return tuple(_times(v, factor) for v in value)
+        return tuple(_times(part, factor) for part in value)
     if isinstance(value, bool):
         return not value if factor > 1 else value
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor

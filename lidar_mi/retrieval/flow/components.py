@@ -117,19 +117,21 @@ def differences(
     times = float(images.time.square().sum())
     time = images.time.to(linear.warped).reshape(-1, *[1] * mesh.dims)
     difference = working((time * linear.warped).sum(0) / times * valid)
+    # outliers, which count little in the fit, are none of the components
+    difference = difference * working(linear.regular)
     unresolved = _variance_beyond(prior, mesh)
-    if not bool((difference != 0).any()):
+    squares = _Squares(valid)
+    found = squares(difference[None])[0]
+    use = squares.inside & (found > 0)
+    if not bool(use.any()):
         return Differences(images, torch.zeros_like(unresolved), {})
     kinds = _drawn(images, linear, mesh, unresolved, times, width)
     told = images.known_noise**2
     absorb = _residual_operator(linear, mesh, response)
     rests = {name: absorb(draws) for name, draws in kinds.items()}
     own = _flows_left(linear, mesh, prior, response)
-    squares = _Squares(valid)
-    found = squares(difference[None])[0]
     held = squares(own).mean(0)
     drawn = {name: squares(draws) for name, draws in rests.items()}
-    use = squares.inside & (found > 0)
     number = (1 / _chance(drawn["noise"])).expand_as(found)
     terms = {name: draws.mean(0) for name, draws in drawn.items()}
     known = held + told * terms["noise"]
@@ -154,10 +156,12 @@ def differences(
 
     noise, after = total(kinds), total(rests) + own
     expected = squares(after).mean(0).clamp(min=1e-30)
-    weighted = (number * found / expected).where(use, 0.0).sum(0)
-    count = number.where(use, 0.0).sum(0)
-    ratio = weighted / count.clamp(min=1e-30)
-    local = squares.on_pixels(_shrunk(ratio, count, use.any(0)))
+    # noise counts in the scales of the texture, which inform the flow
+    weight = (terms["replaced"] / expected).where(use, 0.0)
+    weight = weight / weight.sum(0).clamp(min=1e-30)
+    ratio = (weight * found / expected).sum(0)
+    count = 1 / (weight.square() / number).sum(0).clamp(min=1e-30)
+    local = squares.on_pixels(_shrunk(ratio, count, weight.sum(0) > 0.5))
     floor = (_INTERPOLATION * rms(images.stack)) ** 2
     level = (
         times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)

@@ -127,6 +127,8 @@ class Linear(NamedTuple):
         The same after that of their differences.
     valid : torch.Tensor of bool
         Where all of them are.
+    regular : torch.Tensor
+        Factor by which residuals count less in the fit, 1 but for outliers (Huber).
     """
 
     slope: torch.Tensor
@@ -136,6 +138,7 @@ class Linear(NamedTuple):
     smooth: torch.Tensor
     warped: torch.Tensor
     valid: torch.Tensor
+    regular: torch.Tensor
 
 
 def prepared(
@@ -214,7 +217,8 @@ def linearised_there(
         variance = max(variance, misfit_variance(misfit[valid], len(value)) / passed)
     off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
     # beyond `robust` standard deviations residuals enter linearly (Huber)
-    weight = images.weight * (settings.robust / off.clamp(min=settings.robust)) * valid
+    regular = settings.robust / off.clamp(min=settings.robust)
+    weight = images.weight * regular * valid
     time = images.time.reshape(-1, *[1] * mesh.dims)
     # an image moves by its time times the flow: the derivative weights it by that
     difference = (time * (value - value.mean(0))).sum(0)
@@ -222,7 +226,7 @@ def linearised_there(
     slope = slope * _fraction_of_texture(images, slope, valid, mesh)
     gradient = -informed * difference * slope
     information = images.time.square().sum() * informed
-    return Linear(slope, gradient, information, variance, smooth, value, valid)
+    return Linear(slope, gradient, information, variance, smooth, value, valid, regular)
 
 
 def information_of_first(

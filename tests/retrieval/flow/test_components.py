@@ -124,7 +124,7 @@ def test_noise_told_by_a_map_stays_where_it_is(monkeypatch):
     assert np.mean(ratios) == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.parametrize("level", [0.002, 0.01])
+@pytest.mark.parametrize("level", [0.002, pytest.param(0.01, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("told", [True, False])
 def test_replaced_texture_is_found(level, told, monkeypatch):
     """Texture of a spectrum k^-4 at rest; means of four seeds, of which one is right to 20 %."""
@@ -306,7 +306,9 @@ def test_mean_square_strain():
     assert _mean_square_strain(turning) == 0
 
 
-@pytest.mark.parametrize(("turnover", "rms"), [(0.1, 0.8), (0.4, 0.4)])
+@pytest.mark.parametrize(
+    ("turnover", "rms"), [(0.1, 0.8), pytest.param(0.4, 0.4, marks=pytest.mark.slow)]
+)
 def test_errors_of_flows_drawn_from_a_spectrum(turnover, rms, monkeypatch):
     """Variance of normalised errors of six flows in noise of 1 and 5 % that is told.
 
