@@ -29,6 +29,8 @@ _SHAPES = 0.5 * 2.0 ** torch.arange(7)
 _ROUNDS = 20
 # Limits of the strengths, of displacements in px.
 _WEAKEST, _STRONGEST = 1e-6, 1e10
+# Least standard deviation of a rate in a cell between knots of a volume, px per px.
+_LEAST = 1e-4
 
 Motion = tuple[tuple[int, tuple[int, ...], float], ...]
 """A rate of the flow as terms (component, orders of its derivative along the axes, sign)."""
@@ -206,7 +208,9 @@ class Prior(NamedTuple):
         step = change * (whole / spent).reshape(-1, *[1] * self.mesh.dims)
         most = settings.largest_change
         step = step.clamp(1 / most, most) ** settings.relaxation
-        return self._replace(local=(self.local * step).clamp(_WEAKEST, _STRONGEST))
+        # of a volume as far as conjugate gradients find flows
+        strongest = _STRONGEST if self.mesh.dims == 2 else _cells(self.mesh) / _LEAST**2
+        return self._replace(local=(self.local * step).clamp(_WEAKEST, strongest))
 
     def _number_around(self) -> float:
         """Nodes of the mesh that count in a Gaussian mean of the prior's width."""

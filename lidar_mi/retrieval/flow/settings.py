@@ -155,7 +155,8 @@ VOLUME_VARIATIONAL = VariationalSettings(
     noise_rounds=((3,),),
     least_vorticity=0.03,
     prior_width=0.5,
-    relaxation=2.0,
+    largest_change=4.0,
+    relaxation=1.0,
     filter=VOLUME_FILTER,
 )
 """Of volumes: the flow of the multi-pass correlation makes a coarse level unnecessary."""

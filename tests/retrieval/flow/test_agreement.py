@@ -13,7 +13,7 @@ def linear(images):
     nothing = torch.zeros(2, *images.shape[1:])
     valid = torch.ones(images.shape[1:], dtype=torch.bool)
     still = nothing[0]
-    return Linear(nothing, nothing, still, 1.0, images, images, valid)
+    return Linear(nothing, nothing, still, 1.0, images, images, valid, still)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 1.0])

@@ -248,7 +248,9 @@ def linear_case(level, seed=0, shape=(48, 56)):
     )
     weight = torch.full(shape, level**-2).double()
     images = torch.zeros(2, *shape).double()
-    linear = Linear(slope, 0 * slope, weight, level**2, images, images, weight > 0)
+    linear = Linear(
+        slope, 0 * slope, weight, level**2, images, images, weight > 0, torch.ones_like(weight)
+    )
     still = torch.zeros(2, *(axis.knots for axis in axes)).double()
     return (
         linear,

@@ -36,7 +36,7 @@ def case():
     slope = torch.randn(3, *shape, generator=random, dtype=torch.float64)
     gradient = torch.randn(3, *shape, generator=random, dtype=torch.float64)
     weight = torch.rand(shape, generator=random, dtype=torch.float64) + 0.5
-    linear = Linear(slope, gradient, weight, 1.0, slope, slope, weight > 0)
+    linear = Linear(slope, gradient, weight, 1.0, slope, slope, weight > 0, torch.ones_like(weight))
     nodes = halves(axes, weight)
     local = torch.rand(3, *nodes.shape, generator=random, dtype=torch.float64) + 0.1
     prior = Prior(local, nodes, 2.0, (0.5, 0.7, 1.1))

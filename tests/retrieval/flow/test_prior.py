@@ -107,7 +107,9 @@ def observed(flow, noise, seed):
     weight = torch.full(shape, noise**-2).double()
     images = torch.zeros(2, *shape).double()
     gradient = weight * seen * slope
-    return Linear(slope, gradient, weight, noise**2, images, images, weight > 0)
+    return Linear(
+        slope, gradient, weight, noise**2, images, images, weight > 0, torch.ones_like(weight)
+    )
 
 
 @pytest.mark.parametrize("turnover", [0.1, 0.4])
