@@ -29,9 +29,8 @@ from lidar_mi.retrieval.images.band_limit import (
     wavenumbers,
 )
 from lidar_mi.retrieval.images.intensity import rms
-from lidar_mi.retrieval.images.quality import filled
 from lidar_mi.retrieval.images.spline import Spline, filter_of, spectrum_of, transform_sizes
-from lidar_mi.retrieval.images.windows import averaged, separable, stored, working
+from lidar_mi.retrieval.images.windows import averaged, separable, working
 from lidar_mi.retrieval.reml import most_likely
 
 Response = Callable[[torch.Tensor], torch.Tensor]
@@ -86,9 +85,8 @@ def differences(
     which R J C (P u) is left with the prior's precision P. Squares of the residuals, by three
     scales and by place, have gamma distributions whose means are sums of those of the components.
     The amplitudes are the likeliest (`reml.most_likely`): what the fit absorbs is counted, as in
-    restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545-554). Unresolved
-    motion makes differences like those of noise. Its amplitude, 1 where the prior's spectrum goes
-    on, is the mean of the likeliest one and of the largest that the residuals leave room for.
+    restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545-554). That of the
+    unresolved motion is 1 where the prior's spectrum goes on beyond the splines, and at most.
 
     What differs from the sum of the components by place, and by wavenumber, multiplies it: the
     variance of the ratio beyond chance says how freely (`_shrunk`).
@@ -118,10 +116,10 @@ def differences(
     time = images.time.to(linear.warped).reshape(-1, *[1] * mesh.dims)
     difference = working((time * linear.warped).sum(0) / times * valid)
     # outliers, which count little in the fit, are none of the components
-    difference = difference * working(linear.regular)
+    regular = difference * working(linear.regular)
     unresolved = _variance_beyond(prior, mesh)
     squares = _Squares(valid)
-    found = squares(difference[None])[0]
+    found = squares(regular[None])[0]
     use = squares.inside & (found > 0)
     if not bool(use.any()):
         return Differences(images, torch.zeros_like(unresolved), {})
@@ -136,19 +134,13 @@ def differences(
     terms = {name: draws.mean(0) for name, draws in drawn.items()}
     known = held + told * terms["noise"]
 
-    def likeliest(names: Sequence[str], known: torch.Tensor) -> dict[str, float]:
-        fields = (found, torch.stack([terms[name] for name in names]), number, known)
-        square, means, half, rest = (field[..., use].cpu().numpy() for field in fields)
-        most = np.array([1.0 if name == "unresolved" else np.inf for name in names])
-        _, factors = most_likely(square, means, most, half, rest)
-        return {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
-
     # a noise that is known is not estimated
     names = [name for name in kinds if not (name == "noise" and images.noise_known)]
-    both = likeliest(["unresolved"], known), likeliest(names, known)
-    tail = sum(amplitudes["unresolved"] for amplitudes in both) / 2
-    others = [name for name in names if name != "unresolved"]
-    amplitudes = likeliest(others, known + tail * terms["unresolved"]) | {"unresolved": tail}
+    fields = (found, torch.stack([terms[name] for name in names]), number, known)
+    square, means, half, rest = (field[..., use].cpu().numpy() for field in fields)
+    most = np.array([1.0 if name == "unresolved" else np.inf for name in names])
+    _, factors = most_likely(square, means, most, half, rest)
+    amplitudes = {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
     amplitudes["noise"] = amplitudes.get("noise", 0.0) + told
 
     def total(parts: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -166,8 +158,7 @@ def differences(
     level = (
         times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)
     )
-    # a noise that is known is a lower limit at each place
-    level = torch.maximum(level, told / images.given_weight).clamp(min=max(floor, 1e-30))
+    level = level.clamp(min=max(floor, 1e-30))
     mean = float(level[valid].mean())
     weight = (mean / level).to(images.weight)
     mismatch = None
@@ -230,7 +221,7 @@ def _drawn(
         shaped = spline._replace(gain=spline.gain * density[: len(spline.gain)].sqrt())
         return local * shaped.filtered(normal_fields(shape, like, seed))
 
-    texture = _texture_density(images)
+    texture = _texture_density(images, linear)
     wave = wavenumbers(texture, spline.shape)
     white = normal_fields(shape, like, 1) / images.given_weight.sqrt()
     finer = _motion_beyond(shape, mesh, like, 4) * unresolved.sqrt()
@@ -250,17 +241,23 @@ def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.
     return torch.randn(tuple(shape), generator=random, dtype=like.dtype).to(like.device)
 
 
-def _texture_density(images: Images) -> torch.Tensor:
-    """Spectral density of the texture that stands out of the noise, (shells,)."""
+def _texture_density(images: Images, linear: Linear) -> torch.Tensor:
+    """Spectral density of the texture that the warped images have in common, (shells,).
+
+    The real part of their cross-spectrum: noise and outliers of one image are not in it.
+    """
     spline = images.spline
-    known = torch.stack([torch.isfinite(image) for image in images.stack])
-    stack = torch.stack([stored(filled(image)) for image in images.stack])
     sizes = transform_sizes(spline.shape, spline.settings)
-    _, shell = radii(tuple(sizes), spline.shape, stack.dtype, stack.device)
-    density, uncertainty = shell_means(stack, shell, sizes, spline.settings.smoothing, known)
-    # the means of shells of noise alone scatter about its variance
-    above = density > images.white**2 * (1 + spline.settings.threshold * uncertainty)
-    return torch.where(above, density - images.white**2, 0.0)
+    first, last = working(linear.warped[0]), working(linear.warped[-1])
+    _, shell = radii(tuple(sizes), spline.shape, first.dtype, first.device)
+    both = torch.stack([(first + last) / 2, (first - last) / 2]) * linear.valid
+    (mean, uncertainty), (half, _) = (
+        shell_means(part[None], shell, sizes, spline.settings.smoothing) for part in both
+    )
+    common = mean - half
+    # the means of shells of noise alone scatter about 0
+    above = common > spline.settings.threshold * uncertainty * (mean + half) / 2**0.5
+    return torch.where(above, common / spline.gain.square().clamp(min=1e-6), 0.0)
 
 
 def _density_of_displaced(wave: torch.Tensor, texture: torch.Tensor) -> torch.Tensor:

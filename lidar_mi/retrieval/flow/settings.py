@@ -131,8 +131,8 @@ class VariationalSettings:
     """
 
     knots: tuple[float, ...] = (1.25, 0.5)
-    rounds: tuple[int, ...] = (4, 4)
-    noise_rounds: tuple[tuple[int, ...], ...] = ((2,), (1, 3))
+    rounds: tuple[int, ...] = (6, 7)
+    noise_rounds: tuple[tuple[int, ...], ...] = ((3,), (1, 4))
     robust: float = 3.0
     path_order: int = 6
     noise_width: float = MAP_WIDTH

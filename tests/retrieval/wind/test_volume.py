@@ -83,10 +83,7 @@ def test_smooth_flows_are_not_drawn_to_whole_voxels(moved):
         assert abs(np.mean(off[name])) < 0.01, (name, np.mean(off[name]))
 
 
-UNSTEADY = pytest.mark.xfail(strict=True, reason="rms error of 0.06 voxels in place of 0.03")
-
-
-@pytest.mark.parametrize("method", ["correlation", pytest.param("variational", marks=UNSTEADY)])
+@pytest.mark.parametrize("method", ["correlation", "variational"])
 def test_rigid_shift(method):
     """Nothing bends: errors are those of the noise, 1 % of the mean, 10 % of the texture."""
     level, normalised = [], []
