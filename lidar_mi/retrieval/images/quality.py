@@ -221,7 +221,7 @@ def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """Where a displacement's variance is above a quarter of the variance of all about their mean.
 
     Means over the components of d (components, ...) and covariance (components, components, ...).
-    Everywhere where that holds of the mean variance of all. An error below 0.05 px is small for any
+    Everywhere where that holds of the median variance of all. An error below 0.05 px is small for any
     wind: in uniform wind no error is small compared with its spread.
     """
     known = covariance.isfinite().all(0).all(0) & d.isfinite().all(0)
@@ -230,7 +230,7 @@ def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     variance = covariance.diagonal().mean(-1)
     spread = working(d)[:, known].var(1, correction=0).mean()
     limit = (spread / 4).clamp(min=SMALL**2)
-    return known & ((variance > limit) | (variance[known].mean() > limit))
+    return known & ((variance > limit) | (variance[known].median() > limit))
 
 
 def worst_variance(covariance: torch.Tensor) -> torch.Tensor:
