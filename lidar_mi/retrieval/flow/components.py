@@ -42,6 +42,8 @@ _SCALES = (1.5, 3.0)
 """Standard deviations, px, of the Gaussian means between which squares are told apart by scale."""
 _REGION = 8
 """Standard deviation of the Gaussian mean of the squares, and the separation of its places, px."""
+_TAPER = 4.0
+"""Standard deviation, px, of the Gaussian by which spectra fade next to invalid pixels."""
 _LEAST_DENSITY = 1e-6
 """Of the differences, over their mean: what is less is rounding."""
 _INTERPOLATION = 3e-4
@@ -60,7 +62,7 @@ class Differences:
         Variance of a component of the motion that the splines do not resolve, px^2.
     amplitudes : mapping of str to float
         Variance of each component over that of its unit: of the noise per squared intensity,
-        fraction of the texture that is replaced, px^2 of motion through the plane, fraction of the
+        2 (1 - c) / c of a fraction 1 - c^2 of the texture that is replaced, px^2 of motion through the plane, fraction of the
         variance that the prior's spectrum has beyond the splines.
     """
 
@@ -164,7 +166,7 @@ def differences(
     mismatch = None
     # in a thin volume few shells hold the texture, and edges make most of what is in them
     if mesh.dims == 2:
-        whiten = (weight * times).sqrt() * valid
+        whiten = (weight * times).sqrt() * _tapered(valid)
         mismatch = _spectrum(
             spline,
             *(whiten * part for part in (noise * local.sqrt(), after * local.sqrt(), difference)),
@@ -250,7 +252,7 @@ def _texture_density(images: Images, linear: Linear) -> torch.Tensor:
     sizes = transform_sizes(spline.shape, spline.settings)
     first, last = working(linear.warped[0]), working(linear.warped[-1])
     _, shell = radii(tuple(sizes), spline.shape, first.dtype, first.device)
-    both = torch.stack([(first + last) / 2, (first - last) / 2]) * linear.valid
+    both = torch.stack([(first + last) / 2, (first - last) / 2]) * _tapered(linear.valid)
     (mean, uncertainty), (half, _) = (
         shell_means(part[None], shell, sizes, spline.settings.smoothing) for part in both
     )
@@ -258,6 +260,16 @@ def _texture_density(images: Images, linear: Linear) -> torch.Tensor:
     # the means of shells of noise alone scatter about 0
     above = common > spline.settings.threshold * uncertainty * (mean + half) / 2**0.5
     return torch.where(above, common / spline.gain.square().clamp(min=1e-6), 0.0)
+
+
+def _tapered(valid: torch.Tensor) -> torch.Tensor:
+    """Weights of valid pixels for a spectrum, of mean square 1: smooth towards what is not valid.
+
+    A step would spread the power of long waves over all others.
+    """
+    share = averaged(valid.double(), torch.ones_like(valid), _TAPER)
+    weight = (2 * share - 1).clamp(min=0.0) * valid
+    return weight / weight.square().mean().sqrt().clamp(min=1e-6)
 
 
 def _density_of_displaced(wave: torch.Tensor, texture: torch.Tensor) -> torch.Tensor:

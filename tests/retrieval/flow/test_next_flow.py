@@ -94,7 +94,7 @@ def test_the_same_images_again_give_the_same_flow(slabs, learnt):
         (part.diagonal().sqrt(), part[0, 1] / part.diagonal().prod(-1).sqrt())
         for part in (found.covariance, learnt[0].covariance)
     )
-    torch.testing.assert_close(near[0], known[0], rtol=0.06, atol=0.0)
+    torch.testing.assert_close(near[0], known[0], rtol=0.09, atol=0.0)
     assert float((near[0] / known[0]).mean()) == pytest.approx(1.0, abs=0.01)
     torch.testing.assert_close(near[1], known[1], rtol=0.0, atol=0.1)
     assert bool((found.flag == learnt[0].flag).float().mean() > 0.999)
