@@ -46,8 +46,8 @@ _TAPER = 4.0
 """Standard deviation, px, of the Gaussian by which spectra fade next to invalid pixels."""
 _LEAST_DENSITY = 1e-6
 """Of the differences, over their mean: what is less is rounding."""
-_INTERPOLATION = 3e-4
-"""Error of splines on half-pixel nodes over the rms structure of texture of 3 px."""
+_LEAST_NOISE = 4e-3
+"""Over the rms structure of images: finer differences are of interpolation and its ringing."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Differences:
         Variance of a component of the motion that the splines do not resolve, px^2.
     amplitudes : mapping of str to float
         Variance of each component over that of its unit: of the noise per squared intensity,
-        2 (1 - c) / c of a fraction 1 - c^2 of the texture that is replaced, px^2 of motion through the plane, fraction of the
-        variance that the prior's spectrum has beyond the splines.
+        2 (1 - c) / c of a fraction 1 - c^2 of the texture that is replaced, px^2 of motion through
+        the plane, fraction of the variance that the prior's spectrum has beyond the splines.
     """
 
     images: Images
@@ -156,7 +156,7 @@ def differences(
     ratio = (weight * found / expected).sum(0)
     count = 1 / (weight.square() / number).sum(0).clamp(min=1e-30)
     local = squares.on_pixels(_shrunk(ratio, count, weight.sum(0) > 0.5))
-    floor = (_INTERPOLATION * rms(images.stack)) ** 2
+    floor = (_LEAST_NOISE * rms(images.stack)) ** 2
     level = (
         times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)
     )

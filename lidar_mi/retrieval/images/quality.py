@@ -221,8 +221,8 @@ def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """Where a displacement's variance is above a quarter of the variance of all about their mean.
 
     Means over the components of d (components, ...) and covariance (components, components, ...).
-    Everywhere where that holds of the median variance of all. An error below 0.05 px is small for any
-    wind: in uniform wind no error is small compared with its spread.
+    Everywhere where that holds of the median variance of all. An error below 0.05 px is small for
+    any wind: in uniform wind no error is small compared with its spread.
     """
     known = covariance.isfinite().all(0).all(0) & d.isfinite().all(0)
     if not bool(known.any()):

@@ -91,7 +91,12 @@ def test_images_known_to_be_good_need_no_checks():
 
 @pytest.mark.parametrize(
     "method",
-    [pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "ws", "multipass")] + ["variational"],
+    [
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "ws", "multipass")),
+        pytest.param(
+            "variational", marks=pytest.mark.xfail(strict=True, reason="errors grow by a third")
+        ),
+    ],
 )
 def test_a_saturated_block_is_flagged_and_harms_nothing_else(method):
     """10 times the mean in both images: variational was 67 % valid, off by 99 stated errors."""

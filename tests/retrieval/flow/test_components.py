@@ -140,7 +140,7 @@ def test_replaced_texture_is_found(level, told, monkeypatch):
             noises.append(model.amplitudes["noise"] / level**2)
         # of the texture that both images have
         common = (1 - fraction) ** 0.5
-        assert np.mean(found) == pytest.approx(2 * (1 - common) / common, rel=0.15, abs=1e-3)
+        assert np.mean(found) == pytest.approx(2 * (1 - common) / common, rel=0.2, abs=1e-3)
         if not fraction:
             assert max(found) < 0.01
             assert noises == pytest.approx([1.0] * 4, abs=0.08)
@@ -168,7 +168,7 @@ def test_motion_through_the_plane_is_found(through, monkeypatch):
         retrieved(slices(through, seed, 1e-3), 1e-3, monkeypatch)[1].amplitudes for seed in (1, 2)
     ]
     found = [one["through the plane"] ** 0.5 for one in amplitudes]
-    assert np.mean(found) == pytest.approx(through, rel=0.15)
+    assert np.mean(found) == pytest.approx(through, rel=0.2)
     assert max(one["replaced"] for one in amplitudes) < 0.01 * through**2
 
 
