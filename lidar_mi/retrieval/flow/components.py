@@ -180,8 +180,7 @@ def differences(
     chosen = filter_of(
         images.stack, mean**0.5, mismatch, weight.sqrt(), images.blur, spline.settings
     )
-    white = min(images.white, max(amplitudes["noise"], floor) ** 0.5)
-    again = images.filtered(chosen)._replace(weight=weight, noise_updated=True, white=white)
+    again = images.filtered(chosen)._replace(weight=weight, noise_updated=True)
     # where the residual is smaller than expected, so is the motion that would make it
     unresolved = unresolved * amplitudes["unresolved"] * local.clamp(max=1.0)
     return Differences(again, unresolved, amplitudes)

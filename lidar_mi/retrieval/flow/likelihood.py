@@ -55,8 +55,6 @@ class Images(NamedTuple):
         The images, of one brightness.
     blur : float
         Standard deviation of the Gaussian that blurred the images, px.
-    white : float
-        The white noise alone, without other differences.
     known_noise : float
         The noise that was given; 0 if none was.
     chosen : Filter
@@ -76,7 +74,6 @@ class Images(NamedTuple):
     given_weight: torch.Tensor
     stack: torch.Tensor
     blur: float
-    white: float
     known_noise: float
     chosen: Filter
     noise_known: bool = True
@@ -174,7 +171,6 @@ def prepared(
         weight,
         images,
         blur,
-        level,
         known_noise,
         chosen,
         noise_known,
