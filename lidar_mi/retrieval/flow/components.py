@@ -44,6 +44,8 @@ _REGION = 8
 """Standard deviation of the Gaussian mean of the squares, and the separation of its places, px."""
 _TAPER = 4.0
 """Standard deviation, px, of the Gaussian by which spectra fade next to invalid pixels."""
+_LEAST_ISOTROPY = 1e-3
+"""Of the mean squares of slopes along two directions: less is rounding."""
 _LEAST_DENSITY = 1e-6
 """Of the differences, over their mean: what is less is rounding."""
 _LEAST_NOISE = 4e-3
@@ -60,6 +62,8 @@ class Differences:
         With the filter and the weights by which the noise is white.
     unresolved : torch.Tensor, shape (...)
         Variance of a component of the motion that the splines do not resolve, px^2.
+    fronts : torch.Tensor, shape (components, components, ...)
+        Covariance of the displacement that motion through the plane makes of fronts, px^2.
     amplitudes : mapping of str to float
         Variance of each component over that of its unit: of the noise per squared intensity,
         2 (1 - c) / c of a fraction 1 - c^2 of the texture that is replaced, px^2 of motion through
@@ -68,6 +72,7 @@ class Differences:
 
     images: Images
     unresolved: torch.Tensor
+    fronts: torch.Tensor
     amplitudes: Mapping[str, float]
 
 
@@ -124,7 +129,9 @@ def differences(
     found = squares(regular[None])[0]
     use = squares.inside & (found > 0)
     if not bool(use.any()):
-        return Differences(images, torch.zeros_like(unresolved), {})
+        return Differences(
+            images, torch.zeros_like(unresolved), _of_fronts(linear, 0.0, template), {}
+        )
     kinds = _drawn(images, linear, mesh, unresolved, times, width)
     told = images.known_noise**2
     absorb = _residual_operator(linear, mesh, response)
@@ -183,7 +190,8 @@ def differences(
     again = images.filtered(chosen)._replace(weight=weight, noise_updated=True)
     # where the residual is smaller than expected, so is the motion that would make it
     unresolved = unresolved * amplitudes["unresolved"] * local.clamp(max=1.0)
-    return Differences(again, unresolved, amplitudes)
+    through = amplitudes.get("through the plane", 0.0)
+    return Differences(again, unresolved, _of_fronts(linear, through, template), amplitudes)
 
 
 def _spectrum(
@@ -234,6 +242,47 @@ def _drawn(
     if mesh.dims == 2:
         kinds["through the plane"] = textured(_density_of_displaced(wave, texture), 3)
     return kinds
+
+
+def _of_fronts(linear: Linear, through: float, template: int) -> torch.Tensor:
+    """Covariance of the displacement by motion through the plane where structure is in fronts, px^2.
+
+    In isotropic texture the differences m by motion through the plane are independent of the slopes
+    s in the plane, and many of them are averaged. A front's slopes have one direction in space: m
+    is proportional to s, all along the front, and a fit takes it for motion. With the structure
+    tensor T of the slopes about a place and its eigenvalues l1 > l2, the fraction
+    c = ((l1 - l2) / (l1 + l2))^2 of the structure is in fronts (the coherence, Jaehne 1993,
+    Spatio-Temporal Image Processing), and m = |s| a of a displacement a makes the error
+    T^-1 <s m> at most, of covariance a^2 c l1 T^-1: in the direction along the front it is larger
+    by l1 / l2.
+
+    Parameters
+    ----------
+    linear : Linear
+    through : float
+        Variance of the displacement by motion through the plane, px^2.
+    template : int
+        px, standard deviation of the Gaussian mean.
+
+    Returns
+    -------
+    torch.Tensor, shape (components, components, ...)
+        0 in volumes, where all motion is seen.
+    """
+    slope = working(linear.slope)
+    if len(slope) > 2:
+        return slope.new_zeros(3, 3, *slope.shape[1:])
+    zz, yy, zy = (
+        averaged(one, linear.valid, template)
+        for one in (slope[0].square(), slope[1].square(), slope[0] * slope[1])
+    )
+    half = (zz + yy) / 2
+    radius = ((zz - yy).square() / 4 + zy.square()).sqrt()
+    # where there is no slope the posterior is the prior
+    weak = (half - radius).clamp(min=_LEAST_ISOTROPY * half).clamp(min=1e-300)
+    strong = half + radius
+    adjugate = torch.stack([torch.stack([yy, -zy]), torch.stack([-zy, zz])])
+    return through * (radius / half.clamp(min=1e-300)).square() * adjugate / weak
 
 
 def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:

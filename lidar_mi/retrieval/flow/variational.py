@@ -165,6 +165,7 @@ def variational_and_flow(
     prior: Prior | None = None
     posterior: Posterior | None = None
     unresolved = torch.zeros(windows.shape).to(like)
+    fronts = unresolved.expand(windows.dims, windows.dims, *windows.shape)
     levels = zip(settings.knots, settings.rounds, settings.noise_rounds, strict=True)
     for knots, rounds, noise_rounds in levels:
         axes = [Axis(n, max(2.0, knots * windows.template)) for n in windows.shape]
@@ -185,7 +186,7 @@ def variational_and_flow(
                 found = differences(
                     images, linear, mesh, coefficients, prior, windows.template, response
                 )
-                images, unresolved = found.images, found.unresolved
+                images, unresolved, fronts = found.images, found.unresolved, found.fronts
                 in_single = images.single()
             linear = linearised(in_single, single, coefficients.float(), settings)
             posterior = solve(linear, single, coefficients, prior, settings, iteration)
@@ -202,10 +203,10 @@ def variational_and_flow(
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
-    # what the splines do not resolve is not in the posterior
+    # what splines do not resolve, and fronts through the plane, are not in the posterior
     eye = torch.eye(windows.dims).to(covariance)
-    finer = interpolated(unresolved.to(like), pixels, centres).to(covariance)
-    additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
+    finer = eye.reshape(*eye.shape, *[1] * windows.dims) * unresolved
+    additional = interpolated((finer + fronts).to(like), pixels, centres).to(covariance)
     covariance = covariance + additional
     result = result._replace(covariance=covariance)
     if windows.dims > 2:
