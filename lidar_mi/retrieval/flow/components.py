@@ -28,7 +28,6 @@ from lidar_mi.retrieval.images.band_limit import (
     shell_means,
     wavenumbers,
 )
-from lidar_mi.retrieval.images.intensity import rms
 from lidar_mi.retrieval.images.spline import Spline, filter_of, spectrum_of, transform_sizes
 from lidar_mi.retrieval.images.windows import averaged, separable, working
 from lidar_mi.retrieval.reml import most_likely
@@ -48,8 +47,8 @@ _LEAST_ISOTROPY = 1e-3
 """Of the mean squares of slopes along two directions: less is rounding."""
 _LEAST_DENSITY = 1e-6
 """Of the differences, over their mean: what is less is rounding."""
-_LEAST_NOISE = 4e-3
-"""Over the rms structure of images: finer differences are of interpolation and its ringing."""
+_LEAST_MOTION = 0.015
+"""px: differences that are finer than those of this motion are of interpolation and ringing."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +162,7 @@ def differences(
     ratio = (weight * found / expected).sum(0)
     count = 1 / (weight.square() / number).sum(0).clamp(min=1e-30)
     local = squares.on_pixels(_shrunk(ratio, count, weight.sum(0) > 0.5))
-    floor = (_LEAST_NOISE * rms(images.stack)) ** 2
+    floor = _LEAST_MOTION**2 * float(working(linear.slope).square().sum(0)[valid].mean()) / mesh.dims
     level = (
         times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)
     )

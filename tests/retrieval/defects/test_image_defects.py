@@ -90,7 +90,7 @@ CHANGED = pytest.mark.xfail(strict=True, reason="2 to 14 % of the valid vectors 
     ("seed", "sort"),
     [
         (0, "mast"),
-        pytest.param(5, "border", marks=CHANGED),
+        (5, "border"),
         pytest.param(13, "scratches", marks=CHANGED),
     ],
 )

@@ -163,7 +163,6 @@ def grid(rows, columns):
     return np.meshgrid(np.arange(float(rows)), np.arange(float(columns)), indexing="ij")
 
 
-@pytest.mark.xfail(strict=True, reason="rms error of dark air is 13 % above the limit")
 def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
     """Air 20 times as bright goes out, so means and contrasts differ by more than the dark noise.
 
