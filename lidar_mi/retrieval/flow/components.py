@@ -162,10 +162,14 @@ def differences(
     ratio = (weight * found / expected).sum(0)
     count = 1 / (weight.square() / number).sum(0).clamp(min=1e-30)
     local = squares.on_pixels(_shrunk(ratio, count, weight.sum(0) > 0.5))
-    floor = _LEAST_MOTION**2 * float(working(linear.slope).square().sum(0)[valid].mean()) / mesh.dims
+    steep = float(working(linear.slope).square().sum(0)[valid].mean()) / mesh.dims
+    floor = _LEAST_MOTION**2 * steep
     level = (
         times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)
     )
+    if mesh.dims == 2:
+        # a noise that is known is there, however little the fit leaves
+        level = level.maximum(told / working(images.given_weight))
     level = level.clamp(min=max(floor, 1e-30))
     mean = float(level[valid].mean())
     weight = (mean / level).to(images.weight)
@@ -244,7 +248,7 @@ def _drawn(
 
 
 def _of_fronts(linear: Linear, through: float, template: int) -> torch.Tensor:
-    """Covariance of the displacement by motion through the plane where structure is in fronts, px^2.
+    """Covariance of the displacement of fronts by motion through the plane, px^2.
 
     In isotropic texture the differences m by motion through the plane are independent of the slopes
     s in the plane, and many of them are averaged. A front's slopes have one direction in space: m
@@ -279,7 +283,6 @@ def _of_fronts(linear: Linear, through: float, template: int) -> torch.Tensor:
     radius = ((zz - yy).square() / 4 + zy.square()).sqrt()
     # where there is no slope the posterior is the prior
     weak = (half - radius).clamp(min=_LEAST_ISOTROPY * half).clamp(min=1e-300)
-    strong = half + radius
     adjugate = torch.stack([torch.stack([yy, -zy]), torch.stack([-zy, zz])])
     return through * (radius / half.clamp(min=1e-300)).square() * adjugate / weak
 

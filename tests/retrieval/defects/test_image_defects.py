@@ -87,12 +87,7 @@ CHANGED = pytest.mark.xfail(strict=True, reason="2 to 14 % of the valid vectors 
 
 
 @pytest.mark.parametrize(
-    ("seed", "sort"),
-    [
-        (0, "mast"),
-        (5, "border"),
-        pytest.param(13, "scratches", marks=CHANGED),
-    ],
+    ("seed", "sort"), [(0, "mast"), (5, "border"), pytest.param(13, "scratches", marks=CHANGED)]
 )
 def test_thin_structure_changes_no_valid_vector(seed, sort):
     """Of valid vectors 4 to 13 % were off by three stated errors or more: parts were not found."""

@@ -85,9 +85,9 @@ def test_noise_is_that_of_the_earlier_image(images):
         validation=VectorValidation(min_texture=0),
     )
     np.testing.assert_array_equal(winds["flag"][1], pair["flag"])
-    # the residuals say that a noise of 0.5 is too large, by place and wavenumber
+    # a noise that is given counts, although the residuals say that 0.5 is too large
     of_pairs = winds["v_stderr"].median(("z", "y")) * winds["dt"]
-    assert float(of_pairs[1]) > 1.5 * float(of_pairs[0])
+    assert float(of_pairs[1]) > 3 * float(of_pairs[0])
 
 
 @pytest.mark.parametrize(
