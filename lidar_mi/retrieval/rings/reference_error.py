@@ -10,7 +10,7 @@ A change dd of the mean gap d that the light passes changes its order 2 d / wave
     v = c/2 dd/d
 
 would (Hernandez 1986, Fabry-Perot Interferometers, chapter 3, for the order;
-docs/theory/ring_analysis.md for the means over a disc). Over a disc of radius a about (s, 0), both
+docs/theory/calibration.md for the means over a disc). Over a disc of radius a about (s, 0), both
 over the pupil's radius,
 
     bow,    b 12^(1/2) (rho^2 - 1/2):   b 12^(1/2) (a^2/2 + s^2 - 1/2)
