@@ -37,15 +37,10 @@ from tests.support.experiments import sketched_figures, without_figures
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experiments").glob("*.md"))
+ACCURACY_PAGES = ("accuracy", "accuracy_doppler", "computing_time", "settings", "standard_errors")
 THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))
-PAGES = (
-    "README.md",
-    *THEORY,
-    "docs/accuracy.md",
-    "docs/user_guide.md",
-    "docs/plugins.md",
-    *EXPERIMENTS,
-)
+ACCURACY = tuple(f"docs/{name}.md" for name in ACCURACY_PAGES)
+PAGES = ("README.md", *THEORY, *ACCURACY, "docs/user_guide.md", "docs/plugins.md", *EXPERIMENTS)
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
 OPTIONAL = (
