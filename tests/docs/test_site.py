@@ -46,6 +46,12 @@ def test_pages_are_short():
     assert not long - GENERATED
 
 
+def test_no_line_begins_with_a_per_cent_sign():
+    """MyST takes it for a comment and drops the line."""
+    for page in DOCS.rglob("*.md"):
+        assert not re.findall(r"^\s*%.*", page.read_text(), re.MULTILINE), page.name
+
+
 def test_images_exist():
     for page in DOCS.rglob("*.md"):
         for image in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text()):
