@@ -41,9 +41,10 @@ validate: setup ## check against closed forms, published numbers and other progr
 		|| $(PYTHON_ENV) -m pip install -q -e ".[test]"
 	$(PYTHON_ENV) -m validation $(ARGS)
 
-docs: setup ## build the documentation as a site in site/, readable offline
-	@$(PYTHON_ENV) -c "import furo, latex2mathml, myst_parser" 2>/dev/null \
+docs: setup ## check the spelling of the documentation and build it as a site in site/, readable offline
+	@$(PYTHON_ENV) -c "import codespell_lib, furo, latex2mathml, myst_parser" 2>/dev/null \
 		|| $(PYTHON_ENV) -m pip install -q -e ".[docs]"
+	$(PYTHON_ENV) -m codespell_lib --skip "*.png,*.gif" docs README.md CONTRIBUTING.md CHANGELOG.md
 	$(PYTHON_ENV) -m sphinx -q -W --keep-going -d build/doctrees docs site $(ARGS)
 	@echo "open site/index.html"
 

@@ -49,7 +49,9 @@ def _inline(writer, node):
 
 
 def _block(writer, node):
-    writer.body.append(f'<div class="math">{_mathml(node.astext(), "block")}</div>')
+    drawn = _mathml(node.astext(), "block")
+    # wider than a small screen: the formula scrolls, not the page
+    writer.body.append(f'<div class="math-wrapper"><div class="math">{drawn}</div></div>')
     raise nodes.SkipNode
 
 

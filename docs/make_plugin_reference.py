@@ -20,7 +20,7 @@ HEAD = """\
 
 Mitsuba plugins of lidar-mi: types and parameters as in XML scenes and Python dictionaries.
 `import lidar_mi` registers them in every variant except the scalar ones. Formulas are in the
-[theory](theory.md), whole scenes in the [user guide](user_guide.md#xml-scenes).
+[theory](theory/index.md), whole scenes in the [user guide](guide/xml_scenes.md).
 
 <!-- Written by docs/make_plugin_reference.py from the docstrings in plugins/; edit those. -->
 """

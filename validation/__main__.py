@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
     folder = options.out.parent / options.out.stem
     effort = Effort(16 if options.slow else 1, folder, options.eradiate, options.purpose)
     docs = options.out.parent
-    pages = (docs / "accuracy.md", *sorted(docs.glob("experiments/*.md")))
+    pages = (*sorted(docs.glob("accuracy*.md")), *sorted(docs.glob("experiments/*.md")))
     by_hand = [hand for hand in pages if hand.exists()]
     console = Console(width=None if sys.stdout.isatty() else 140)
     found, failed = [], []

@@ -34,7 +34,7 @@ INTRODUCTION = (
     "one `vortex_fit` have ten parameters in common, and those of all seeds as much as they are "
     "alike. Bold: more than 5 points or outside 0.8 to 1.25, by more than the uncertainty, where "
     "1 % or more of the vectors are valid. Cases and reasons: "
-    "[accuracy](accuracy.md#standard-errors-where-air-changes)."
+    "[standard errors](standard_errors.md#standard-errors-where-air-changes)."
 )
 
 SCENES = Path(str(files("lidar_mi.scenes")))

@@ -35,16 +35,24 @@ from lidar_mi.rendering.phase import scatterer
 from tests.support.experiments import sketched_figures, without_figures
 
 ROOT = Path(__file__).parents[2]
+
+
+def in_order(page):
+    """Names of the table of contents of a page."""
+    (table,) = re.findall(r"^```\{toctree\}\n(?::.*\n)*\n([^`]+)```$", page, re.MULTILINE)
+    return table.split()
+
+
 DOCS = ROOT / "docs"
 EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experiments").glob("*.md"))
-PAGES = (
-    "README.md",
-    "docs/theory.md",
-    "docs/accuracy.md",
-    "docs/user_guide.md",
-    "docs/plugins.md",
-    *EXPERIMENTS,
+ACCURACY_PAGES = ("accuracy", "accuracy_doppler", "computing_time", "settings", "standard_errors")
+GUIDE = tuple(
+    f"docs/guide/{name}.md"
+    for name in ("index", *in_order((DOCS / "guide" / "index.md").read_text()))
 )
+THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))
+ACCURACY = tuple(f"docs/{name}.md" for name in ACCURACY_PAGES)
+PAGES = ("README.md", *THEORY, *ACCURACY, *GUIDE, "docs/plugins.md", *EXPERIMENTS)
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
 OPTIONAL = (
@@ -193,7 +201,7 @@ def _unit(field):
 def documented():
     """Rows of the guide's tables of keys: key to (unit, default, allowed)."""
     rows = {}
-    for line in (DOCS / "user_guide.md").read_text().splitlines():
+    for line in "".join((ROOT / page).read_text() for page in GUIDE).splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 5 and re.fullmatch(r"`[a-z_.]+`", cells[0]):
             assert cells[0][1:-1] not in rows, f"{cells[0]} twice"
@@ -385,7 +393,7 @@ def check_xml(block):
 def test_a_file_name_stands_for_one_text():
     """A reader who follows one page must not write over the files of another recipe."""
     texts = {}
-    for page in ("docs/user_guide.md", "docs/theory.md", "README.md"):
+    for page in (*GUIDE, *THEORY, "README.md"):
         for block in blocks(page):
             if block.file:
                 first = texts.setdefault(block.file, block)
@@ -393,7 +401,7 @@ def test_a_file_name_stands_for_one_text():
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("pages", [["docs/theory.md"], ["docs/user_guide.md", "README.md"]])
+@pytest.mark.parametrize("pages", [THEORY, (*GUIDE, "README.md")])
 def test_printed_code_runs(pages, workplace, capsys):
     """Block by block, as a reader would: files written by one are there for the next.
 
@@ -420,7 +428,7 @@ def test_printed_code_runs(pages, workplace, capsys):
             with without_figures():
                 exec(code, {"__name__": "__docs__"})  # that is the test
         else:
-            assert block.language == "math", f"{block.place}: {block.language!r}"
+            assert block.language in ("math", "{toctree}"), f"{block.place}: {block.language!r}"
 
 
 @pytest.mark.usefixtures("variant")

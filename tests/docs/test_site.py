@@ -1,8 +1,8 @@
 """The documentation as a site.
 
-Detects a page that the site lists but does not have, or has but does not list, an image or link
-that leads nowhere, a formula that is left as its source, and styled letters that browsers would
-draw plain.
+Detects a page that the site lists but does not have, or has but does not list, a page too long to
+be read at once, an image or link that leads nowhere, a formula that is left as its source, and
+styled letters that browsers would draw plain.
 """
 
 import importlib.util
@@ -16,6 +16,8 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 NEEDED = ("sphinx", "myst_parser", "furo", "latex2mathml")
+MOST_LINES = 300
+GENERATED = {"plugins.md", "validation.md"}
 missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
 with_sphinx = pytest.mark.skipif(bool(missing), reason=f"no {', '.join(missing)}: extra docs")
 
@@ -32,6 +34,22 @@ def listed(page):
 def test_every_page_is_listed_and_there():
     found = sorted(listed(DOCS / "index.md"))
     assert found == sorted(set(DOCS.rglob("*.md")) - {DOCS / "index.md"})
+
+
+def test_pages_are_short():
+    """Pages of tables that a program writes aside."""
+    lines = {
+        str(page.relative_to(DOCS)): len(page.read_text().splitlines())
+        for page in DOCS.rglob("*.md")
+    }
+    long = {name for name, number in lines.items() if number > MOST_LINES}
+    assert not long - GENERATED
+
+
+def test_no_line_begins_with_a_per_cent_sign():
+    """MyST takes it for a comment and drops the line."""
+    for page in DOCS.rglob("*.md"):
+        assert not re.findall(r"^\s*%.*", page.read_text(), re.MULTILINE), page.name
 
 
 def test_images_exist():
@@ -65,8 +83,9 @@ def test_site_is_built_without_a_warning(tmp_path):
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    theory = (tmp_path / "site" / "theory.html").read_text()
-    assert theory.count("<math ") > 500 and "merror" not in theory
+    theory = [page.read_text() for page in (tmp_path / "site" / "theory").glob("*.html")]
+    assert sum(page.count("<math ") for page in theory) > 500
+    assert not any("merror" in page for page in theory)
     # no script or style from elsewhere: it opens offline
-    for page in (tmp_path / "site").glob("*.html"):
+    for page in (tmp_path / "site").rglob("*.html"):
         assert not re.search(r'(?:src|href)="https?://[^"]+\.(?:js|css)', page.read_text())

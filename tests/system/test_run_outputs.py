@@ -77,7 +77,7 @@ def test_the_record_is_an_experiment_file(demo):
 
 
 def test_every_variable_of_the_winds_is_in_the_user_guide(demo):
-    guide = (Path(__file__).parents[2] / "docs" / "user_guide.md").read_text()
+    guide = (Path(__file__).parents[2] / "docs" / "guide" / "outputs.md").read_text()
     table = guide[guide.index("`wind.nc`, CF") :].partition("\n`source` ")[0]
     listed = set(re.findall(r"`(\w+)`", "".join(re.findall(r"(?m)^\|([^|]*)\|", table))))
     with xr.open_dataset(demo.folder / "wind.nc") as winds:

@@ -1,6 +1,6 @@
 """Settings of the band limit of images and volumes, frozen.
 
-How much the errors change where a field is halved or doubled is in ``docs/accuracy.md``, measured
+How much the errors change where a field is halved or doubled is in ``docs/settings.md``, measured
 by ``python -m benchmarks settings``.
 """
 

@@ -9,8 +9,9 @@ A change dd of the mean gap d that the light passes changes its order 2 d / wave
 
     v = c/2 dd/d
 
-would (Hernandez 1986, Fabry-Perot Interferometers, chapter 3, for the order; docs/theory.md for the
-means over a disc). Over a disc of radius a about (s, 0), both over the pupil's radius,
+would (Hernandez 1986, Fabry-Perot Interferometers, chapter 3, for the order;
+docs/theory/calibration.md for the means over a disc). Over a disc of radius a about (s, 0), both
+over the pupil's radius,
 
     bow,    b 12^(1/2) (rho^2 - 1/2):   b 12^(1/2) (a^2/2 + s^2 - 1/2)
     wedge,  2 w x:                      2 w s

@@ -437,7 +437,8 @@ def test_uniform_wind_is_known_to_the_mean_of_all_lines():
 def test_a_vortex_pair():
     """The paper's conclusion: u from lines and images together; v and w of lines are useless.
 
-    Lamb-Oseen vortices with 2 m/s of axial flow in their cores, errors as in docs/accuracy.md.
+    Lamb-Oseen vortices with 2 m/s of axial flow in their cores, errors as in
+    docs/accuracy_doppler.md.
     """
     random = np.random.default_rng(0)
     y, z = np.arange(-40, 40.1, 1.0), np.arange(-28, 28.1, 1.0)
