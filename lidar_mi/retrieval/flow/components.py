@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from lidar_mi.retrieval.images.band_limit import (
     shell_means,
     wavenumbers,
 )
-from lidar_mi.retrieval.images.spline import Spline, filter_of, spectrum_of, transform_sizes
+from lidar_mi.retrieval.images.spline import Spline, filter_of, finite, spectrum_of, transform_sizes
 from lidar_mi.retrieval.images.windows import averaged, separable, working
 from lidar_mi.retrieval.reml import most_likely
 
@@ -43,8 +43,8 @@ _REGION = 8
 """Standard deviation of the Gaussian mean of the squares, and the separation of its places, px."""
 _TAPER = 4.0
 """Standard deviation, px, of the Gaussian by which spectra fade next to invalid pixels."""
-_LEAST_ISOTROPY = 1e-3
-"""Of the mean squares of slopes along two directions: less is rounding."""
+_RATIO_OF_TWO = (2 - 3**0.5) ** 2
+"""Median ratio of the eigenvalues of the structure tensor of two independent slopes."""
 _LEAST_DENSITY = 1e-6
 """Of the differences, over their mean: what is less is rounding."""
 _LEAST_MOTION = 0.015
@@ -61,8 +61,6 @@ class Differences:
         With the filter and the weights by which the noise is white.
     unresolved : torch.Tensor, shape (...)
         Variance of a component of the motion that the splines do not resolve, px^2.
-    fronts : torch.Tensor, shape (components, components, ...)
-        Covariance of the displacement that motion through the plane makes of fronts, px^2.
     amplitudes : mapping of str to float
         Variance of each component over that of its unit: of the noise per squared intensity,
         2 (1 - c) / c of a fraction 1 - c^2 of the texture that is replaced, px^2 of motion through
@@ -71,7 +69,6 @@ class Differences:
 
     images: Images
     unresolved: torch.Tensor
-    fronts: torch.Tensor
     amplitudes: Mapping[str, float]
 
 
@@ -128,9 +125,7 @@ def differences(
     found = squares(regular[None])[0]
     use = squares.inside & (found > 0)
     if not bool(use.any()):
-        return Differences(
-            images, torch.zeros_like(unresolved), _of_fronts(linear, 0.0, template), {}
-        )
+        return Differences(images, torch.zeros_like(unresolved), {})
     kinds = _drawn(images, linear, mesh, unresolved, times, width)
     told = images.known_noise**2
     absorb = _residual_operator(linear, mesh, response)
@@ -193,8 +188,7 @@ def differences(
     again = images.filtered(chosen)._replace(weight=weight, noise_updated=True)
     # where the residual is smaller than expected, so is the motion that would make it
     unresolved = unresolved * amplitudes["unresolved"] * local.clamp(max=1.0)
-    through = amplitudes.get("through the plane", 0.0)
-    return Differences(again, unresolved, _of_fronts(linear, through, template), amplitudes)
+    return Differences(again, unresolved, amplitudes)
 
 
 def _spectrum(
@@ -247,44 +241,42 @@ def _drawn(
     return kinds
 
 
-def _of_fronts(linear: Linear, through: float, template: int) -> torch.Tensor:
-    """Covariance of the displacement of fronts by motion through the plane, px^2.
+def without_texture(stack: torch.Tensor, template: int) -> torch.Tensor:
+    """Where images in a plane have less than two independent structures in a template.
 
-    In isotropic texture the differences m by motion through the plane are independent of the slopes
-    s in the plane, and many of them are averaged. A front's slopes have one direction in space: m
-    is proportional to s, all along the front, and a fit takes it for motion. With the structure
-    tensor T of the slopes about a place and its eigenvalues l1 > l2, the fraction
-    c = ((l1 - l2) / (l1 + l2))^2 of the structure is in fronts (the coherence, Jaehne 1993,
-    Spatio-Temporal Image Processing), and m = |s| a of a displacement a makes the error
-    T^-1 <s m> at most, of covariance a^2 c l1 T^-1: in the direction along the front it is larger
-    by l1 / l2.
+    A displacement has two components, so that one structure does not tell it: its error is that of
+    the flow's prior, which is then estimated from the error. Of n independent isotropic slopes
+    the ratio t of the structure tensor's eigenvalues has the distribution of the two-dimensional
+    Wishart matrix (Muirhead 1982, Aspects of Multivariate Statistical Theory, 3.2): of two slopes
+    P(t) = 2 t^(1/2) / (1 + t), with the median (2 - 3^(1/2))^2. Counted are places where the ratio
+    is below that in most of two templates about them, and all where that holds of most: what the
+    flow is elsewhere depends on the prior.
 
     Parameters
     ----------
-    linear : Linear
-    through : float
-        Variance of the displacement by motion through the plane, px^2.
+    stack : torch.Tensor, shape (images, z, y)
+        Not filtered: after the filter the least rounding may be as large as the texture.
     template : int
-        px, standard deviation of the Gaussian mean.
+        px, twice the standard deviation of the Gaussian mean of the tensor.
 
     Returns
     -------
-    torch.Tensor, shape (components, components, ...)
-        0 in volumes, where all motion is seen.
+    torch.Tensor of bool, shape (z, y)
     """
-    slope = working(linear.slope)
-    if len(slope) > 2:
-        return slope.new_zeros(3, 3, *slope.shape[1:])
-    zz, yy, zy = (
-        averaged(one, linear.valid, template)
-        for one in (slope[0].square(), slope[1].square(), slope[0] * slope[1])
+    valid = stack.isfinite().all(0)
+    slopes = torch.gradient(finite(working(stack)), dim=(1, 2))
+    # structure tensor, in the mean of the images
+    zz, zy, yy = (
+        averaged((one * other).mean(0), valid, 0.5 * template)
+        for one, other in combinations_with_replacement(slopes, 2)
     )
-    half = (zz + yy) / 2
     radius = ((zz - yy).square() / 4 + zy.square()).sqrt()
-    # where there is no slope the posterior is the prior
-    weak = (half - radius).clamp(min=_LEAST_ISOTROPY * half).clamp(min=1e-300)
-    adjugate = torch.stack([torch.stack([yy, -zy]), torch.stack([-zy, zz])])
-    return through * (radius / half.clamp(min=1e-300)).square() * adjugate / weak
+    strong, weak = (zz + yy) / 2 + radius, (zz + yy) / 2 - radius
+    # what is less than the least motion of the mean slope is no structure
+    none = strong < _LEAST_MOTION**2 * strong[valid].mean()
+    single = working(none | (weak < _RATIO_OF_TWO * strong))
+    bare = averaged(single, valid, 2 * template) > 0.5
+    return bare | (bare[valid].double().mean() > 0.5)
 
 
 def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:

@@ -13,14 +13,14 @@ import torch
 from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.flow import direct, iterative, strips
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.flow.components import differences
+from lidar_mi.retrieval.flow.components import differences, without_texture
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import check_between
+from lidar_mi.retrieval.images.quality import Flag, check_between
 from lidar_mi.retrieval.images.windows import Windows, image_pair, working
 
 
@@ -165,7 +165,6 @@ def variational_and_flow(
     prior: Prior | None = None
     posterior: Posterior | None = None
     unresolved = torch.zeros(windows.shape).to(like)
-    fronts = unresolved.expand(windows.dims, windows.dims, *windows.shape)
     levels = zip(settings.knots, settings.rounds, settings.noise_rounds, strict=True)
     for knots, rounds, noise_rounds in levels:
         axes = [Axis(n, max(2.0, knots * windows.template)) for n in windows.shape]
@@ -186,7 +185,7 @@ def variational_and_flow(
                 found = differences(
                     images, linear, mesh, coefficients, prior, windows.template, response
                 )
-                images, unresolved, fronts = found.images, found.unresolved, found.fronts
+                images, unresolved = found.images, found.unresolved
                 in_single = images.single()
             linear = linearised(in_single, single, coefficients.float(), settings)
             posterior = solve(linear, single, coefficients, prior, settings, iteration)
@@ -203,16 +202,19 @@ def variational_and_flow(
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
-    # what splines do not resolve, and fronts through the plane, are not in the posterior
+    # what the splines do not resolve is not in the posterior
     eye = torch.eye(windows.dims).to(covariance)
-    finer = eye.reshape(*eye.shape, *[1] * windows.dims) * unresolved
-    additional = interpolated((finer + fronts).to(like), pixels, centres).to(covariance)
+    finer = interpolated(unresolved.to(like), pixels, centres).to(covariance)
+    additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
     covariance = covariance + additional
     result = result._replace(covariance=covariance)
     if windows.dims > 2:
         return result, None
-    result = result._replace(flag=result.flag | unskilled(result.d, covariance))
-    if not (keep and isinstance(posterior, direct.Posterior)):
+    bare = without_texture(images.stack, windows.template).to(like)
+    bare = interpolated(bare, pixels, centres) > 0.5
+    flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * bare).short()
+    result = result._replace(flag=flag)
+    if bare.double().mean() > 0.5 or not (keep and isinstance(posterior, direct.Posterior)):
         return result, None
     return result, flow_of(posterior, linear, images, before, additional, windows, settings)
 
