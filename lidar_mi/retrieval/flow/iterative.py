@@ -31,6 +31,8 @@ class Posterior(NamedTuple):
     settings : VariationalSettings
     iteration : int
         Seeds the draws.
+    response : None
+        See `variational.Posterior`: of volumes it would take a solution for every random field.
     """
 
     coefficients: torch.Tensor
@@ -39,6 +41,7 @@ class Posterior(NamedTuple):
     single: Prior
     settings: VariationalSettings
     iteration: int
+    response: None = None
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow."""

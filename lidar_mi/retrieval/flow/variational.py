@@ -13,7 +13,7 @@ import torch
 from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.flow import direct, iterative, strips
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.flow.components import differences, without_texture
+from lidar_mi.retrieval.flow.components import Response, differences, without_texture
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
@@ -30,6 +30,10 @@ class Posterior(Protocol):
     @property
     def coefficients(self) -> torch.Tensor:
         """Of the splines, (components, knots ...)."""
+
+    @property
+    def response(self) -> Response | None:
+        """Change of the coefficients by a gradient of the log-likelihood, if it is affordable."""
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow."""
@@ -181,9 +185,8 @@ def variational_and_flow(
         for iteration in range(rounds):
             if posterior is not None and iteration in noise_rounds:
                 linear = linearised(images, mesh, coefficients, settings)
-                response = getattr(posterior, "response", None)
                 found = differences(
-                    images, linear, mesh, coefficients, prior, windows.template, response
+                    images, linear, mesh, coefficients, prior, windows.template, posterior.response
                 )
                 images, unresolved = found.images, found.unresolved
                 in_single = images.single()
