@@ -5,10 +5,9 @@ have the shape (height, width).
 """
 
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 from pydantic import Field
 
@@ -17,6 +16,9 @@ from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
 from lidar_mi.units import Angle, Length, Number, Within
+
+if TYPE_CHECKING:
+    import torch
 
 # Two Gauss-Legendre points average a pixel to fourth order.
 _NODES = {1: (0.0,), 2: (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))}
@@ -163,7 +165,7 @@ def fringe_image(
     photons: float = 2.4e7,
     counted: str = "detected",
     subsamples: int = 2,
-) -> torch.Tensor:
+) -> "torch.Tensor":
     """Expected photons of every pixel, without noise or background.
 
     The width of the line is that at the centre of the rings: too large by 1 - cos(theta), 1e-4 in
@@ -243,8 +245,10 @@ def ring_radii(
 
 def _passed(
     camera: FringeCamera, etalon: Etalon, line: Line, speeds: np.ndarray, subsamples: int
-) -> tuple[torch.Tensor, float]:
+) -> "tuple[torch.Tensor, float]":
     """Light behind the etalon (N, height, width), and the sum of what came."""
+    import torch
+
     if subsamples not in _NODES:
         raise InputError(f"subsamples: {subsamples!r} is not allowed; expected 1 or 2")
     nodes = _NODES[subsamples]
