@@ -62,7 +62,8 @@ _BAD_UNIT = (
 
 
 @functools.cache
-def _registry() -> "pint.UnitRegistry[float]":
+def registry() -> "pint.UnitRegistry[float]":
+    """All units that pint knows; made on first use."""
     import pint
 
     return pint.UnitRegistry()
@@ -98,7 +99,7 @@ def to_si(value: object, unit: str, example: str) -> float:
     factor = _FACTORS.get(unit, {}).get(re.sub(r" */ *", "/", text))
     if factor is not None:
         return number * factor
-    units = _registry()
+    units = registry()
     from pint import PintError
 
     try:
@@ -274,7 +275,7 @@ def usual_unit(number: float, unit: str) -> tuple[float, str]:
     if unit == "rad" and _in_degrees(number):
         return 180 / math.pi, "deg"
     if number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
-        found = _registry().Quantity(number, unit).to_compact()
+        found = registry().Quantity(number, unit).to_compact()
         return float(found.magnitude) / number, f"{found.units:~}"
     return 1.0, unit
 
@@ -312,7 +313,7 @@ def shown(number: float, unit: str) -> str:
         return number.text
     factor = _OF_UNIT.get(unit)
     if factor is None:
-        factor = _registry().Quantity(1.0, unit).to_base_units().magnitude
+        factor = registry().Quantity(1.0, unit).to_base_units().magnitude
     return f"{number / factor:.4g} {unit}"
 
 
@@ -332,7 +333,7 @@ def parse_units(text: str) -> "pint.Quantity[float]":
     products = re.sub(r"(?<=[^\W_])\.(?=[^\W\d_])", "*", text)
     powers = re.sub(r"(?<![\w.])([^\W\d_]+)\^?(-?\d+)(?!\w)", r"\1**\2", products)
     try:
-        units = _registry()
+        units = registry()
         return 1.0 * units.parse_expression(_bounded(powers or "1")) * units.dimensionless
     except Exception as error:  # pint lets its tokenizer's own exceptions through
         raise ValueError(f"{text!r} is not a unit") from error

@@ -77,7 +77,7 @@ OPENS = {
     "assessment/report/campaign.py": "its own script, a resource of the package",
     "assessment/report/page.py": "its own script, a resource of the package",
     "experiment/log.py": "the log, line by line",
-    "experiment/folder/run_folder.py": "checksums of what a run depends on",
+    "experiment/folder/records.py": "checksums of what a run depends on",
     "system/doctor.py": "a file of its own in a program that it tries",
     "system/llvm.py": "/proc",
     "system/memory.py": "/proc, /sys/fs/cgroup",

@@ -75,7 +75,7 @@ def _run_study(
 ) -> None:
     """Variants of one experiment, each in its own folder, and their comparison."""
     from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment.folder.run_folder import read_answer
+    from lidar_mi.experiment.folder.records import read_answer
 
     first, experiment = next(iter(variants.items()))
     name = experiment.name.removesuffix(f".{first}")

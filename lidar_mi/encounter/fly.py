@@ -19,7 +19,7 @@ from lidar_mi.encounter.preview import Lidar
 from lidar_mi.encounter.report import answer, write_report
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError, is_interrupt
-from lidar_mi.experiment.folder.run_folder import REPORT
+from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import load_experiment

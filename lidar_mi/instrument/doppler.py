@@ -200,11 +200,9 @@ def filtered_coherence_time(line: Line, transmission: Callable[[np.ndarray], np.
 
 def _behind_etalon(etalon: Etalon, line: Line, order: float) -> Callable[[np.ndarray], np.ndarray]:
     """Transmission as a function of the frequency, in the place of a fractional order."""
-    import torch
-
     amplitudes = harmonics(etalon, line.wavelength)
     spectral_range = etalon.free_spectral_range(line.wavelength)
-    return lambda nu: series(amplitudes, torch.from_numpy(order + nu / spectral_range)).numpy()
+    return lambda nu: series(amplitudes, order + nu / spectral_range)
 
 
 def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line: Line) -> float:

@@ -12,7 +12,7 @@ The Mitsuba plugin `etalon` computes the same transmission ray by ray; tests com
 """
 
 import math
-from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -23,9 +23,6 @@ from lidar_mi.atmosphere.line import Line
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.units import Length, Number, Within
-
-if TYPE_CHECKING:
-    import torch
 
 POLARIZATIONS = ("s", "p")
 # Transmittance below which a mirror counts as opaque: even lossless, it would transmit no photon of
@@ -235,13 +232,10 @@ def harmonics(
     return amplitudes[: max(2, np.count_nonzero(remainder > 1e-12 * remainder[0]))]
 
 
-def series(amplitudes: np.ndarray, order: "torch.Tensor") -> "torch.Tensor":
+def series(amplitudes: np.ndarray, order: ArrayLike) -> np.ndarray:
     """A_0 + 2 Re sum A_n exp(2 pi i n m) at the orders ``m``, by Horner's rule in float64."""
-    import torch
-
-    phase = 2 * math.pi * order.double()
-    z = torch.polar(torch.ones_like(phase), phase)
-    total = torch.zeros_like(z)
+    z = np.exp(2j * math.pi * np.asarray(order, float))
+    total = np.zeros_like(z)
     # without A_0, which is not doubled
     for amplitude in amplitudes[:0:-1].tolist():
         total += amplitude
@@ -267,10 +261,8 @@ def transmission(
     line : lidar_mi.atmosphere.line.Line, optional
         Average over this line, shifted by ``offset``; default: monochromatic light.
     """
-    import torch
-
     order = fractional_order(etalon, wavelength, cosine, offset)
-    return series(harmonics(etalon, wavelength, line), torch.as_tensor(order)).numpy()
+    return series(harmonics(etalon, wavelength, line), order)
 
 
 def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> float:
@@ -281,12 +273,10 @@ def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> floa
     InputError
         Fringes so broad that they nowhere fall to half their height.
     """
-    import torch
-
     amplitudes = harmonics(etalon, wavelength, line)
 
     def above_half(order: float) -> float:
-        both = series(amplitudes, torch.tensor([order, 0.0], dtype=torch.float64))
+        both = series(amplitudes, [order, 0.0])
         return float(both[0] - both[1] / 2)
 
     if above_half(0.5) >= 0:

@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import dask
 import h5py
 import numpy as np
 import xarray as xr
@@ -276,6 +275,8 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     InputError
         As of `write_atomically`.
     """
+    import dask
+
     packed: dict[Any, dict[str, Any]]
     packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
     # CF 2.5.1: no missing values in coordinate variables

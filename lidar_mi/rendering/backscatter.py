@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import xarray as xr
 
@@ -19,7 +17,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.io.exr import label_scan, unpack
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.memory import samples_at_once
-from lidar_mi.rendering.phase import Molecules
+from lidar_mi.rendering.phase import Molecules, loadable
 from lidar_mi.rendering.settings import RenderSettings
 
 MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
@@ -118,7 +116,7 @@ def render_scans(
     environment : float
         Extinction coefficient around the slab and up to it, m^-1.
     phase : dict
-        Mitsuba phase function of slab and environment.
+        Mitsuba phase function of slab and environment, also with a table as an array.
     albedo : float
         Single-scattering albedo of slab and environment.
     seed : int
@@ -178,6 +176,8 @@ class ScanRenderer:
         settings: RenderSettings,
         molecules: Molecules | None = None,
     ) -> None:
+        import mitsuba as mi
+
         air = (environment, phase, albedo, settings, molecules)
         self._scene = mi.load_dict(scene_dict(extinction, plan, lidar, *air))
         self._parameters = mi.traverse(self._scene)
@@ -203,6 +203,9 @@ class ScanRenderer:
         batches : Batches, optional
             Store of the samples while they are rendered.
         """
+        import drjit as dr
+        import mitsuba as mi
+
         _move(self._parameters, extinction, plan, self._albedo, self._molecules)
         integrator = self._scene.integrator()
         integrator.progress, integrator.batches = progress, batches
@@ -229,6 +232,8 @@ def scene_dict(
     molecules: Molecules | None = None,
 ) -> dict[str, Any]:
     """The Mitsuba scene of one scan as a dictionary for ``mi.load_dict``."""
+    import mitsuba as mi
+
     samples = settings.without_detector(plan.gate_count)
     low, high = _box(extinction)
     place = mi.ScalarTransform4f().translate(low).scale(high - low)
@@ -240,6 +245,7 @@ def scene_dict(
         grid = mi.VolumeGrid(_voxels(field))
         return {"type": "gridvolume", "grid": grid, "to_world": place, "accel": False}
 
+    phase = loadable(phase)
     around = within = {"albedo": albedo, "phase": phase}
     if molecules:
         both, fraction = _mixed(xr.DataArray(environment), albedo, molecules)
@@ -324,6 +330,8 @@ def _move(
     molecules: Molecules | None,
 ) -> None:
     """Update the telescope, its beams and the air in the slab to a later scan."""
+    import mitsuba as mi
+
     parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
     beams = _beams(plan)
     parameters["sensor.origins"] = mi.Float(beams[:, :3].ravel())
@@ -387,6 +395,8 @@ def _as_dataset(
     seed: int,
 ) -> xr.Dataset:
     """The rendered tensor (rows from the top, y falling) as a labelled dataset."""
+    import mitsuba as mi
+
     variables = unpack(image, names, plan.gate_count)
     y = attenuated_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
     variables["Y"] = (("z", "y"), y[0].astype(np.float32))

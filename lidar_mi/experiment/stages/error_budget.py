@@ -41,10 +41,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.retrieval.images.common_grid import resample_pair
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.synchronised import synchronised
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
@@ -149,6 +146,8 @@ def _budgets(
     known : xr.Dataset, optional
         Winds that need not be retrieved again, from `cross_flow_winds`.
     """
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     plans = sensor.plans(truth)
     images, blurred = _images(sensor, truth, flows, plans, scans)
     cores = find_cores(truth.wind) if cores is None else cores
@@ -302,6 +301,9 @@ def _without_noise(
     blurred: bool = True,
 ) -> tuple[list[xr.DataArray], Times]:
     """The air as both scans see it, and the times of pixels where they are of their own air."""
+    from lidar_mi.retrieval.images.common_grid import resample_pair
+    from lidar_mi.retrieval.wind.synchronised import synchronised
+
     scan = sensor.scan
     depth = scan.thickness / scan.gate_count
     lidar = sensor.lidar if blurred else None

@@ -21,7 +21,6 @@ from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.settings import RenderSettings
-from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 
 def simulation_noise(
@@ -52,6 +51,8 @@ def simulation_noise(
         where the noise has no more than ``render.monte_carlo_fraction`` of the detector's
         variance: neither has it then of the wind's.
     """
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     fraction = max(one.attrs.get("monte_carlo_fraction", np.inf) for one in detected)
     if fraction <= render.monte_carlo_fraction:
         return None

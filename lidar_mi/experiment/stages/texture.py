@@ -14,7 +14,6 @@ from lidar_mi.experiment.truth.extinction import true_air
 from lidar_mi.experiment.truth.flows import Flows, advection_by
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Relative rms of the texture."""
@@ -38,6 +37,8 @@ def texture_sweep(
         ``rmse_v``, ``rmse_w`` (m s^-1) over every vector with a displacement, NaN where there is
         none; ``valid_fraction``.
     """
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     points, advected = [], advection_by(wake, platform, scan, volume, flows)
     for index, rms in enumerate(LEVELS):
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))

@@ -10,6 +10,7 @@ import torch
 from torch.nn.functional import pad
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.images.window_sizes import check_window_sizes
 
 # Working memory of one tile of windows. Small enough to stay near the cache, large enough that
 # the cost of a call is negligible.
@@ -60,22 +61,7 @@ class Windows:
     stride: int = 1
 
     def __post_init__(self) -> None:
-        image = self.dims == 2
-        unit = "px" if image else "voxels"
-        lowest = {"template": 2 if image else 4, "search": self.template + 2, "stride": 1}
-        for name, low in lowest.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                allowed = "template + 2" if name == "search" else low
-                raise InputError(f"{name}: {value!r} {unit} is not an integer >= {allowed}")
-        if min(self.shape) < self.inner:
-            sizes = " x ".join(map(str, self.shape))
-            raise InputError(
-                f"search: {self.search} px does not fit into the image of {sizes} (z x y) px"
-                if image
-                else f"template: {self.template} voxels do not fit into the volume of {sizes} "
-                "(x, z, y); expected at least as many voxels (gates along x) in every direction"
-            )
+        check_window_sizes(self.shape, self.template, self.search, self.stride)
 
     @property
     def dims(self) -> int:
