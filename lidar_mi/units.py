@@ -40,7 +40,13 @@ _FACTORS = {
 }
 """Multiples of SI units that experiments are written in; pint, which takes a fifth of a second to
 be loaded, reads all others."""
-_OF_UNIT = {text: factor for multiples in _FACTORS.values() for text, factor in multiples.items()}
+# not of bytes, whose base unit is the bit for pint
+_OF_UNIT = {
+    text: factor
+    for unit, multiples in _FACTORS.items()
+    if unit != "byte"
+    for text, factor in multiples.items()
+}
 # one number, then a unit: pint alone reads "0,1 m" as 1 m and "500 m 3" as 1500 m
 _TEXT = re.compile(r"""([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan))\s*([^\n,;#"']*)""")
 # A unit's text as far as pint gets to see it: pint computes what it reads, 9**9**9 for ever.

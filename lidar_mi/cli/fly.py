@@ -58,7 +58,6 @@ def fly(
 
     Writes the flights and the track (NetCDF), metrics (JSON), figures, an animation and a report.
     """
-    from lidar_mi.encounter.fly import fly as start
     from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
@@ -75,6 +74,9 @@ def fly(
         )
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
+        notice(f"starting {loaded.name}", None)
+        from lidar_mi.encounter.fly import fly as start
+
         done = start(loaded, folder, overwrite=overwrite, processes=processes, notice=notice)
     print_answer(done.answer)
     for table in done.tables()[1:]:

@@ -1,6 +1,6 @@
 """``lidar-mi run``: run an experiment."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,10 +36,6 @@ def run(
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped is resumed with the images it has.
     """
-    from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment import study
-    from lidar_mi.experiment.folder.run_folder import RESULTS
-    from lidar_mi.experiment.run import run as start
     from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
@@ -49,11 +45,16 @@ def run(
         sections = {"render": loaded.wake, "doppler.render": loaded.doppler}
         changes += [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
     if variants:
-        _run_study(reading.load_variants(path, changes), out, path, overwrite, study.run)
+        _run_study(reading.load_variants(path, changes), out, path, overwrite)
         return
     loaded = reading.load(path, changes)
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
+        notice(f"starting {loaded.name}", None)
+        from lidar_mi.assessment.report.summary import summary
+        from lidar_mi.experiment.folder.run_folder import RESULTS
+        from lidar_mi.experiment.run import run as start
+
         done = start(loaded, folder, beside=path.parent, overwrite=overwrite, notice=notice)
     print_answer(done.answer)
     for table in summary(done.metrics, _averaged(loaded)):
@@ -67,20 +68,18 @@ def run(
 
 
 def _run_study(
-    variants: Mapping[str, "Experiment"],
-    out: Path | None,
-    path: Path,
-    overwrite: bool,
-    start: Callable[..., Mapping[str, Mapping[str, float]]],
+    variants: Mapping[str, "Experiment"], out: Path | None, path: Path, overwrite: bool
 ) -> None:
     """Variants of one experiment, each in its own folder, and their comparison."""
-    from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment.folder.records import read_answer
-
     first, experiment = next(iter(variants.items()))
     name = experiment.name.removesuffix(f".{first}")
     folder = out or Path("outputs") / name
     with progress() as notice:
+        notice(f"starting {name}", None)
+        from lidar_mi.assessment.report.summary import summary
+        from lidar_mi.experiment.folder.records import read_answer
+        from lidar_mi.experiment.study import run as start
+
         metrics = start(name, variants, folder, path.parent, overwrite, notice)
     for variant in metrics:
         output.print(f"\n{variant}", style="bold")

@@ -71,8 +71,6 @@ def sections(
     InputError
         Anything that a run would refuse before it starts.
     """
-    from lidar_mi.experiment.preflight.cost import with_number
-
     # of the processor: other programs do not lengthen it
     start = time.process_time()
     prepared = experiment.prepare(asked, search_path, without_warnings(notice))
@@ -97,6 +95,8 @@ def sections(
                 _timing(asked, call(lines_schedule, asked, search_path=prepared.search_path)),
             )
     if timed:
+        from lidar_mi.experiment.preflight.cost import with_number
+
         notice("timing a few samples and a retrieval", None)
         # with the number that is chosen already: choosing it takes pilots
         whole = with_number(asked, chosen.number) if chosen else asked
