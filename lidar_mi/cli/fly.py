@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, FlightName
+from lidar_mi.cli.options import Changes, Device, FlightName
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.shipped import experiment_file
@@ -39,6 +39,7 @@ def fly(
             "feedforward, with perfect preview."
         ),
     ] = None,
+    device: Device = None,
     set_: Changes = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a flight of a different experiment.")
@@ -61,6 +62,8 @@ def fly(
     from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
+    if device:
+        changes.append(f"device={device}")
     if mode:
         changes.append(f"encounter.control.mode={mode.value!r}")
     variants = reading.load_variants(path, changes)

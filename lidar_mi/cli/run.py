@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, RunName, Variant
+from lidar_mi.cli.options import Changes, Device, RunName, Variant
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
@@ -26,6 +26,7 @@ def run(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Run folder. Default: outputs/NAME.")
     ] = None,
+    device: Device = None,
     set_: Changes = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a run of a different experiment.")
@@ -39,6 +40,8 @@ def run(
     from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
+    if device:
+        changes.append(f"device={device}")
     variants = reading.load_variants(path, changes)
     loaded = next(iter(variants.values())) if variants else reading.load(path, changes)
     if variant:

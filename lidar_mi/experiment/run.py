@@ -14,6 +14,7 @@ from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.errors import InputError, is_interrupt
+from lidar_mi.experiment.device import devices_in_words, on_its_device
 from lidar_mi.experiment.folder.run_folder import RunFolder
 from lidar_mi.experiment.graph import Graph, Stage, Store
 from lidar_mi.experiment.log import Log, silent
@@ -101,7 +102,8 @@ def prepare(
     Returns
     -------
     Run
-        With the truth and the other results of the preflight; `complete` runs the rest.
+        On the device that the experiment asks for, with the truth and the other results of the
+        preflight; `complete` runs the rest.
 
     Raises
     ------
@@ -113,6 +115,7 @@ def prepare(
             f"encounter: {experiment.name} is a flight, not a run; expected lidar-mi fly (lm.fly)"
         )
     beside = experiment.folder if beside is None else beside
+    experiment = on_its_device(experiment)
     graph, log = stages_of(experiment), Log(notice)
     prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
     # results first: a check may take those of any stage of the preflight
@@ -159,6 +162,7 @@ def complete(
             f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
             f"seed {prepared.experiment.seed}"
         )
+        log(devices_in_words(prepared.experiment))
         try:
             finish(prepared, store)
             _report(prepared, store)

@@ -17,6 +17,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.io.exr import label_scan, unpack
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.memory import samples_at_once
+from lidar_mi.rendering.passes import within_memory
 from lidar_mi.rendering.phase import Molecules, loadable
 from lidar_mi.rendering.settings import RenderSettings
 
@@ -211,7 +212,7 @@ class ScanRenderer:
         integrator.progress, integrator.batches = progress, batches
         start = time.perf_counter()
         seed %= 2**31  # a header holds 32 bits with a sign
-        image = np.array(mi.render(self._scene, seed=seed))
+        image = within_memory(integrator, lambda: np.array(mi.render(self._scene, seed=seed)))
         dr.flush_malloc_cache()  # the buffers of the tracing are as large as the image
         names = integrator.quantities()
         scan = _as_dataset(image, names, plan, self._lidar, self._environment, self._settings, seed)
@@ -263,7 +264,9 @@ def scene_dict(
             "covariance": mi.is_polarized,
             "shares": True,
             "estimator": settings.estimator,
-            "samples_per_pass": samples_at_once(settings.samples_per_pass, settings.memory),
+            "samples_per_pass": samples_at_once(
+                settings.given_per_pass, settings.memory, mi.variant()
+            ),
         },
         "environment": {"type": "homogeneous", "sigma_t": environment, **around},
         "sensor": {
@@ -413,7 +416,7 @@ def _as_dataset(
     attributes = {
         "software": f"lidar-mi {__version__}",
         "units": "Stokes: received over emitted energy; Y: m-1 sr-1; lengths: m; angles: rad",
-        "variant": settings.variant,
+        "variant": mi.variant(),
         "polarized": int(mi.is_polarized),
         "seed": int(seed),
         "samples_per_beam": settings.without_detector(plan.gate_count),

@@ -16,6 +16,8 @@ from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.instrument.lens import singlet
 from lidar_mi.io.exr import label_fringes
 from lidar_mi.rendering.batches import Batches
+from lidar_mi.rendering.memory import samples_at_once
+from lidar_mi.rendering.passes import within_memory
 from lidar_mi.rendering.settings import FringeSettings
 
 # from the stop to the etalon, m: any distance that is large enough for a lens
@@ -115,7 +117,9 @@ def scene_dict(
         "integrator": {
             "type": "fringes",
             "estimator": settings.estimator,
-            "samples_per_pass": settings.samples_per_pass,
+            "samples_per_pass": samples_at_once(
+                settings.given_per_pass, settings.memory, mi.variant()
+            ),
         },
         "line": {
             "type": "spectral_line",
@@ -204,7 +208,7 @@ def render_image(scene: Any, samples: int = 0, seed: int = 0) -> xr.Dataset:
     import mitsuba as mi
 
     sensor, integrator = scene.sensors()[0], scene.integrator()
-    image = np.array(mi.render(scene, spp=samples, seed=seed))
+    image = within_memory(integrator, lambda: np.array(mi.render(scene, spp=samples, seed=seed)))
     layers = {name: image[..., k] for k, name in enumerate(integrator.quantities())}
     source, line = scene.environment(), scene.environment().line
     x, y = sensor.centre

@@ -50,6 +50,13 @@ cuda_ad_spectral
     mi.set_log_level(mi.LogLevel.Error)
 
 
+def has_cuda() -> bool:
+    """Whether ``cuda_*`` variants can run here: an NVIDIA GPU, and a driver that Dr.Jit takes."""
+    import drjit as dr
+
+    return bool(dr.has_backend(dr.JitBackend.CUDA))
+
+
 def check_variant(name: str) -> None:
     """Refuse a variant as `use_variant` does; Mitsuba is loaded for CUDA alone.
 

@@ -74,6 +74,7 @@ def sections(
     # of the processor: other programs do not lengthen it
     start = time.process_time()
     prepared = experiment.prepare(asked, search_path, without_warnings(notice))
+    asked = prepared.experiment
     preparation, results = time.process_time() - start, prepared.results
     chosen: Samples | None = None
     if asked.wake:

@@ -60,6 +60,7 @@ class _Sensor:
     volume: Volume | None
     seed: int
     search_path: Path
+    device: str | None = None
 
     def plans(self, truth: Truth) -> list[ScanPlan]:
         """The scans of both images."""
@@ -90,6 +91,7 @@ def error_budgets(
     retrieval: Retrieval,
     volume: Volume | None,
     seed: int,
+    device: str | None,
     flows: Flows,
     truth: Truth,
     scans: Sequence[xr.Dataset],
@@ -100,7 +102,7 @@ def error_budgets(
 ) -> dict[str, dict[str, float]]:
     """`budgets` from a run's winds, where these need not be retrieved again."""
     log("retrieving winds without each cause of error")
-    sensor = _Sensor(wake, platform, scan, lidar, detector, volume, seed, search_path)
+    sensor = _Sensor(wake, platform, scan, lidar, detector, volume, seed, search_path, device)
     return _budgets(sensor, retrieval, truth, scans, flows, log.bar, wind, cores)
 
 
@@ -153,7 +155,7 @@ def _budgets(
     cores = find_cores(truth.wind) if cores is None else cores
     methods = retrieval.methods
     dt, sizes = sensor.platform.dt, window_sizes(retrieval)
-    settings: dict[str, Any] = {"dt": dt, **window_settings(retrieval)}
+    settings: dict[str, Any] = {"dt": dt, **window_settings(retrieval, sensor.device)}
     blur = known_blur(retrieval, sensor.lidar, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if sensor.detector:

@@ -25,7 +25,7 @@ from lidar_mi.instrument.doppler import DopplerLidar, photons, solar_background,
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_values, ring_radii
 from lidar_mi.rendering.fringes import lens_surfaces, render_fringes
-from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory
+from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory, host_bytes
 from lidar_mi.rendering.settings import FringeSettings
 from lidar_mi.rendering.variant import check_variant, use_variant
 
@@ -104,12 +104,12 @@ def ring_instrument(doppler: Doppler) -> Rings:
     """
     render, pixels = doppler.render, doppler.camera.width * doppler.camera.height
     # samples are traced pass by pass
-    at_once = min(render.samples_per_pass, pixels * render.samples_per_pixel)
+    samples = host_bytes(pixels * render.samples_per_pixel, render)
     check_memory(
-        PROGRAM + PER_PIXEL * pixels + PER_SAMPLE * at_once,
+        PROGRAM + PER_PIXEL * pixels + samples,
         render.memory,
         f"doppler.camera: {doppler.camera.width} x {doppler.camera.height} pixels and "
-        f"{at_once:.3g} samples at once",
+        f"{samples / PER_SAMPLE:.3g} samples at once",
         "fewer pixels or samples_per_pass",
         "doppler.render.memory",
     )

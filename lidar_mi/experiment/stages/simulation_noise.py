@@ -31,6 +31,7 @@ def simulation_noise(
     detector: Detector | None,
     render: RenderSettings,
     retrieval: Retrieval,
+    device: str | None,
     seed: int,
     detected: Sequence[xr.Dataset],
     plans: Sequence[ScanPlan],
@@ -77,7 +78,7 @@ def simulation_noise(
             times=times,
             blur=known_blur(retrieval, lidar, plans[0]),
             standard_errors=False,
-            **window_settings(retrieval),
+            **window_settings(retrieval, device),
         )
         first = wind.sel(source=source, algorithm=method)
         valid = (found["flag"].values == 0) & (first["flag"].values == 0)

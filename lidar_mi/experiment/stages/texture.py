@@ -25,6 +25,7 @@ def texture_sweep(
     scan: Scan,
     volume: Volume | None,
     retrieval: Retrieval,
+    device: str | None,
     seed: int,
     flows: Flows,
     log: Log,
@@ -50,7 +51,7 @@ def texture_sweep(
             truth.image(1),
             dt=platform.dt,
             method=ImageMethod.CC,
-            **window_settings(retrieval),
+            **window_settings(retrieval, device),
         )
         true = truth_at_vectors(wind, truth.wind)
         v, w = (wind[name].values - true[name].values for name in ("v", "w"))

@@ -20,6 +20,7 @@ from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_pair import Pair, both, combined_noise
 from lidar_mi.experiment.stages.rendering import environment_extinction
+from lidar_mi.experiment.stages.winds import retrieval_device
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector import Detector
@@ -208,6 +209,7 @@ def volume_winds(
     platform: Platform,
     scan: Scan,
     volume: Volume,
+    device: str | None,
     flows: Flows,
     volumes: Volumes,
     log: Log,
@@ -237,6 +239,7 @@ def volume_winds(
                     windows=WindowSizes(volume.template, volume.search, volume.stride),
                     validation=VectorValidation(volume.min_correlation),
                     noise=volumes.noise[source],
+                    device=retrieval_device(device),
                 )
             )
         # attributes of single methods are not those of all

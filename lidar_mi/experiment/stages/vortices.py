@@ -16,7 +16,12 @@ from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
 from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.schema.wake import Wake
-from lidar_mi.experiment.stages.winds import common_error, pixel_times, rendered_pairs
+from lidar_mi.experiment.stages.winds import (
+    common_error,
+    pixel_times,
+    rendered_pairs,
+    retrieval_device,
+)
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
@@ -77,6 +82,7 @@ def fit_pairs(
     detector: Detector | None,
     retrieval: Retrieval,
     sensor: Sensor | None,
+    device: str | None,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
     vectors: xr.Dataset | None,
@@ -95,7 +101,7 @@ def fit_pairs(
     # as functions: a refused fit to the images must not prevent that to the vectors
     ways: dict[Origin, Callable[[], VortexPairFit]] = {
         Origin.IMAGES: lambda: fit_vortices(
-            pair[0], pair[1], platform.dt, noise, times=times
+            pair[0], pair[1], platform.dt, noise, times=times, device=retrieval_device(device)
         ).with_common_error(common, common, rotation)
     }
     if with_vectors:

@@ -51,6 +51,7 @@ def cross_flow_winds(
     lidar: BackscatterLidar,
     detector: Detector | None,
     retrieval: Retrieval,
+    device: str | None,
     truth: Truth,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
@@ -84,7 +85,10 @@ def cross_flow_winds(
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
         # the truth's images are photographs
         timed = times if source in RENDERED else None
-        bound = wind_bound(pair[0], pair[1], platform.dt, noise, window_sizes(retrieval), timed)
+        sizes = window_sizes(retrieval)
+        bound = wind_bound(
+            pair[0], pair[1], platform.dt, noise, sizes, timed, retrieval_device(device)
+        )
         methods: list[xr.Dataset] = []
         for method in retrieval.methods:
             wind = retrieve_wind(
@@ -92,7 +96,7 @@ def cross_flow_winds(
                 pair[1],
                 dt=platform.dt,
                 method=method,
-                **window_settings(retrieval),
+                **window_settings(retrieval, device),
                 noise=noise,
                 times=timed,
                 # the extinction itself has passed no instrument
@@ -256,12 +260,21 @@ def common_error(
     return pointing.stderr * distance / dt, pointing.roll / dt
 
 
-def window_settings(settings: Retrieval) -> dict[str, Any]:
-    """Sizes of windows and tests of vectors, as `retrieve_wind` takes them."""
+def retrieval_device(device: str | None) -> str:
+    """Name of torch's device, of an experiment that is on its device."""
+    return device or "cpu"
+
+
+def window_settings(settings: Retrieval, device: str | None) -> dict[str, Any]:
+    """Sizes of windows, tests of vectors and the device, as `retrieve_wind` takes them."""
     from lidar_mi.retrieval.wind.options import VectorValidation
 
     limits = settings.min_correlation, settings.min_texture, settings.min_isotropy
-    return {"windows": window_sizes(settings), "validation": VectorValidation(*limits)}
+    return {
+        "windows": window_sizes(settings),
+        "validation": VectorValidation(*limits),
+        "device": retrieval_device(device),
+    }
 
 
 def window_sizes(settings: Retrieval) -> "WindowSizes":
