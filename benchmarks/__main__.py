@@ -27,6 +27,7 @@ COMPARISONS = (
     "campaign",
     "realtime",
     "imports",
+    "gpu",
 )
 
 

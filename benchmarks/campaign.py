@@ -17,7 +17,7 @@ from lidar_mi.campaign.description import Campaign
 from lidar_mi.campaign.engine import connected, execute, prepare_campaign
 from lidar_mi.campaign.folder import Outcome, write_outcome
 from lidar_mi.campaign.points import Points
-from lidar_mi.experiment.folder.run_folder import METRICS
+from lidar_mi.experiment.folder.records import METRICS
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.run import finish, prepare
 from lidar_mi.io.json import to_json

@@ -31,13 +31,15 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
     Whether a value is in range is for the function to say.
     """
-    signature = inspect.signature(function)
+    signature, annotations = inspect.signature(function), function.__annotations__
     hints: dict[str, Any] = {}
 
     @functools.wraps(function)
     def checked(*given: P.args, **named: P.kwargs) -> R:
         if not hints:
-            hints.update(typing.get_type_hints(function))
+            asked = {name: kind for name, kind in annotations.items() if name != "return"}
+            holder = types.SimpleNamespace(__annotations__=asked)
+            hints.update(typing.get_type_hints(holder, function.__globals__))
         for name, value in signature.bind(*given, **named).arguments.items():
             expected = hints.get(name, Any)
             more = signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD

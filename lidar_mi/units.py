@@ -6,18 +6,47 @@ except angles, which must say their unit (degrees and radians are too easily con
 are shown to people as they wrote them (`Given`).
 """
 
+import functools
 import math
 import re
 import tokenize
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
-import pint
 from pydantic import GetCoreSchemaHandler, SerializationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-UNITS: pint.UnitRegistry[float] = pint.UnitRegistry()
+if TYPE_CHECKING:
+    import pint
+
+_FACTORS = {
+    "m": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180},
+    "rad/s^2": {"rad/s^2": 1.0, "deg/s^2": math.pi / 180},
+    "m/s": {"m/s": 1.0},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "J": {"J": 1.0, "mJ": 1e-3, "uJ": 1e-6},
+    "1/m": {"1/m": 1.0, "/m": 1.0, "1/km": 1e-3, "/km": 1e-3},
+    "1/m/sr": {"1/m/sr": 1.0, "/m/sr": 1.0},
+    "m^2": {"m^2": 1.0},
+    "m^2/s": {"m^2/s": 1.0},
+    "Hz": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "GHz": 1e9},
+    "K": {"K": 1.0, "mK": 1e-3},
+    "W/m^3/sr": {"W/m^2/sr/nm": 1 / 1e-9},
+    "": {"%": 1e-2},
+    "byte": {"MB": 1e6, "GB": 1e9},
+}
+"""Multiples of SI units that experiments are written in; pint, which takes a fifth of a second to
+be loaded, reads all others."""
+# not of bytes, whose base unit is the bit for pint
+_OF_UNIT = {
+    text: factor
+    for unit, multiples in _FACTORS.items()
+    if unit != "byte"
+    for text, factor in multiples.items()
+}
 # one number, then a unit: pint alone reads "0,1 m" as 1 m and "500 m 3" as 1500 m
 _TEXT = re.compile(r"""([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan))\s*([^\n,;#"']*)""")
 # A unit's text as far as pint gets to see it: pint computes what it reads, 9**9**9 for ever.
@@ -26,9 +55,8 @@ _NAME = r"(?:[^\W\d_]|[%°])[\w⁻]*+"
 _NUMBER = r"(?:\d{1,20}(?:\.\d{0,20})?|\.\d{1,20})(?:[eE][-+]?\d{1,2})?(?![\w.])"
 _POWER = r"\s*(?:\*\*|\^)\s*(?:[-+]?\d{1,2}|\([-+]?\d{1,2}\))(?![\d.]|\s*+\^|\s*+\*\*)"
 _PARTS = re.compile(rf"(?:\s*+(?:(?:{_NAME}|{_NUMBER})(?:{_POWER})?|[*·/()](?!\*)))*\s*+")
-# what pint raises, and what reaches us through it from Python's tokenizer and arithmetic
+# what reaches us through pint from Python's tokenizer and arithmetic; some of its own are these
 _BAD_UNIT = (
-    pint.PintError,
     tokenize.TokenError,
     ArithmeticError,
     AssertionError,
@@ -37,6 +65,14 @@ _BAD_UNIT = (
     TypeError,
     ValueError,
 )
+
+
+@functools.cache
+def registry() -> "pint.UnitRegistry[float]":
+    """All units that pint knows; made on first use."""
+    import pint
+
+    return pint.UnitRegistry()
 
 
 def to_si(value: object, unit: str, example: str) -> float:
@@ -66,10 +102,16 @@ def to_si(value: object, unit: str, example: str) -> float:
         if unit.startswith("rad") and number != 0:
             raise ValueError(f"{value!r} has no unit; expected {kind} such as '{example}'")
         return number
+    factor = _FACTORS.get(unit, {}).get(re.sub(r" */ *", "/", text))
+    if factor is not None:
+        return number * factor
+    units = registry()
+    from pint import PintError
+
     try:
-        given = UNITS.parse_units(_bounded("1" + text if text.startswith("/") else text))
-        return float(UNITS.Quantity(number, given).to(unit or "dimensionless").magnitude)
-    except _BAD_UNIT:
+        given = units.parse_units(_bounded("1" + text if text.startswith("/") else text))
+        return float(units.Quantity(number, given).to(unit or "dimensionless").magnitude)
+    except (PintError, *_BAD_UNIT):
         raise wrong from None
 
 
@@ -239,7 +281,7 @@ def usual_unit(number: float, unit: str) -> tuple[float, str]:
     if unit == "rad" and _in_degrees(number):
         return 180 / math.pi, "deg"
     if number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
-        found = UNITS.Quantity(number, unit).to_compact()
+        found = registry().Quantity(number, unit).to_compact()
         return float(found.magnitude) / number, f"{found.units:~}"
     return 1.0, unit
 
@@ -275,10 +317,13 @@ def shown(number: float, unit: str) -> str:
     """
     if isinstance(number, Given):
         return number.text
-    return f"{number / UNITS.Quantity(1.0, unit).to_base_units().magnitude:.4g} {unit}"
+    factor = _OF_UNIT.get(unit)
+    if factor is None:
+        factor = registry().Quantity(1.0, unit).to_base_units().magnitude
+    return f"{number / factor:.4g} {unit}"
 
 
-def parse_units(text: str) -> pint.Quantity[float]:
+def parse_units(text: str) -> "pint.Quantity[float]":
     """A CF units string as a pint quantity: 'm s-1', 'km/h', 'kg m-3', '1', '%'.
 
     CF (UDUNITS) writes powers as digits behind a unit and products as a dot, pint does not.
@@ -294,6 +339,26 @@ def parse_units(text: str) -> pint.Quantity[float]:
     products = re.sub(r"(?<=[^\W_])\.(?=[^\W\d_])", "*", text)
     powers = re.sub(r"(?<![\w.])([^\W\d_]+)\^?(-?\d+)(?!\w)", r"\1**\2", products)
     try:
-        return 1.0 * UNITS.parse_expression(_bounded(powers or "1")) * UNITS.dimensionless
+        units = registry()
+        return 1.0 * units.parse_expression(_bounded(powers or "1")) * units.dimensionless
     except Exception as error:  # pint lets its tokenizer's own exceptions through
         raise ValueError(f"{text!r} is not a unit") from error
+
+
+def conversion(text: str, target: str) -> float:
+    """Factor from a CF units string to another.
+
+    Raises
+    ------
+    ValueError
+        The text is no unit, or none that converts to the other.
+    """
+    if text == target:
+        return 1.0
+    given, wanted = parse_units(text), parse_units(target)
+    from pint import PintError
+
+    try:
+        return float(given.to(wanted.units).magnitude)
+    except PintError as error:
+        raise ValueError(f"{text!r} is no unit of {target}") from error

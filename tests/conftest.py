@@ -8,6 +8,8 @@ process. Processes share Dr.Jit's kernel cache: it writes a kernel nameless and 
 import gc
 import os
 
+BACKEND = os.environ.get("LIDAR_MI_TEST_BACKEND", "llvm")
+"""cuda: tests that ask for a variant run in that of CUDA."""
 IS_WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if IS_WORKER:  # before anything imports numpy or torch
     for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
@@ -48,7 +50,7 @@ def variant(request, _long_lived):
     """
     import mitsuba as mi
 
-    name = getattr(request, "param", "llvm_ad_mono_polarized")
+    name = getattr(request, "param", "llvm_ad_mono_polarized").replace("llvm", BACKEND)
     try:
         mi.set_variant(name)
     except ImportError as error:

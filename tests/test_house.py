@@ -77,7 +77,7 @@ OPENS = {
     "assessment/report/campaign.py": "its own script, a resource of the package",
     "assessment/report/page.py": "its own script, a resource of the package",
     "experiment/log.py": "the log, line by line",
-    "experiment/folder/run_folder.py": "checksums of what a run depends on",
+    "experiment/folder/records.py": "checksums of what a run depends on",
     "system/doctor.py": "a file of its own in a program that it tries",
     "system/llvm.py": "/proc",
     "system/memory.py": "/proc, /sys/fs/cgroup",
@@ -281,6 +281,36 @@ def imports_between_tests() -> list[str]:
     return found
 
 
+def bound(node: ast.AST) -> set[str]:
+    """Names that imports anywhere in a part of a module bind."""
+    found = (n for n in ast.walk(node) if isinstance(n, ast.Import | ast.ImportFrom))
+    return {alias.asname or alias.name.split(".")[0] for one in found for alias in one.names}
+
+
+def used(node: ast.AST) -> set[str]:
+    """Names that a part of a module looks up when it runs: annotations of locals are not."""
+    if isinstance(node, ast.Name):
+        return {node.id}
+    if isinstance(node, ast.AnnAssign):
+        return used(node.value) if node.value else set()
+    if isinstance(node, ast.FunctionDef):
+        # as nested ones are defined where their annotations are evaluated
+        return set().union(*map(used, ast.iter_child_nodes(node))) - bound(node)
+    return set().union(*map(used, ast.iter_child_nodes(node)))
+
+
+def types_used_at_run_time() -> list[str]:
+    """Names that only a type checker imports, used in the program: no checker says so."""
+    found = []
+    for name, (_, tree) in MODULES.items():
+        for block in tree.body:
+            if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+                rest = ast.Module([node for node in tree.body if node is not block], [])
+                wrong = bound(ast.Module(block.body, [])) & used(rest)
+                found += [f"{name}: {one}" for one in sorted(wrong)]
+    return found
+
+
 RULES = (
     wrong_arrows,
     arrows_up_in_a_room,
@@ -291,6 +321,7 @@ RULES = (
     files_opened_elsewhere,
     modules_of_imports_only,
     imports_between_tests,
+    types_used_at_run_time,
 )
 
 

@@ -8,27 +8,16 @@ import ast
 import doctest
 import importlib
 import inspect
-import json
 import re
-import subprocess
-import sys
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
 
 import lidar_mi as lm
+from tests.support.loaded import modules_after
 
 HEAVY = ("mitsuba", "drjit", "torch", "numpy", "scipy", "xarray", "matplotlib", "pydantic", "rich")
-
-
-def modules_after(code: str) -> set[str]:
-    """Modules that a fresh interpreter has loaded after running some code."""
-    code += "\nimport json, sys; print(json.dumps(list(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
-    )
-    return set(json.loads(done.stdout.splitlines()[-1]))
 
 
 def stub() -> ast.Module:
@@ -45,12 +34,6 @@ def test_light_names_load_no_renderer():
     assert modules_after(code).isdisjoint(("mitsuba", "drjit", "torch"))
     code = "import lidar_mi as lm; lm.retrieve_wind; lm.fit_vortices; lm.read_vortices"
     assert modules_after(code).isdisjoint(("mitsuba", "drjit"))
-
-
-def test_help_loads_nothing_heavy():
-    code = "import sys; sys.argv = ['lidar-mi', '--help']\n"
-    code += "from lidar_mi.cli.app import main\ntry: main()\nexcept SystemExit: pass"
-    assert modules_after(code).isdisjoint(set(HEAVY) - {"rich"})
 
 
 def test_stub_lists_exactly_the_public_names():

@@ -4,6 +4,8 @@ import math
 import pickle
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 from lidar_mi.units import (
@@ -15,6 +17,7 @@ from lidar_mi.units import (
     Number,
     Speed,
     Time,
+    registry,
     shown,
     to_si,
     usual,
@@ -78,6 +81,40 @@ class Quantities(BaseModel):
 )
 def test_quantities_become_si(kind, text, expected):
     assert getattr(Quantities(**{kind: text}), kind) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("unit", "texts"),
+    [
+        ("m", ("m", "km", "cm", "mm", "um", "nm", "pm")),
+        ("rad", ("rad", "mrad", "urad", "deg")),
+        ("rad/s", ("rad/s", "deg/s", "deg / s")),
+        ("rad/s^2", ("rad/s^2", "deg/s^2")),
+        ("m/s", ("m/s", "m / s")),
+        ("s", ("s", "ms", "us", "ns")),
+        ("J", ("J", "mJ", "uJ")),
+        ("1/m", ("1/m", "1 / km")),
+        ("1/m/sr", ("1/m/sr",)),
+        ("m^2", ("m^2",)),
+        ("m^2/s", ("m^2/s",)),
+        ("Hz", ("Hz", "kHz", "MHz", "GHz")),
+        ("K", ("K", "mK")),
+        ("W/m^3/sr", ("W/m^2/sr/nm",)),
+        ("byte", ("MB", "GB")),
+        ("", ("%",)),
+    ],
+)
+@given(st.floats(1e-6, 1e6), st.integers(1, 17))
+def test_usual_units_are_read_to_the_last_bit_as_pint_reads_them(unit, texts, number, digits):
+    """Runs of before are resumed with the very same numbers."""
+    number = float(f"{number:.{digits}g}")
+    for text in texts:
+        expected = registry().Quantity(number, text).to(unit or "dimensionless").magnitude
+        assert to_si(f"{number!r} {text}", unit, "") == expected
+        if unit != "byte":
+            assert (
+                shown(number, text) == f"{number / registry()(text).to_base_units().m:.4g} {text}"
+            )
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,8 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.fft import dctn, idctn
-from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.errors import InputError
 
@@ -39,13 +38,17 @@ def _sampler(values: np.ndarray, finer: int = 1) -> Callable[[np.ndarray], np.nd
     padded = np.pad(values, _MARGIN, mode="edge")
     if finer > 1:
         more = [(0, (finer - 1) * n) for n in padded.shape]
-        padded = idctn(np.pad(dctn(padded, norm="forward"), more), norm="forward")
-    coefficients = spline_filter(padded, order=_ORDER, mode="mirror")
+        padded = scipy.fft.idctn(
+            np.pad(scipy.fft.dctn(padded, norm="forward"), more), norm="forward"
+        )
+    coefficients = scipy.ndimage.spline_filter(padded, order=_ORDER, mode="mirror")
 
     def sample(indices: np.ndarray) -> np.ndarray:
         # the nodes of a cosine series are half a spacing from its ends
         places = finer * (indices + _MARGIN) + (finer - 1) / 2
-        return map_coordinates(coefficients, places, order=_ORDER, mode="nearest", prefilter=False)
+        return scipy.ndimage.map_coordinates(
+            coefficients, places, order=_ORDER, mode="nearest", prefilter=False
+        )
 
     return sample
 

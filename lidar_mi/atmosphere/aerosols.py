@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.integrate import quad
+import scipy
 
 from lidar_mi.errors import InputError
 
@@ -146,7 +146,7 @@ class Aerosol:
 
         def area(low: float, high: float) -> float:
             # r^2 n dr is r^3 n du, with u = ln r
-            return quad(
+            return scipy.integrate.quad(
                 lambda u: self.sizes(math.exp(u)) * math.exp(3 * u), low, high, epsabs=0, limit=400
             )[0]
 

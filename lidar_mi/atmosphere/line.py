@@ -11,16 +11,15 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.constants import Avogadro, Boltzmann
-from scipy.optimize import brentq
 
 from lidar_mi.errors import InputError
 
 SHAPES = ("rayleigh", "rayleigh_brillouin")
 
-# Mean molecular mass of dry air, kg (28.9644 g / mol, ICAO standard atmosphere).
-_MASS = 28.9644e-3 / Avogadro
+# Mean molar mass of dry air, kg / mol (ICAO standard atmosphere).
+_MOLAR_MASS = 28.9644e-3
 _FWHM = 2 * math.sqrt(2 * math.log(2))
 
 
@@ -81,7 +80,9 @@ class Line:
         half = self.pdf(peak) / 2
         # to 1 Hz, of widths of MHz and more
         left, right = (
-            brentq(lambda x: float(self.pdf(x) - half), peak, peak + side * extent, xtol=1.0)
+            scipy.optimize.brentq(
+                lambda x: float(self.pdf(x) - half), peak, peak + side * extent, xtol=1.0
+            )
             for side in (-1, 1)
         )
         return right - left
@@ -150,7 +151,8 @@ def rayleigh_width(wavelength: float, temperature: float) -> float:
     _check("wavelength", wavelength, wavelength > 0, "m above 0")
     _check("temperature", temperature, temperature > 0, "K above 0")
     # the Doppler shift of backscatter is 2 v / wavelength
-    return _FWHM * 2 / wavelength * math.sqrt(Boltzmann * temperature / _MASS)
+    molecule = _MOLAR_MASS / scipy.constants.Avogadro
+    return _FWHM * 2 / wavelength * math.sqrt(scipy.constants.Boltzmann * temperature / molecule)
 
 
 def rayleigh(wavelength: float, temperature: float) -> Line:

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.constants import Boltzmann
+import scipy
 
 from lidar_mi.atmosphere.scattering import ScatteringTable, rayleigh_table
 from lidar_mi.errors import InputError
@@ -135,7 +135,7 @@ def number_density(pressure: float, temperature: float) -> float:
     for name, value in (("pressure", pressure), ("temperature", temperature)):
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{name}: {value!r} is not allowed; it must be > 0")
-    return pressure / (Boltzmann * temperature)
+    return pressure / (scipy.constants.Boltzmann * temperature)
 
 
 def standard_atmosphere(altitude: float) -> tuple[float, float]:

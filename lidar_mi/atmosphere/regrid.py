@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 # Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
 # their origin reach 5e-4.
@@ -69,7 +69,7 @@ def interpolated(
     for axis, (own, wanted) in enumerate(zip(nodes, targets, strict=True)):
         if own.size == wanted.size and np.allclose(own, wanted, rtol=0, atol=1e-3 * _step(own)):
             continue
-        smooth = CubicSpline(own, smooth, axis=axis)(wanted)
+        smooth = scipy.interpolate.CubicSpline(own, smooth, axis=axis)(wanted)
         straight = _linear(own, straight, wanted, axis)
     return smooth, float(np.sqrt(np.mean((smooth - straight) ** 2)))
 

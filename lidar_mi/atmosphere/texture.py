@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.fft import fftfreq, irfftn, next_fast_len, rfftfreq, rfftn
-from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.errors import InputError
 
@@ -61,15 +60,15 @@ def gaussian_field(
     d = len(shape)
     # the generator by its name: numpy may change the one of default_rng
     noise = np.random.Generator(np.random.PCG64(seed)).standard_normal(shape)
-    spectrum = rfftn(noise, overwrite_x=True)
-    frequencies = [fftfreq(n, s) for n, s in zip(shape[:-1], spacing[:-1], strict=True)]
-    frequencies.append(rfftfreq(shape[-1], spacing[-1]))
+    spectrum = scipy.fft.rfftn(noise, overwrite_x=True)
+    frequencies = [scipy.fft.fftfreq(n, s) for n, s in zip(shape[:-1], spacing[:-1], strict=True)]
+    frequencies.append(scipy.fft.rfftfreq(shape[-1], spacing[-1]))
     k2 = sum(f**2 for f in np.meshgrid(*frequencies, indexing="ij", sparse=True))
     # Frequencies in cycles per metre: the common 2 pi drops out of the shape.
     # The root of the spectral density, as the noise is an amplitude.
     spectrum *= (k2 + outer_scale**-2) ** (-(slope + d - 1) / 4)
     spectrum.flat[0] = 0
-    return irfftn(spectrum, s=shape, overwrite_x=True)
+    return scipy.fft.irfftn(spectrum, s=shape, overwrite_x=True)
 
 
 def corrsin_obukhov(
@@ -133,7 +132,7 @@ def corrsin_obukhov(
     sizes = [values.size for values in axes.values()]
     # longer than the image by an outer scale, as the field is periodic
     period = tuple(
-        next_fast_len(int(np.ceil(axes[name].size + outer_scale / step)), real=True)
+        scipy.fft.next_fast_len(int(np.ceil(axes[name].size + outer_scale / step)), real=True)
         for name, step in spacing.items()
     )
     if np.prod(period, dtype=float) > _LARGEST_GRID:
@@ -197,7 +196,7 @@ class PeriodicTexture:
             *(np.asarray(a, float) / d for a, d in zip((x, y, z), self.spacing, strict=True))
         )
         shape, flat = places[0].shape, np.stack([place.ravel() for place in places])
-        logarithm = map_coordinates(
+        logarithm = scipy.ndimage.map_coordinates(
             self.coefficients, flat, order=_ORDER, mode="grid-wrap", prefilter=False
         )
         return np.exp(logarithm).reshape(shape)
@@ -226,7 +225,7 @@ def periodic_texture(
         )
     # rounding must not add a node to a whole number of them
     nodes = tuple(
-        next_fast_len(int(np.ceil(length / step - 1e-9)), real=True)
+        scipy.fft.next_fast_len(int(np.ceil(length / step - 1e-9)), real=True)
         for length, step in zip(extent, spacing, strict=True)
     )
     if np.prod(nodes, dtype=float) > _LARGEST_GRID:
@@ -239,4 +238,4 @@ def periodic_texture(
     g = gaussian_field(nodes, spacing, outer_scale, seed)
     s = np.sqrt(np.log1p(rms**2))
     g = (g - g.mean()) * (s / g.std()) - s**2 / 2
-    return PeriodicTexture(spline_filter(g, order=_ORDER, mode="grid-wrap"), spacing)
+    return PeriodicTexture(scipy.ndimage.spline_filter(g, order=_ORDER, mode="grid-wrap"), spacing)

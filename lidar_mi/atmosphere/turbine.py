@@ -8,10 +8,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import integrate
-from scipy.fft import next_fast_len
 
 from lidar_mi.atmosphere.texture import gaussian_field
 from lidar_mi.atmosphere.vortex import LAMB_OSEEN_CONSTANT
@@ -127,7 +126,7 @@ class TurbineWake:
         torque = self.torque_coefficient * self.wind_speed**2 * math.pi * radius**3 / 2
         # the integrand falls like a Gaussian of sigma
         # angular momentum r v_t, which u carries through the plane; rho cancels
-        momentum, _ = integrate.quad(
+        momentum, _ = scipy.integrate.quad(
             lambda r: self.axial_speed(r) * r * self._profile(r) * 2 * math.pi * r,
             0,
             12 * self.width,
@@ -183,7 +182,8 @@ def isotropic_turbulence(
     # a node more at both ends, for the central differences
     shape = [len(axis) + 2 for axis in axes]
     period = [
-        next_fast_len(n + math.ceil(outer_scale / h)) for n, h in zip(shape, step, strict=True)
+        scipy.fft.next_fast_len(n + math.ceil(outer_scale / h))
+        for n, h in zip(shape, step, strict=True)
     ]
     cut = tuple(slice(n) for n in shape)
     # with this slope the density is (k^2 + k0^2)^(-17/6); k^2 is by the curl, k^2 by the shells

@@ -4,8 +4,8 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.interpolate import CubicSpline
 
 from lidar_mi.atmosphere.regrid import interpolated, statement
 from lidar_mi.errors import InputError
@@ -100,7 +100,9 @@ def resample(
         values = own
         if divided:
             for axis in axes:
-                values = CubicSpline(wake[axis].values, values, axis="xyz".index(axis))(nodes[axis])
+                values = scipy.interpolate.CubicSpline(
+                    wake[axis].values, values, axis="xyz".index(axis)
+                )(nodes[axis])
         else:
             values, errors[str(variable_name)] = interpolated(own, old, targets)
         if variable_name in ("tracer", "aerosol"):

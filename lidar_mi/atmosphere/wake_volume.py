@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import map_coordinates, spline_filter1d
 
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.atmosphere.wake_path import Components, check_cut, wake_axes
@@ -146,9 +145,9 @@ class VolumeAlongPath:
             values = self.flow[name].transpose("x", "y", "z").values.astype(float)
             if len(values) > 1:
                 # periodic along the axis: behind the last plane comes the first
-                values = spline_filter1d(values, axis=0, mode="grid-wrap")
+                values = scipy.ndimage.spline_filter1d(values, axis=0, mode="grid-wrap")
             for axis in (1, 2):
-                values = spline_filter1d(values, axis=axis, mode="mirror")
+                values = scipy.ndimage.spline_filter1d(values, axis=axis, mode="mirror")
             found[str(name)] = np.take(
                 values, range(-_BEYOND, len(values) + _BEYOND), axis=0, mode="wrap"
             )
@@ -194,7 +193,9 @@ class VolumeAlongPath:
 
     def _at(self, name: str, index: np.ndarray) -> np.ndarray:
         flat = index.reshape(3, -1)
-        found = map_coordinates(self._splines[name], flat, prefilter=False, mode="mirror")
+        found = scipy.ndimage.map_coordinates(
+            self._splines[name], flat, prefilter=False, mode="mirror"
+        )
         return found.reshape(index.shape[1:])
 
     def wind(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:
@@ -219,7 +220,7 @@ class VolumeAlongPath:
         return np.where(inside, found, self.background)
 
     @cached_property
-    def _tracks(self) -> tuple[CubicSpline, ...]:
+    def _tracks(self) -> tuple[scipy.interpolate.CubicSpline, ...]:
         """y, z, radius and circulation of each vortex along the axis, periodic."""
         x = self.flow["x"].values
         # a periodic spline needs its first value again at the end
@@ -227,7 +228,11 @@ class VolumeAlongPath:
         found = []
         for side in (self.port, self.starboard):
             rows = np.array([[v.y, v.z, v.core_radius, v.circulation] for v in side])
-            found.append(CubicSpline(nodes, np.vstack([rows, rows[:1]]), bc_type="periodic"))
+            found.append(
+                scipy.interpolate.CubicSpline(
+                    nodes, np.vstack([rows, rows[:1]]), bc_type="periodic"
+                )
+            )
         return tuple(found)
 
     def vortices(self, x: float, time: float) -> tuple[Vortex, Vortex]:

@@ -12,7 +12,7 @@ from lidar_mi.assessment.metrics.names import title_of
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.campaign.folder import DATA, CampaignFolder, open_folder
 from lidar_mi.campaign.points import MEMBER, tied
-from lidar_mi.experiment.folder.run_folder import METRICS
+from lidar_mi.experiment.folder.records import METRICS
 from lidar_mi.experiment.log import silent
 from lidar_mi.io.json import read_json
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf

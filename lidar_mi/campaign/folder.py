@@ -16,7 +16,8 @@ from lidar_mi import __version__
 from lidar_mi.campaign.description import Campaign, checked_campaign
 from lidar_mi.campaign.points import Points
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.folder.run_folder import METRICS, made_by, new_record, refuse_strangers
+from lidar_mi.experiment.folder.records import METRICS
+from lidar_mi.experiment.folder.run_folder import made_by, new_record, refuse_strangers
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.schema.experiment import Experiment

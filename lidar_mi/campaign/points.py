@@ -14,7 +14,7 @@ from lidar_mi.campaign.description import Campaign, Range
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.units import UNITS, split_quantity
+from lidar_mi.units import registry, split_quantity
 
 MEMBER, SAMPLE = "member", "sample"
 """Names of dimensions that are no key."""
@@ -209,7 +209,9 @@ def tied(keys: str) -> list[str]:
 def _quantities(labels: Sequence[str]) -> tuple[list[Any], str]:
     """Names of sets of changes; those that are all quantities of one kind as numbers in SI."""
     try:
-        found = [UNITS.Quantity(*split_quantity(_plain(label))).to_base_units() for label in labels]
+        found = [
+            registry().Quantity(*split_quantity(_plain(label))).to_base_units() for label in labels
+        ]
     except Exception:  # words; pint raises whatever its parser does
         return list(labels), ""
     if len({one.units for one in found}) > 1:

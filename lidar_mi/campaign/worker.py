@@ -31,6 +31,7 @@ from lidar_mi.campaign.folder import (
 )
 from lidar_mi.encounter.fly import fly
 from lidar_mi.errors import InputError, one_line
+from lidar_mi.experiment.folder import records
 from lidar_mi.experiment.folder import run_folder as resumable_folder
 from lidar_mi.experiment.folder.image_store import ImageStore
 from lidar_mi.experiment.log import Log, silent
@@ -116,7 +117,7 @@ def carry_out(
         assert found is not None  # written before the metrics, by which the point is done
         return found
     make_folder(place)
-    log = Log(path=place / resumable_folder.LOG)
+    log = Log(path=place / records.LOG)
     start = time.perf_counter()
     store: PointStore | None = None
     try:
@@ -141,7 +142,7 @@ def carry_out(
         )
         # metrics last: they say that the point is done
         write_outcome(place, outcome)
-        write_text(place / resumable_folder.METRICS, to_json(metrics))
+        write_text(place / records.METRICS, to_json(metrics))
     except Exception as error:
         # an outcome, not an exception: one point must not end the campaign
         log.fail(error)
@@ -255,7 +256,7 @@ def _compute(campaign: CampaignFolder, run: Run, store: PointStore) -> None:
         complete(run, store.place / RUN, overwrite=True, shared=store)
         return
     record = resumable_folder.new_record(run.experiment, campaign.points.search_path)
-    write_text(store.place / resumable_folder.RECORD, to_yaml(record))
+    write_text(store.place / records.RECORD, to_yaml(record))
     # without a report figures have no use
     finish(run, store, with_figures=False)
 

@@ -12,7 +12,7 @@ import typer
 from rich.live import Live
 from rich.table import Table as RichTable
 
-from lidar_mi.cli.options import complete_campaign, quantity
+from lidar_mi.cli.options import Device, complete_campaign, quantity
 from lidar_mi.cli.terminal import errors, output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -72,6 +72,7 @@ def run(
         str | None,
         typer.Option(help="Begin no point that would not end within this time, such as '50 min'."),
     ] = None,
+    device: Device = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -108,9 +109,10 @@ def run(
         with slurm_cluster(memory=memory, walltime=walltime, queue=queue) as cluster:
             output.print(cluster.job_script(), highlight=False, soft_wrap=True)
         return
+    changes = list(set_ or []) + ([f"set.device={device}"] if device else [])
     with progress() as notice:
         folder = prepare_campaign(
-            campaign, out, quick=quick, confirmed=yes, overrides=set_, notice=notice
+            campaign, out, quick=quick, confirmed=yes, overrides=changes, notice=notice
         )
     if point is not None:
         _run_point(folder, point)

@@ -1,40 +1,65 @@
 """``lidar-mi check``: whether an experiment can be run, and a summary of it."""
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
 from lidar_mi.cli.options import Changes, ExperimentName
 from lidar_mi.cli.terminal import output, print_rows
 from lidar_mi.experiment.shipped import experiment_file
-from lidar_mi.progress import progress
+from lidar_mi.progress import Notice, progress
+
+if TYPE_CHECKING:
+    from lidar_mi.experiment.describe import Section
+    from lidar_mi.experiment.schema.experiment import Experiment
 
 EXAMPLES = (
-    "Examples: `lidar-mi check wake_sensor` - `lidar-mi check my_wake.yaml --set "
-    "scan.range='200 m'`"
+    "Examples: `lidar-mi check wake_sensor` - `lidar-mi check wake_sensor --forecast` - "
+    "`lidar-mi check my_wake.yaml --set scan.range='200 m'`"
 )
 
 
-def check(experiment: ExperimentName, set_: Changes = None) -> None:
+def check(
+    experiment: ExperimentName,
+    set_: Changes = None,
+    forecast: Annotated[
+        bool,
+        typer.Option(
+            "--forecast",
+            help="Also the time of a run on this machine and the number of Monte Carlo samples, by "
+            "rendering a few samples and timing a retrieval: several seconds.",
+        ),
+    ] = False,
+) -> None:
     """Check whether an experiment can be run; show its instruments and the observed air in numbers.
 
-    Reads the wake, the scattering and the requirements as run does, and writes nothing. A probe of
-    about a second tells how long the run will take on this machine.
+    Reads the wake, the scattering and the requirements as run does, and writes nothing.
     """
-    from lidar_mi.encounter.check import sections as flight_sections
-    from lidar_mi.experiment.preflight.check import sections
-    from lidar_mi.experiment.schema import reading as config
+    from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
-    asked = config.load_variants(path, changes) or {"": config.load(path, changes)}
+    asked = reading.load_variants(path, changes) or {"": reading.load(path, changes)}
     with progress() as notice:
         found = [
             section
             for one in asked.values()
-            for section in (
-                flight_sections(one.read_from(path.parent), notice, timed=True)
-                if one.encounter
-                else sections(one, path.parent, notice, timed=True, sampled=True)
-            )
+            for section in _sections(one.read_from(path.parent), notice, forecast)
         ]
     for title, rows in found:
         print_rows(title, rows)
     warned = sum(len(rows) for title, rows in found if ": warnings" in title)
     warnings = f", {warned} warning{'s' * (warned > 1)} above" if warned else ""
     output.print(f"all checks passed{warnings}", highlight=False)
+
+
+def _sections(asked: "Experiment", notice: Notice, forecast: bool) -> Iterator["Section"]:
+    """Tables of a run or of a flight."""
+    notice(f"checking {asked.name}", None)
+    if asked.encounter:
+        from lidar_mi.encounter.check import sections as flight_sections
+
+        return flight_sections(asked, notice, timed=forecast)
+    from lidar_mi.experiment.preflight.check import sections
+
+    return sections(asked, asked.folder, notice, timed=forecast, sampled=forecast)

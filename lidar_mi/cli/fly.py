@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, FlightName
+from lidar_mi.cli.options import Changes, Device, FlightName
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.shipped import experiment_file
@@ -39,6 +39,7 @@ def fly(
             "feedforward, with perfect preview."
         ),
     ] = None,
+    device: Device = None,
     set_: Changes = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a flight of a different experiment.")
@@ -58,10 +59,11 @@ def fly(
 
     Writes the flights and the track (NetCDF), metrics (JSON), figures, an animation and a report.
     """
-    from lidar_mi.encounter.fly import fly as start
     from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
+    if device:
+        changes.append(f"device={device}")
     if mode:
         changes.append(f"encounter.control.mode={mode.value!r}")
     variants = reading.load_variants(path, changes)
@@ -75,6 +77,9 @@ def fly(
         )
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
+        notice(f"starting {loaded.name}", None)
+        from lidar_mi.encounter.fly import fly as start
+
         done = start(loaded, folder, overwrite=overwrite, processes=processes, notice=notice)
     print_answer(done.answer)
     for table in done.tables()[1:]:

@@ -1,8 +1,8 @@
 """``lidar-mi info``: contents of a file or a folder of results, properties of a scatterer."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,6 +10,9 @@ from lidar_mi.cli.options import complete_contents, quantity
 from lidar_mi.cli.terminal import output, print_answer, print_rows, print_table
 from lidar_mi.progress import progress
 from lidar_mi.tables import Table
+
+if TYPE_CHECKING:
+    from lidar_mi.experiment.describe import Section
 
 CAMPAIGN = "campaign.yaml"
 """Record in the folder of a campaign."""
@@ -47,8 +50,6 @@ def info(
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
     from lidar_mi.experiment.describe import sections
-    from lidar_mi.experiment.folder.run_folder import failure, read_metrics, read_record
-    from lidar_mi.experiment.study import RECORD, answers
 
     if (Path(what) / CAMPAIGN).is_file():
         from lidar_mi.campaign.status import campaign_status
@@ -70,41 +71,58 @@ def info(
             )
         )
     folder = Path(what)
-    reason, metrics = failure(folder), read_metrics(folder) if folder.is_dir() else None
-    if folder.is_dir() and metrics is None and not reason:
-        output.print("unfinished: no metrics.json yet; run it again to resume")
     if folder.is_dir():
-        for part, answer in answers(folder):
-            if part:
-                output.print(f"\n{part}", style="bold")
-            print_answer(answer)
+        _show_folder(folder, found)
+        return
     for title, rows in found:
         print_rows(title, rows)
-    if folder.is_dir():
-        if reason:
-            output.print(f"failed: {reason}", soft_wrap=True)
-        elif metrics is not None and not (folder / RECORD).is_file():
-            for table in _results(folder, metrics, read_record(folder)["experiment"]):
-                print_table(table)
-        if (folder / RECORD).is_file() and not reason:
-            output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
+
+
+def _show_folder(folder: Path, found: Sequence["Section"]) -> None:
+    """The answer, the contents and the numbers of a run or of a study."""
+    from lidar_mi.experiment.folder.records import (
+        STUDY,
+        answers,
+        failure,
+        read_metrics,
+        read_record,
+    )
+
+    reason, metrics = failure(folder), read_metrics(folder)
+    if metrics is None and not reason:
+        output.print("unfinished: no metrics.json yet; run it again to resume")
+    for part, answer in answers(folder):
+        if part:
+            output.print(f"\n{part}", style="bold")
+        print_answer(answer)
+    for title, rows in found:
+        print_rows(title, rows)
+    if reason:
+        output.print(f"failed: {reason}", soft_wrap=True)
+    elif metrics is not None and not (folder / STUDY).is_file():
+        for table in _results(folder, metrics, read_record(folder)["experiment"]):
+            print_table(table)
+    if (folder / STUDY).is_file() and not reason:
+        output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
 
 
 def _results(
     folder: Path, metrics: Mapping[str, float], experiment: Mapping[str, Any]
 ) -> list[Table]:
     """The numbers of a flight or of a run."""
-    from lidar_mi.assessment.metrics.encounter import CONTROLLER
-    from lidar_mi.assessment.report.encounter import encounter_summary
-    from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment.describe import value_at
-    from lidar_mi.experiment.export_flight import FLIGHT_FILES
-    from lidar_mi.io.netcdf import read_netcdf
 
     if value_at(experiment, "encounter") is not None:
+        from lidar_mi.assessment.metrics.encounter import CONTROLLER
+        from lidar_mi.assessment.report.encounter import encounter_summary
+        from lidar_mi.experiment.export_flight import FLIGHT_FILES
+        from lidar_mi.io.netcdf import read_netcdf
+
         flights = folder / FLIGHT_FILES["series"]
         about = read_netcdf(flights).attrs if flights.is_file() else {}
         return encounter_summary(metrics, about.get(CONTROLLER, ""))
+    from lidar_mi.assessment.report.summary import summary
+
     asked = value_at(experiment, "doppler.retrieval.averaged")
     averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()
     return summary(metrics, averaged)

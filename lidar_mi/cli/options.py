@@ -86,6 +86,29 @@ Variant = Annotated[
     ),
 ]
 
+DEVICES = ("auto", "cpu", "cuda")
+
+
+def _checked_device(device: str | None) -> str | None:
+    if device not in (None, *DEVICES):
+        raise InputError(f"--device: {device} is not allowed; expected {', '.join(DEVICES)}")
+    return device
+
+
+Device = Annotated[
+    str | None,
+    typer.Option(
+        "--device",
+        metavar="DEVICE",
+        callback=_checked_device,
+        autocompletion=lambda incomplete: starting(incomplete, DEVICES),
+        help="That renders and retrieves: cpu, cuda, or auto for what is there. Default: as the "
+        "experiment says.",
+        show_default=False,
+    ),
+]
+
+
 NominalInstrument = Annotated[
     str,
     typer.Option(

@@ -101,7 +101,7 @@ def retrieve(
     min_isotropy: Annotated[
         float, typer.Option(help="Weakest over strongest slope; below: flagged.")
     ] = 0.2,
-    device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
+    device: Annotated[str, typer.Option(help="That computes: cpu, cuda, or auto.")] = "cpu",
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from many."""

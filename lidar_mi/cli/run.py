@@ -1,12 +1,12 @@
 """``lidar-mi run``: run an experiment."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, RunName, Variant
+from lidar_mi.cli.options import Changes, Device, RunName, Variant
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
@@ -26,6 +26,7 @@ def run(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Run folder. Default: outputs/NAME.")
     ] = None,
+    device: Device = None,
     set_: Changes = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a run of a different experiment.")
@@ -36,24 +37,27 @@ def run(
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped is resumed with the images it has.
     """
-    from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment import study
-    from lidar_mi.experiment.folder.run_folder import RESULTS
-    from lidar_mi.experiment.run import run as start
     from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
+    if device:
+        changes.append(f"device={device}")
     variants = reading.load_variants(path, changes)
     loaded = next(iter(variants.values())) if variants else reading.load(path, changes)
     if variant:
         sections = {"render": loaded.wake, "doppler.render": loaded.doppler}
         changes += [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
     if variants:
-        _run_study(reading.load_variants(path, changes), out, path, overwrite, study.run)
+        _run_study(reading.load_variants(path, changes), out, path, overwrite)
         return
     loaded = reading.load(path, changes)
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
+        notice(f"starting {loaded.name}", None)
+        from lidar_mi.assessment.report.summary import summary
+        from lidar_mi.experiment.folder.run_folder import RESULTS
+        from lidar_mi.experiment.run import run as start
+
         done = start(loaded, folder, beside=path.parent, overwrite=overwrite, notice=notice)
     print_answer(done.answer)
     for table in summary(done.metrics, _averaged(loaded)):
@@ -67,20 +71,18 @@ def run(
 
 
 def _run_study(
-    variants: Mapping[str, "Experiment"],
-    out: Path | None,
-    path: Path,
-    overwrite: bool,
-    start: Callable[..., Mapping[str, Mapping[str, float]]],
+    variants: Mapping[str, "Experiment"], out: Path | None, path: Path, overwrite: bool
 ) -> None:
     """Variants of one experiment, each in its own folder, and their comparison."""
-    from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment.folder.run_folder import read_answer
-
     first, experiment = next(iter(variants.items()))
     name = experiment.name.removesuffix(f".{first}")
     folder = out or Path("outputs") / name
     with progress() as notice:
+        notice(f"starting {name}", None)
+        from lidar_mi.assessment.report.summary import summary
+        from lidar_mi.experiment.folder.records import read_answer
+        from lidar_mi.experiment.study import run as start
+
         metrics = start(name, variants, folder, path.parent, overwrite, notice)
     for variant in metrics:
         output.print(f"\n{variant}", style="bold")

@@ -14,7 +14,6 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.preflight import check as preflight
-from lidar_mi.experiment.preflight.cost import flight_seconds
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.progress import Notice
@@ -102,6 +101,8 @@ def sections(
     ]
     yield f"{experiment.name}: flight into the wake", rows
     if timed:
+        from lidar_mi.experiment.preflight.cost import flight_seconds
+
         notice("timing a few samples and a retrieval", None)
         steers = encounter.control.mode == "feedforward"
         scans = duration(encounter) * encounter.rate if steers else 0.0

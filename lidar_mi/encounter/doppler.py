@@ -5,12 +5,11 @@ the slab.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
+import scipy
 import xarray as xr
-from scipy.spatial.transform import Rotation
 
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.pose import AircraftPose
@@ -25,6 +24,10 @@ from lidar_mi.experiment.stages.ring_images import Rings, ring_instrument
 from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind
+
+if TYPE_CHECKING:
+    import torch
+
 
 # m/s by which the wind in a wake changes the speed along a line, at most: noise-free images are
 # tabulated over these speeds.
@@ -61,8 +64,8 @@ class LineFrames(NamedTuple):
     """
 
     lines: xr.Dataset
-    air: torch.Tensor
-    laser: torch.Tensor
+    air: "torch.Tensor"
+    laser: "torch.Tensor"
     own: list[int]
     scan: int
 
@@ -96,7 +99,7 @@ class DopplerScans:
         x: float,
         time: float,
         midway: Midway,
-        misalignment: Rotation | None = None,
+        misalignment: scipy.spatial.transform.Rotation | None = None,
     ) -> LineFrames:
         """Frames of all lines of sight of a slab.
 

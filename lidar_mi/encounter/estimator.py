@@ -14,7 +14,7 @@ from lidar_mi.encounter.doppler import LineFrames
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProcess
 from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.stages.winds import window_settings
+from lidar_mi.experiment.stages.winds import retrieval_device, window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices, started_fit
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -83,7 +83,8 @@ class Estimator:
         self._winds: InThisProcess | InOwnProcess | None = None
         if vectors and methods:
             form = InThisProcess if processes == 1 else InOwnProcess
-            self._winds = form(methods[0], window_settings(settings))
+            self._winds = form(methods[0], window_settings(settings, experiment.device))
+        self._device = retrieval_device(experiment.device)
         self._speeds, self._processes = speeds, processes
         # the last slab's vortices, near which the next wind starts
         self._last: VortexPairFit | None = None
@@ -137,12 +138,24 @@ class Estimator:
         # submitted before this process fits: the other one works at the same time
         prepared = self._winds.prepare(first, self._last) if self._winds else None
         fit: Callable[[xr.DataArray], VortexPairFit] = partial(
-            fit_vortices, image1, dt=dt, noise=noise, times=times, telescope=telescope
+            fit_vortices,
+            image1,
+            dt=dt,
+            noise=noise,
+            times=times,
+            telescope=telescope,
+            device=self._device,
         )
         if expected:
             with _timed(seconds, "vortices_before"):
                 fit = started_fit(
-                    image1, dt, noise, start=expected, times=times, telescope=telescope
+                    image1,
+                    dt,
+                    noise,
+                    start=expected,
+                    times=times,
+                    telescope=telescope,
+                    device=self._device,
                 )
         if prepared:
             # in flight the second image comes only now

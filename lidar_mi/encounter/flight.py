@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -18,16 +19,17 @@ from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
 from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
-from lidar_mi.encounter.preview import Lidar, WakeTracker, preview_in
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.scan_store import ScanStore
-from lidar_mi.encounter.series import FlightRecorder, flights_dataset, track_dataset
-from lidar_mi.encounter.slab_recorder import SlabRecorder
 from lidar_mi.encounter.user_controller import name_of, user_controller
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.experiment.schema.encounter import Encounter
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.progress import Notice
+
+if TYPE_CHECKING:
+    from lidar_mi.encounter.preview import Lidar
+
 
 OFF, AUTOPILOT, FEEDFORWARD, PERFECT = "off", "autopilot", "feedforward", "perfect"
 FLIGHTS = {
@@ -74,7 +76,7 @@ def simulate_flights(
     experiment: Experiment,
     notice: Notice,
     *,
-    lidar: Lidar | None = None,
+    lidar: "Lidar | None" = None,
     aircraft: OwnAircraft | None = None,
     controller: OwnController | None = None,
     processes: int = 1,
@@ -97,6 +99,10 @@ def simulate_flights(
     processes, scans
         As `VirtualLidar` takes them.
     """
+    from lidar_mi.encounter.preview import WakeTracker, preview_in
+    from lidar_mi.encounter.series import flights_dataset, track_dataset
+    from lidar_mi.encounter.slab_recorder import SlabRecorder
+
     encounter = encounter_of(experiment)
     wake = wake_along_path(experiment)
     levelling = encounter.control.levelling_time
@@ -155,6 +161,8 @@ def simulate_flight(
     preview_at : callable
         The preview in a state; None: there is none.
     """
+    from lidar_mi.encounter.series import FlightRecorder
+
     period = 1 / encounter.rate
     a_scan = math.ceil(period / _STEP)
     dt, count = period / a_scan, round(duration(encounter) / period) * a_scan
@@ -191,7 +199,7 @@ def _titled(notice: Notice, title: str) -> Notice:
     return lambda text, fraction: notice(f"{title}: {text}", fraction)
 
 
-def _virtual_lidar(experiment: Experiment, processes: int, scans: ScanStore | None) -> Lidar:
+def _virtual_lidar(experiment: Experiment, processes: int, scans: ScanStore | None) -> "Lidar":
     # Mitsuba takes seconds to load: flights without this lidar do not pay for it
     from lidar_mi.encounter.virtual_lidar import VirtualLidar
 

@@ -19,7 +19,8 @@ from lidar_mi.encounter.preview import Lidar
 from lidar_mi.encounter.report import answer, write_report
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError, is_interrupt
-from lidar_mi.experiment.folder.run_folder import REPORT
+from lidar_mi.experiment.device import devices_in_words, on_its_device
+from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import load_experiment
@@ -159,6 +160,7 @@ def fly(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     encounter_of(experiment)
+    experiment = on_its_device(experiment)
     log = Log(notice)
     for text in geometry(experiment, aircraft() if aircraft else None):
         log.remark(text)
@@ -179,6 +181,7 @@ def fly(
     with results.claimed(overwrite):
         log.path = results.log
         log(f"lidar-mi {__version__}, flight {experiment.name}, seed {experiment.seed}")
+        log(devices_in_words(experiment))
         # the record names no lidar, aircraft or controller of one's own: their flights are not
         # recognised in a folder
         reusable = not (lidar or aircraft or controller)

@@ -13,20 +13,16 @@ from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.export_flight import FLIGHT_FILES as FILES
 from lidar_mi.experiment.folder.image_store import MADE_BY
-from lidar_mi.experiment.folder.run_folder import (
-    FIGURES,
+from lidar_mi.experiment.folder.records import (
     LOG,
     METRICS,
     RECORD,
     REPORT,
     SUMMARY,
-    held,
-    made_by,
-    new_record,
     read_metrics,
     read_record,
-    write_verdict,
 )
+from lidar_mi.experiment.folder.run_folder import FIGURES, held, made_by, new_record, write_verdict
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf

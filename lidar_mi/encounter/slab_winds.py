@@ -123,7 +123,11 @@ class SlabWinds:
         """
         began = time.perf_counter()
         self._slab, start = slab, self._start(slab, before)
-        self._prepared = expected_wind(slab.image, start, slab.noise) if start else None
+        self._prepared = (
+            expected_wind(slab.image, start, slab.noise, self._windows.get("device", "cpu"))
+            if start
+            else None
+        )
         return time.perf_counter() - began
 
     @torch.inference_mode()

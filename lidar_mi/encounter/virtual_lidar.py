@@ -20,6 +20,7 @@ from lidar_mi.encounter.scan_store import Scan, ScanStore
 from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.device import on_its_device
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages.rendering import PILOT_SEED, environment_extinction
@@ -82,7 +83,7 @@ class VirtualLidar:
     Raises
     ------
     InputError
-        An experiment that is not that of an encounter.
+        An experiment that is not that of an encounter; a `device` that is not there.
 
     Examples
     --------
@@ -113,7 +114,7 @@ class VirtualLidar:
     ) -> None:
         if not isinstance(experiment, Experiment):
             experiment = load_experiment(experiment)
-        self.experiment = experiment
+        self.experiment = experiment = on_its_device(experiment)
         self.encounter = encounter_of(experiment)
         self.gates: Gates = gates_of(experiment)
         self.air: Air = air_of(experiment, self.gates)

@@ -5,17 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from lidar_mi.atmosphere.aerosols import AEROSOLS
 from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
 from lidar_mi.atmosphere.particle_scattering import Notice
 from lidar_mi.atmosphere.scattering import ScatteringTable, describe
 from lidar_mi.errors import InputError
-from lidar_mi.io.netcdf import load_variable, open_netcdf
 from lidar_mi.io.scattering_table import aerosol_table, read_table
 from lidar_mi.io.size import fits
-from lidar_mi.io.vortex_file import read_vortices
 
 MOLECULES = "molecules"
 
@@ -86,6 +83,8 @@ def sections(
 
 
 def _vortices(path: Path) -> Iterator[Section]:
+    from lidar_mi.io.vortex_file import read_vortices
+
     for name, fit in read_vortices(path).items():
         rows = [
             (
@@ -143,6 +142,10 @@ def _image(path: Path) -> Iterator[Section]:
 
 
 def _netcdf(path: Path) -> Iterator[Section]:
+    import xarray as xr
+
+    from lidar_mi.io.netcdf import load_variable, open_netcdf
+
     with open_netcdf(path) as data:
         rows = []
         for name, variable in data.variables.items():
@@ -167,15 +170,15 @@ def _span(low: float, high: float) -> str:
 
 
 def _folder(folder: Path) -> Iterator[Section]:
-    from lidar_mi.experiment.study import RECORD
+    from lidar_mi.experiment.folder.records import STUDY
 
-    yield from _study(folder) if (folder / RECORD).is_file() else _run_folder(folder)
+    yield from _study(folder) if (folder / STUDY).is_file() else _run_folder(folder)
 
 
 def _study(folder: Path) -> Iterator[Section]:
     """Settings in which a study's variants differ, and their results, one column per variant."""
     from lidar_mi.assessment.report.comparison import differences, flat, results, setting
-    from lidar_mi.experiment.study import read_study
+    from lidar_mi.experiment.folder.records import read_study
 
     name, records, metrics = read_study(folder)
     rows = [
@@ -202,7 +205,7 @@ def _study(folder: Path) -> Iterator[Section]:
 
 def _run_folder(folder: Path) -> Iterator[Section]:
     from lidar_mi.assessment.report.comparison import setting
-    from lidar_mi.experiment.folder.run_folder import read_record
+    from lidar_mi.experiment.folder.records import read_record
 
     record = read_record(folder)
     experiment = record["experiment"]

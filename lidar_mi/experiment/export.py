@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -12,15 +12,17 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import value_at
 from lidar_mi.experiment.export_flight import FLIGHT_FILES, flight_results
-from lidar_mi.experiment.folder.run_folder import RESULTS, read_record
+from lidar_mi.experiment.folder.records import STUDY, read_record
+from lidar_mi.experiment.folder.run_folder import RESULTS
 from lidar_mi.experiment.stages.rendering import IMAGES
-from lidar_mi.experiment.study import RECORD
 from lidar_mi.io.exr import read_scan
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.netcdf import read_netcdf
-from lidar_mi.io.vortex_file import read_vortices
-from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.units import to_si
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
 
 FORMATS = ("vtk", "csv", "mat")
 _WINDS = ("wind", "wind_volume", "wind3d")
@@ -75,7 +77,7 @@ def export(
     if format not in FORMATS:
         raise InputError(f"format: {format!r} is not allowed; expected one of {', '.join(FORMATS)}")
     folder = Path(folder)
-    if (folder / RECORD).is_file():
+    if (folder / STUDY).is_file():
         raise InputError(f"{folder}: a folder of several runs; expected one of them, {folder}/...")
     record = read_record(folder)
     if value_at(record["experiment"], "encounter") is not None:
@@ -131,6 +133,8 @@ def _one_by_one(name: str, data: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]
 
 def _results(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[str, xr.Dataset]]:
     """Data sets with the coordinates x, y, z, as far as their files are there."""
+    from lidar_mi.io.vortex_file import read_vortices
+
     for name in IMAGES:
         if (folder / f"{name}.exr").is_file():
             yield name, _placed_scan(read_scan(folder / f"{name}.exr"))
@@ -200,7 +204,7 @@ def _placed_lines(lines: xr.Dataset) -> xr.Dataset:
     return split.set_coords(["x", "y", "z"])
 
 
-def _vortices(fits: dict[str, VortexPairFit]) -> xr.Dataset:
+def _vortices(fits: "dict[str, VortexPairFit]") -> xr.Dataset:
     """Parameters of fitted pairs with standard errors: of each vortex, and of the pair."""
     sides = ("port", "starboard")
     pairs = []

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMappin
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Protocol, TypeVar, Union, get_args, get_origin
-from typing import get_type_hints as hints
 
 from pydantic import BaseModel
 
@@ -150,19 +149,28 @@ class Stage:
 
 @functools.cache
 def parameters(function: Callable[..., Any]) -> tuple[Parameter, ...]:
-    """The parameters of a stage's function that the graph provides."""
-    typed = hints(function, include_extras=True)
+    """The parameters of a stage's function that the graph provides.
+
+    A type in quotes is that of a result, from a module that only the stage itself loads: it is read
+    as text.
+    """
     found = []
     for name, given in inspect.signature(function).parameters.items():
         # their names stand for nothing that the graph could look up
         if given.kind in (given.VAR_POSITIONAL, given.VAR_KEYWORD):
             continue
-        kind, marks = typed.get(name), ()
+        kind, marks = given.annotation, ()
+        if isinstance(kind, str) and "Annotated" in kind:
+            raise ValueError(f"{function.__name__}: {name}: marks in quotes are not read")
         if get_origin(kind) is Annotated:
             kind, *rest = get_args(kind)
             marks = tuple(rest)
         # Optional[X] and X | None have different origins
-        optional = get_origin(kind) in (Union, types.UnionType) and type(None) in get_args(kind)
+        optional = (
+            kind.endswith("| None")
+            if isinstance(kind, str)
+            else get_origin(kind) in (Union, types.UnionType) and type(None) in get_args(kind)
+        )
         default = given.default is not given.empty
         found.append(Parameter(name, section_path(name), optional, default, marks))
     return tuple(found)

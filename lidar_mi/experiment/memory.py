@@ -14,12 +14,11 @@ from lidar_mi.instrument.scan import Scan
 from lidar_mi.io.exr import MOST_LAYERS
 from lidar_mi.rendering.memory import (
     PER_PIXEL,
-    PER_SAMPLE,
     PROGRAM,
     ceiling,
     check_memory,
+    host_bytes,
     image_bytes,
-    samples_at_once,
 )
 from lidar_mi.rendering.settings import RenderSettings
 
@@ -72,8 +71,7 @@ class Footprint:
             return PROGRAM + self._rings()
         render, gates = self.render, self.scan.gate_count
         samples = beams * max(most_samples(render, self.detector, beams, gates), 2 * gates)
-        at_once = samples_at_once(render.samples_per_pass, render.memory)
-        images = self._per_beam(gates) * beams + PER_SAMPLE * min(samples, at_once)
+        images = self._per_beam(gates) * beams + host_bytes(samples, render)
         return PROGRAM + PER_STATE * in_states + images + self._rings()
 
     def check_size(self, columns: int, rows: int) -> None:

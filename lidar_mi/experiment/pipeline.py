@@ -1,7 +1,7 @@
 """The stages of an experiment. What each needs, its function's signature says: see `graph`."""
 
 from collections.abc import Mapping
-from typing import TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import xarray as xr
 
@@ -10,7 +10,6 @@ from lidar_mi.assessment.metrics.pointing import ScanPointing
 from lidar_mi.assessment.metrics.requirements import RequirementTable
 from lidar_mi.assessment.metrics.rings import RingBudget
 from lidar_mi.assessment.metrics.safety import ScanSafety
-from lidar_mi.assessment.metrics.sensor import LidarCost
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.experiment.graph import Graph, Stage
 from lidar_mi.experiment.memory import Footprint
@@ -72,7 +71,11 @@ from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.rings.calibration import Calibration
+
+if TYPE_CHECKING:
+    from lidar_mi.assessment.metrics.sensor import LidarCost
+    from lidar_mi.retrieval.rings.calibration import Calibration
+
 
 RING_RETRIEVAL = "doppler_retrieve"
 
@@ -211,7 +214,7 @@ class Results(TypedDict, total=False):
     rings: Rings
     ring_images: dict[str, xr.Dataset]
     lit_rings: RingImages
-    calibration_file: Calibration | None
+    calibration_file: "Calibration | None"
     assumed_rings: Rings
     v_los: xr.Dataset
     ring_budget: RingBudget
@@ -224,7 +227,7 @@ class Results(TypedDict, total=False):
     wind3d: xr.Dataset | None
     u_limits: dict[str, float]
     doppler_alone: dict[str, xr.Dataset]
-    costs: dict[str, LidarCost]
+    costs: "dict[str, LidarCost]"
     pulses_needed: int | None
     vectors: xr.Dataset | None
     vortices: VortexFits

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
-from scipy.optimize import brentq
 
 from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
@@ -204,7 +204,7 @@ def required_energy(receiver: Receiver, error: float, v_los: float = 0.0) -> flo
             f"error: {error!r} m/s is not allowed; expected one of {_ENERGIES[0]:g} to "
             f"{_ENERGIES[1]:g} times the energy"
         )
-    return math.exp(brentq(excess, low, high, xtol=1e-6))
+    return math.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-6))
 
 
 def detected_fraction(receiver: Receiver) -> float:

@@ -4,23 +4,21 @@ import webbrowser
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import xarray as xr
 from rich.console import Console
 
-from lidar_mi.assessment.figures.backscatter import overview
 from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.assessment.report.answer import answer
-from lidar_mi.assessment.report.summary import summary
-from lidar_mi.experiment.folder.run_folder import REPORT
+from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.measure import judged
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.stages.vortices import VortexFits
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.io.png import png_bytes
 from lidar_mi.tables import Table, Tabular
+
+if TYPE_CHECKING:
+    from lidar_mi.experiment.stages.vortices import VortexFits
 
 
 @dataclass(repr=False)
@@ -95,13 +93,16 @@ class Run(Tabular):
         return self.results.get("wind3d")
 
     @property
-    def vortices(self) -> VortexFits | None:
+    def vortices(self) -> "VortexFits | None":
         """Vortex pairs fitted to images and to wind vectors."""
         return self.results.get("vortices")
 
     @property
     def answer(self) -> list[str]:
         """Errors and verdicts with their reasons, in sentences; empty until everything is done."""
+        from lidar_mi.assessment.report.answer import answer
+        from lidar_mi.experiment.measure import judged
+
         if not self.metrics:
             return []
         verdicts = judged(self.experiment, self.results, self.metrics)
@@ -109,6 +110,8 @@ class Run(Tabular):
 
     def tables(self) -> list[Table]:
         """The answer, the experiment and its main errors."""
+        from lidar_mi.assessment.report.summary import summary
+
         doppler = self.experiment.doppler
         seconds = sum(self.seconds.values())
         rows = [("experiment", self.experiment.name), ("computed in", f"{seconds:.1f} s")]
@@ -126,6 +129,9 @@ class Run(Tabular):
 
     def thumbnail(self) -> bytes | None:
         """Image of the backscatter lidar and cross-flow wind, where there are any, as PNG."""
+        from lidar_mi.assessment.figures.backscatter import overview
+        from lidar_mi.io.png import png_bytes
+
         if self.truth is None or "wind" not in self.results or not self.scans:
             return None
         figure, _ = overview(self.truth, self.scans, self.results["wind"], self.cores)

@@ -13,15 +13,12 @@ from typing import Any, cast
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.names import timing_key
-from lidar_mi.assessment.report.page import page
-from lidar_mi.assessment.report.simulation import simulation_remark
 from lidar_mi.errors import InputError, is_interrupt
+from lidar_mi.experiment.device import devices_in_words, on_its_device
 from lidar_mi.experiment.folder.run_folder import RunFolder
 from lidar_mi.experiment.graph import Graph, Stage, Store
 from lidar_mi.experiment.log import Log, silent
-from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import Results, stages_of
-from lidar_mi.experiment.report import chapters
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import dump
@@ -105,7 +102,8 @@ def prepare(
     Returns
     -------
     Run
-        With the truth and the other results of the preflight; `complete` runs the rest.
+        On the device that the experiment asks for, with the truth and the other results of the
+        preflight; `complete` runs the rest.
 
     Raises
     ------
@@ -117,6 +115,7 @@ def prepare(
             f"encounter: {experiment.name} is a flight, not a run; expected lidar-mi fly (lm.fly)"
         )
     beside = experiment.folder if beside is None else beside
+    experiment = on_its_device(experiment)
     graph, log = stages_of(experiment), Log(notice)
     prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
     # results first: a check may take those of any stage of the preflight
@@ -163,6 +162,7 @@ def complete(
             f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
             f"seed {prepared.experiment.seed}"
         )
+        log(devices_in_words(prepared.experiment))
         try:
             finish(prepared, store)
             _report(prepared, store)
@@ -192,6 +192,9 @@ def finish(prepared: Run, store: Store | None = None, *, with_figures: bool = Tr
     with_figures : bool
         With what only the report needs.
     """
+    from lidar_mi.assessment.report.simulation import simulation_remark
+    from lidar_mi.experiment.measure import measure
+
     graph = stages_of(prepared.experiment)
     for stage in graph:
         # the graph computes those on demand where another stage needs them
@@ -219,6 +222,9 @@ def _carry_out(graph: Graph, stage: Stage, run: Run, store: Store | None = None)
 
 def _report(run: Run, store: RunFolder) -> None:
     """Draw the figures; write them, the metrics and the report."""
+    from lidar_mi.assessment.report.page import page
+    from lidar_mi.experiment.report import chapters
+
     made, seconds = chapters(run.experiment, run.results, run.metrics, store.figures, run.log)
     run.seconds |= seconds
     # figures are drawn from the metrics: their own duration comes last

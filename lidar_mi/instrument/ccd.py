@@ -2,16 +2,18 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
-import torch
 from pydantic import Field, model_validator
 
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.multiplication import intensified, register_excess, register_output
 from lidar_mi.units import Frequency, Number, Time, Within, quantity
+
+if TYPE_CHECKING:
+    import torch
 
 
 class CCD(Description):
@@ -155,13 +157,13 @@ class CCD(Description):
 
 
 def expose(
-    expected: torch.Tensor,
+    expected: "torch.Tensor",
     ccd: CCD,
     seed: int,
     images: int | Sequence[int] | None = None,
-    modes: float | torch.Tensor = math.inf,
+    modes: "float | torch.Tensor" = math.inf,
     background: float = 0.0,
-) -> torch.Tensor:
+) -> "torch.Tensor":
     """Read the CCD: noisy images, in photoelectrons.
 
     The mean of a pixel is drawn from a Gamma distribution of shape ``modes`` (speckle) and
@@ -194,6 +196,8 @@ def expose(
     ------
     InputError
     """
+    import torch
+
     expected = torch.as_tensor(expected).double()
     _check_image(expected, background)
     modes = torch.as_tensor(modes, dtype=torch.float64, device=expected.device)
@@ -221,13 +225,15 @@ def expose(
 
 
 def _read(
-    mean: torch.Tensor,
-    floor: torch.Tensor | float,
-    modes: torch.Tensor,
+    mean: "torch.Tensor",
+    floor: "torch.Tensor | float",
+    modes: "torch.Tensor",
     ccd: CCD,
-    generator: torch.Generator,
-) -> torch.Tensor:
+    generator: "torch.Generator",
+) -> "torch.Tensor":
     """One image in photoelectrons."""
+    import torch
+
     if not bool(torch.isinf(modes).all()):
         shape = modes.expand(mean.shape)
         # the sampler of torch.distributions.Gamma, which accepts no generator
@@ -246,7 +252,9 @@ def _read(
     return electrons / ccd.multiplication_gain
 
 
-def _output(photoelectrons: torch.Tensor, ccd: CCD, generator: torch.Generator) -> torch.Tensor:
+def _output(
+    photoelectrons: "torch.Tensor", ccd: CCD, generator: "torch.Generator"
+) -> "torch.Tensor":
     """Electrons that reach the output: multiplied, clipped at the wells, of nonlinear response."""
     electrons, gain = photoelectrons, ccd.multiplication_gain
     # the photocathode is in front of the chip's wells, the register behind them
@@ -262,15 +270,19 @@ def _output(photoelectrons: torch.Tensor, ccd: CCD, generator: torch.Generator) 
     return electrons
 
 
-def _response(ccd: CCD, expected: torch.Tensor) -> torch.Tensor:
+def _response(ccd: CCD, expected: "torch.Tensor") -> "torch.Tensor":
     """Responses of the pixels: those of the chip, whatever is drawn on it."""
+    import torch
+
     generator = torch.Generator().manual_seed(ccd.response_seed)
     drawn = torch.randn(expected.shape[-2:], generator=generator, dtype=torch.float64)
     return (1 + ccd.pixel_response_rms * drawn).clamp(min=0).to(expected.device)
 
 
-def _bad_pixels(ccd: CCD, expected: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _bad_pixels(ccd: CCD, expected: "torch.Tensor") -> "tuple[torch.Tensor, torch.Tensor]":
     """Whether pixels are hot, whether they are dead: those of the chip, no pixel both."""
+    import torch
+
     height, width = expected.shape[-2:]
     order = np.random.default_rng([ccd.response_seed, 1]).permutation(height * width)
     # ranks of one order: with a larger fraction the same pixels stay hot
@@ -282,8 +294,10 @@ def _bad_pixels(ccd: CCD, expected: torch.Tensor) -> tuple[torch.Tensor, torch.T
     return rank < hot, (rank >= hot) & (rank < bad)
 
 
-def _generator(seed: int, number: int, device: torch.device) -> torch.Generator:
+def _generator(seed: int, number: int, device: "torch.device") -> "torch.Generator":
     """The stream of a seed and a number, independent of those of all other pairs."""
+    import torch
+
     for name, value in (("seed", seed), ("images", number)):
         if not isinstance(value, int | np.integer) or value < 0:
             raise InputError(f"{name}: {value!r} is not allowed; expected an integer, 0 or more")
@@ -292,7 +306,7 @@ def _generator(seed: int, number: int, device: torch.device) -> torch.Generator:
     return torch.Generator(device).manual_seed(int(state) >> 1)
 
 
-def _image_numbers(images: int | Iterable[int] | None, expected: torch.Tensor) -> list[int]:
+def _image_numbers(images: int | Iterable[int] | None, expected: "torch.Tensor") -> list[int]:
     count = expected.shape[0] if expected.ndim == 3 else None
     if images is None:
         images = count or 1
@@ -304,7 +318,9 @@ def _image_numbers(images: int | Iterable[int] | None, expected: torch.Tensor) -
     return numbers
 
 
-def _check_image(expected: torch.Tensor, background: float) -> None:
+def _check_image(expected: "torch.Tensor", background: float) -> None:
+    import torch
+
     if expected.ndim not in (2, 3):
         raise InputError(
             f"expected: {expected.ndim} dimensions are not allowed; expected (height, width) or "

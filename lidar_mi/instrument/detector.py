@@ -3,9 +3,9 @@
 from typing import Annotated, Self
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
-from scipy import constants
 
 from lidar_mi.description import Description
 from lidar_mi.units import Frequency, Length, Number, SpectralRadiance, Within, quantity
@@ -71,12 +71,12 @@ class Detector(Description):
 
 def gate_duration(gate_length: ArrayLike) -> np.ndarray:
     """Time in which a gate is recorded, s: 2 dr / c for a gate dr (m) long."""
-    return 2 * np.asarray(gate_length, float) / constants.c
+    return 2 * np.asarray(gate_length, float) / scipy.constants.c
 
 
 def photons_per_energy(wavelength: float) -> float:
     """Photons in one joule of light, lambda / (h c), J^-1."""
-    return wavelength / (constants.h * constants.c)
+    return wavelength / (scipy.constants.h * scipy.constants.c)
 
 
 def signal_photoelectrons(

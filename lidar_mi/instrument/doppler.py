@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
 import numpy as np
-import torch
 from pydantic import AliasChoices, Field, model_validator
 
 from lidar_mi.atmosphere.line import Line
@@ -203,7 +202,7 @@ def _behind_etalon(etalon: Etalon, line: Line, order: float) -> Callable[[np.nda
     """Transmission as a function of the frequency, in the place of a fractional order."""
     amplitudes = harmonics(etalon, line.wavelength)
     spectral_range = etalon.free_spectral_range(line.wavelength)
-    return lambda nu: series(amplitudes, torch.from_numpy(order + nu / spectral_range)).numpy()
+    return lambda nu: series(amplitudes, order + nu / spectral_range)
 
 
 def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line: Line) -> float:

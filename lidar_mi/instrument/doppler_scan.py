@@ -5,13 +5,11 @@ Line-of-sight velocities are positive toward the instrument, as in the paper's e
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import xarray as xr
+import scipy
 from pydantic import Field
-from scipy import constants
-from scipy.interpolate import RegularGridInterpolator
 
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
@@ -20,6 +18,9 @@ from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.motion import attitude, tilted
 from lidar_mi.instrument.scan import HalfAngle
 from lidar_mi.units import Angle, Speed, Within, quantity
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Wind (..., 3) in m/s at points (..., 3) in m.
 WindAt = Callable[[np.ndarray], np.ndarray]
@@ -136,7 +137,7 @@ def sight_volumes(
     pulse_nodes, pulse_weights = np.polynomial.hermite_e.hermegauss(_PULSE)
     beam_nodes, beam_weights = np.polynomial.hermite_e.hermegauss(_BEAM)
     # half the way of light, and from full width at half maximum to standard deviation
-    smear = constants.c / 2 * lidar.pulse_duration / math.sqrt(8 * math.log(2))
+    smear = scipy.constants.c / 2 * lidar.pulse_duration / math.sqrt(8 * math.log(2))
     offsets = lidar.range_bin / 2 * bin_nodes[:, None] + smear * pulse_nodes
     along = ranges[:, None] + offsets.ravel()
     if along.min() <= 0:
@@ -165,7 +166,7 @@ def sight_volumes(
     return points.reshape(lines, -1, 3), weights / weights.sum(1, keepdims=True)
 
 
-def wind_at(wind: xr.Dataset, points: np.ndarray) -> np.ndarray:
+def wind_at(wind: "xr.Dataset", points: np.ndarray) -> np.ndarray:
     """Wind (..., 3) at points (..., 3), by linear interpolation.
 
     Parameters
@@ -198,11 +199,13 @@ def wind_at(wind: xr.Dataset, points: np.ndarray) -> np.ndarray:
     values = np.stack([wind[n].transpose(*axes).values for n in ("u", "v", "w")], -1)
     grid = tuple(wind[axis].values.astype(float) for axis in axes)
     # extrapolates, but by the slack at most
-    return RegularGridInterpolator(grid, values, bounds_error=False, fill_value=None)(places)
+    return scipy.interpolate.RegularGridInterpolator(
+        grid, values, bounds_error=False, fill_value=None
+    )(places)
 
 
 def wind_of_lines(
-    wind: xr.Dataset, points: np.ndarray, times: np.ndarray | None = None
+    wind: "xr.Dataset", points: np.ndarray, times: np.ndarray | None = None
 ) -> np.ndarray:
     """Wind (lines, points, 3) at points (lines, points, 3), each line at its own time.
 
@@ -224,7 +227,7 @@ def wind_of_lines(
 
 
 def scan_wind(
-    wind: xr.Dataset | WindAt,
+    wind: "xr.Dataset | WindAt",
     scan: DopplerScan,
     lidar: DopplerLidar,
     v_los_std: float | np.ndarray,
@@ -232,7 +235,7 @@ def scan_wind(
     speed: float = 0.0,
     errors: PlatformErrors | None = None,
     beams: Beams | None = None,
-) -> xr.Dataset:
+) -> "xr.Dataset":
     """Measurement of a wind field by a Doppler lidar, line by line.
 
     The velocity is the wind's projection averaged over the volume (`sight_volumes`) plus the
@@ -269,6 +272,8 @@ def scan_wind(
     InputError
         A field that does not contain the scan; a negative standard error.
     """
+    import xarray as xr
+
     ranges, errors = scan.ranges(lidar, beams), errors or PlatformErrors()
     directions = scan.directions() if beams is None else beams.reported_direction
     std = np.broadcast_to(np.asarray(v_los_std, float), len(directions)).copy()

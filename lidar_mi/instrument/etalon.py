@@ -15,11 +15,9 @@ import math
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
-import torch
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
-from scipy import constants
-from scipy.optimize import brentq
 
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.description import Description
@@ -128,7 +126,7 @@ class Etalon(Description):
 
     def free_spectral_range(self, wavelength: float) -> float:
         """Frequency from one order to the next, c / (2 n d), Hz."""
-        return constants.c / (2 * self.index * self.tuned_gap(wavelength))
+        return scipy.constants.c / (2 * self.index * self.tuned_gap(wavelength))
 
 
 def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
@@ -234,11 +232,10 @@ def harmonics(
     return amplitudes[: max(2, np.count_nonzero(remainder > 1e-12 * remainder[0]))]
 
 
-def series(amplitudes: np.ndarray, order: torch.Tensor) -> torch.Tensor:
+def series(amplitudes: np.ndarray, order: ArrayLike) -> np.ndarray:
     """A_0 + 2 Re sum A_n exp(2 pi i n m) at the orders ``m``, by Horner's rule in float64."""
-    phase = 2 * math.pi * order.double()
-    z = torch.polar(torch.ones_like(phase), phase)
-    total = torch.zeros_like(z)
+    z = np.exp(2j * math.pi * np.asarray(order, float))
+    total = np.zeros_like(z)
     # without A_0, which is not doubled
     for amplitude in amplitudes[:0:-1].tolist():
         total += amplitude
@@ -265,7 +262,7 @@ def transmission(
         Average over this line, shifted by ``offset``; default: monochromatic light.
     """
     order = fractional_order(etalon, wavelength, cosine, offset)
-    return series(harmonics(etalon, wavelength, line), torch.as_tensor(order)).numpy()
+    return series(harmonics(etalon, wavelength, line), order)
 
 
 def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> float:
@@ -279,12 +276,12 @@ def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> floa
     amplitudes = harmonics(etalon, wavelength, line)
 
     def above_half(order: float) -> float:
-        both = series(amplitudes, torch.tensor([order, 0.0], dtype=torch.float64))
+        both = series(amplitudes, [order, 0.0])
         return float(both[0] - both[1] / 2)
 
     if above_half(0.5) >= 0:
         raise InputError("etalon: no finesse; its fringes nowhere fall to half their height")
-    return 0.5 / brentq(above_half, 0, 0.5, xtol=1e-12)
+    return 0.5 / scipy.optimize.brentq(above_half, 0, 0.5, xtol=1e-12)
 
 
 def coated_transmission(
@@ -323,7 +320,7 @@ def _round_trip(
 def _less_whole_orders(
     centre: float, gap: float, wavelength: float, cosine: ArrayLike, offset: ArrayLike
 ) -> np.ndarray:
-    relative = np.asarray(offset, float) * wavelength / constants.c
+    relative = np.asarray(offset, float) * wavelength / scipy.constants.c
     change = gap * (np.asarray(cosine, float) * (1 + relative) - 1)
     # whole orders are taken off first: of 77 000 they would cost the fraction's digits
     return (centre - math.floor(centre)) + change
@@ -342,7 +339,7 @@ def _mirror_amplitudes(
     if etalon.coatings is None:
         raise InputError("etalon.coatings: null is not allowed here; expected layers")
     cosine = np.asarray(cosine, float)
-    wavenumber = 2 * np.pi * (1 / wavelength + np.asarray(offset, float) / constants.c)
+    wavenumber = 2 * np.pi * (1 / wavelength + np.asarray(offset, float) / scipy.constants.c)
     # squared component along the layers, the same in all of them (Snell)
     across = etalon.index**2 * (1 - cosine**2)
 

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from scipy import optimize
+import scipy
 
 from lidar_mi.errors import InputError
 
@@ -262,7 +262,7 @@ def hazard_distance(
     # exposure falls with the distance: doubled until the root is inside
     while excess(far) > 0:
         far *= 2
-    return float(optimize.brentq(excess, 0.0, far, xtol=1e-9 * far, rtol=1e-12))
+    return float(scipy.optimize.brentq(excess, 0.0, far, xtol=1e-9 * far, rtol=1e-12))
 
 
 def scan_hazard_distance(

@@ -5,10 +5,9 @@ have the shape (height, width).
 """
 
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 from pydantic import Field
 
@@ -17,6 +16,9 @@ from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
 from lidar_mi.units import Angle, Length, Number, Within
+
+if TYPE_CHECKING:
+    import torch
 
 # Two Gauss-Legendre points average a pixel to fourth order.
 _NODES = {1: (0.0,), 2: (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))}
@@ -163,7 +165,24 @@ def fringe_image(
     photons: float = 2.4e7,
     counted: str = "detected",
     subsamples: int = 2,
-) -> torch.Tensor:
+) -> "torch.Tensor":
+    """`fringe_values` as a tensor."""
+    import torch
+
+    return torch.from_numpy(
+        fringe_values(camera, etalon, line, v_los, photons, counted, subsamples)
+    )
+
+
+def fringe_values(
+    camera: FringeCamera,
+    etalon: Etalon,
+    line: Line,
+    v_los: ArrayLike = 0.0,
+    photons: float = 2.4e7,
+    counted: str = "detected",
+    subsamples: int = 2,
+) -> np.ndarray:
     """Expected photons of every pixel, without noise or background.
 
     The width of the line is that at the centre of the rings: too large by 1 - cos(theta), 1e-4 in
@@ -187,7 +206,7 @@ def fringe_image(
 
     Returns
     -------
-    torch.Tensor
+    np.ndarray
         float64, (height, width), or (N, height, width) for an array of speeds.
 
     Raises
@@ -200,7 +219,7 @@ def fringe_image(
     if counted not in ("detected", "before_etalon"):
         raise InputError(f"counted: {counted!r} is not allowed; expected detected or before_etalon")
     passed, light = _passed(camera, etalon, line, speeds.ravel(), subsamples)
-    total = passed.sum((1, 2), keepdim=True) if counted == "detected" else light
+    total = passed.sum((1, 2), keepdims=True) if counted == "detected" else light
     return (passed * (photons / total)).reshape(*speeds.shape, camera.height, camera.width)
 
 
@@ -243,13 +262,13 @@ def ring_radii(
 
 def _passed(
     camera: FringeCamera, etalon: Etalon, line: Line, speeds: np.ndarray, subsamples: int
-) -> tuple[torch.Tensor, float]:
+) -> tuple[np.ndarray, float]:
     """Light behind the etalon (N, height, width), and the sum of what came."""
     if subsamples not in _NODES:
         raise InputError(f"subsamples: {subsamples!r} is not allowed; expected 1 or 2")
     nodes = _NODES[subsamples]
     amplitudes = harmonics(etalon, line.wavelength, line)
-    passed = torch.zeros((len(speeds), camera.height, camera.width), dtype=torch.float64)
+    passed = np.zeros((len(speeds), camera.height, camera.width))
     light = 0.0
     radius = camera.defocus / 2 / camera.pixel
     disc = [(w, radius * x, radius * y) for w, x, y in _DISC] if radius else [(1.0, 0.0, 0.0)]
@@ -263,7 +282,7 @@ def _passed(
             for image, speed in zip(passed, speeds, strict=True):
                 offset = doppler_shift(speed, line.wavelength)
                 order = fractional_order(etalon, line.wavelength, cosine, offset)
-                image += series(amplitudes, torch.from_numpy(order)) * torch.from_numpy(falloff)
+                image += series(amplitudes, order) * falloff
     return passed, light
 
 

@@ -8,8 +8,8 @@ corners, evenly to all sides.
 """
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from lidar_mi.errors import InputError
 
@@ -102,7 +102,7 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
         return np.concatenate(residuals)
 
     power = 1 / (index - 1)
-    solved = least_squares(
+    solved = scipy.optimize.least_squares(
         aberrations,
         [0.85 * power, -0.15 * power, -0.5, 1.0],
         x_scale=[1, 1, 1, 0.01],

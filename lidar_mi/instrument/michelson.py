@@ -14,9 +14,9 @@ import math
 from typing import Annotated, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field
-from scipy import constants
 
 from lidar_mi.description import Description
 from lidar_mi.units import Length, Number, Within
@@ -60,7 +60,7 @@ class Michelson(Description):
     @property
     def delay(self) -> float:
         """Path difference over the speed of light, s."""
-        return self.path_difference / constants.c
+        return self.path_difference / scipy.constants.c
 
 
 def harmonics(michelson: Michelson) -> np.ndarray:

@@ -6,16 +6,18 @@ Pitch is positive nose up, yaw nose to port, roll port wing up.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self, cast
+from typing import TYPE_CHECKING, Annotated, Literal, Self, cast
 
 import numpy as np
+import scipy
 from pydantic import Field, ValidationInfo, field_serializer, field_validator, model_validator
-from scipy import special
-from scipy.spatial.transform import Rotation, Slerp
 
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.units import Angle, Frequency, Within, to_si
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 PLACES, ANGLES = ("x", "y", "z"), ("roll", "pitch", "yaw")
 
@@ -97,7 +99,7 @@ class Pose:
 
     place: np.ndarray
     velocity: np.ndarray
-    attitude: Rotation
+    attitude: "Rotation"
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ class Trajectory:
 
     time: np.ndarray
     place: np.ndarray
-    attitude: Rotation
+    attitude: "Rotation"
     source: str
 
     def at(self, time: np.ndarray, speed: float) -> Pose:
@@ -149,7 +151,7 @@ class Trajectory:
         velocity = (np.diff(self.place, axis=0) / np.diff(self.time)[:, None])[part]
         place[:, 0] -= speed * time
         velocity[:, 0] -= speed
-        return Pose(place, velocity, Slerp(self.time, self.attitude)(time))
+        return Pose(place, velocity, scipy.spatial.transform.Slerp(self.time, self.attitude)(time))
 
 
 def trajectory(columns: Mapping[str, np.ndarray], speed: float, source: str) -> Trajectory:
@@ -168,10 +170,12 @@ def trajectory(columns: Mapping[str, np.ndarray], speed: float, source: str) -> 
 
 def attitude(
     roll: float | np.ndarray, pitch: float | np.ndarray, yaw: float | np.ndarray
-) -> Rotation:
+) -> "Rotation":
     """Rotation from the body to the lidar's frame by yaw, pitch and roll, in this order, rad."""
     # capitals: about axes that turn along; about y, to port, the nose goes down
-    return Rotation.from_euler("ZYX", np.stack([yaw, np.negative(pitch), roll], -1))
+    return scipy.spatial.transform.Rotation.from_euler(
+        "ZYX", np.stack([yaw, np.negative(pitch), roll], -1)
+    )
 
 
 def tilted(directions: np.ndarray, rms: float, random: np.random.Generator) -> np.ndarray:
@@ -204,7 +208,7 @@ def random_process(
     corner = 2 * math.pi * bandwidth / math.sqrt(math.sqrt(2) - 1)
     strata = (np.arange(_WAVES) + random.random(_WAVES)) / _WAVES
     # quantiles of the upper half of the distribution: frequencies are positive
-    frequencies = corner / math.sqrt(3) * special.stdtrit(3, (1 + strata) / 2)
+    frequencies = corner / math.sqrt(3) * scipy.special.stdtrit(3, (1 + strata) / 2)
     cosine, sine = rms / math.sqrt(_WAVES) * random.standard_normal((2, _WAVES))
     found = np.zeros(len(time))
     for one, a, b in zip(frequencies, cosine, sine, strict=True):
@@ -257,5 +261,5 @@ def true_pose(
     return Pose(
         recorded.place + place,
         recorded.velocity + velocity,
-        cast(Rotation, recorded.attitude * turned),
+        cast("Rotation", recorded.attitude * turned),
     )

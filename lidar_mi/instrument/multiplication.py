@@ -4,7 +4,10 @@ Both multiply every photoelectron by a random number g of mean G. A pixel of mea
 variance F^2 G^2 mu, with the excess noise factor F^2 = <g^2> / G^2.
 """
 
-import torch
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
 
 
 def register_excess(gain: float, stages: int) -> float:
@@ -26,14 +29,16 @@ def register_excess(gain: float, stages: int) -> float:
 
 
 def register_output(
-    electrons: torch.Tensor, gain: float, stages: int, generator: torch.Generator
-) -> torch.Tensor:
+    electrons: "torch.Tensor", gain: float, stages: int, generator: "torch.Generator"
+) -> "torch.Tensor":
     """Electrons behind the register, float64, of whole numbers before it.
 
     Every electron is still there; the ones that were freed are negative binomial. That is the exact
     law of very many stages (one electron becomes a geometric number), and has the exact mean and
     variance for any number of them.
     """
+    import torch
+
     freed = gain - 1
     if freed == 0:
         return electrons.double()
@@ -45,8 +50,8 @@ def register_output(
 
 
 def intensified(
-    electrons: torch.Tensor, gain: float, excess: float, generator: torch.Generator
-) -> torch.Tensor:
+    electrons: "torch.Tensor", gain: float, excess: float, generator: "torch.Generator"
+) -> "torch.Tensor":
     """Electrons on the chip behind an intensifier, float64, of so many from its photocathode.
 
     Pulse heights follow a Gamma distribution of mean ``gain`` and relative variance
@@ -57,8 +62,10 @@ def intensified(
     return _gamma(electrons / (excess - 1), generator) * (gain * (excess - 1))
 
 
-def _gamma(shape: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+def _gamma(shape: "torch.Tensor", generator: "torch.Generator") -> "torch.Tensor":
     """Gamma numbers of scale 1; 0 where the shape is."""
+    import torch
+
     # the sampler of torch.distributions.Gamma, which accepts no generator
     drawn = torch._standard_gamma(torch.where(shape > 0, shape, 1.0).double(), generator=generator)
     return torch.where(shape > 0, drawn, 0.0)

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from scipy import constants
+import scipy
 
 from lidar_mi.errors import InputError
 
@@ -80,7 +80,7 @@ def pulse_budget(
             raise InputError(f"{name}: {value} is not allowed; expected more than 0")
     mean = directions * slabs_per_second * pulses_per_direction
     rate = mean if sending is None else directions * pulses_per_direction / sending
-    echo_time = 2 * farthest / constants.c
+    echo_time = 2 * farthest / scipy.constants.c
     return PulseBudget(
         pulses_per_second=rate,
         # over all time, turns of the scanner included

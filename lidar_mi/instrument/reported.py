@@ -4,15 +4,17 @@ Errors are truth minus the reported value, in the lidar's frame.
 """
 
 from collections.abc import Callable
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from lidar_mi.description import Description
 from lidar_mi.instrument.motion import ANGLES, PLACES, Pose, attitude, random_process
 from lidar_mi.units import Angle, AngularRate, Frequency, Length, Speed, Time, Within
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _Place = Annotated[Length, Within(-10000, 10000, "no navigation at all")]
 _Turn = Annotated[Angle, Within(-1, 1, "larger errors are no errors of an attitude")]
@@ -112,4 +114,4 @@ def reported_pose(
     place[:, 0] -= speed * reported.latency
     velocity = late.velocity - [getattr(reported.drift, axis) for axis in PLACES]
     missed = attitude(*(error[axis] for axis in ANGLES))
-    return Pose(place, velocity, cast(Rotation, missed.inv() * late.attitude))
+    return Pose(place, velocity, cast("Rotation", missed.inv() * late.attitude))

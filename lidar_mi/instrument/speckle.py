@@ -1,8 +1,8 @@
 """Speckle of the received light: independent patterns in time and over the telescope."""
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import special
 
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.detector import Detector
@@ -39,7 +39,9 @@ def temporal_modes(line_width: float, duration: ArrayLike) -> np.ndarray:
     """
     # the duration in coherence times
     x = np.asarray(duration, float) * line_width / np.sqrt(2 * np.log(2) / np.pi)
-    return 1 / (special.erf(np.sqrt(np.pi) * x) / x + np.expm1(-np.pi * x**2) / (np.pi * x**2))
+    return 1 / (
+        scipy.special.erf(np.sqrt(np.pi) * x) / x + np.expm1(-np.pi * x**2) / (np.pi * x**2)
+    )
 
 
 def spatial_modes(
@@ -70,7 +72,7 @@ def spatial_modes(
     small = a < 1e-6
     safe = np.where(small, 1.0, a)
     # ive is scaled by exp(-a): the functions themselves overflow
-    closed = safe / 2 / (1 - special.ive(0, safe) - special.ive(1, safe))
+    closed = safe / 2 / (1 - scipy.special.ive(0, safe) - scipy.special.ive(1, safe))
     return np.where(small, 1 + a / 2, closed)
 
 

@@ -18,11 +18,10 @@ import re
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import OpenEXR
-import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
@@ -30,6 +29,10 @@ from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.exr_header import declared
 from lidar_mi.io.library_name import library_name
 from lidar_mi.io.size import check_size
+
+if TYPE_CHECKING:
+    import xarray as xr
+
 
 MOST_LAYERS = 2**15 - 1
 """Of a file: the library counts them in 16 bits."""
@@ -60,7 +63,7 @@ _STRUCTURE = {
 }
 
 
-def write_scan(path: str | Path, scan: xr.Dataset) -> None:
+def write_scan(path: str | Path, scan: "xr.Dataset") -> None:
     """Write a scan: S0 ... S3, S0_stderr with dims (gate, z, y), and Y with dims (z, y).
 
     The file is written whole or not at all; errors as of `write_atomically`. Values are float32.
@@ -82,7 +85,7 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     _write(path, axes | scan.attrs, channels)
 
 
-def write_fringes(path: str | Path, image: xr.Dataset) -> None:
+def write_fringes(path: str | Path, image: "xr.Dataset") -> None:
     """Write the image of a fringe camera: S0 ... S3, S0_stderr with dims (y, x), y downwards.
 
     ``Y`` is a copy of S0, so that any viewer shows the rings. Files, values and attributes as in
@@ -92,7 +95,7 @@ def write_fringes(path: str | Path, image: xr.Dataset) -> None:
     _write(Path(path), image.attrs, layers | {"Y": layers["S0"]})
 
 
-def read_fringes(path: str | Path) -> xr.Dataset:
+def read_fringes(path: str | Path) -> "xr.Dataset":
     """Read an image written by `write_fringes`; the round trip is exact in float32.
 
     Raises
@@ -109,8 +112,10 @@ def read_fringes(path: str | Path) -> xr.Dataset:
     return label_fringes({name: layers[name] for name in QUANTITIES}, header)
 
 
-def label_fringes(layers: dict[str, np.ndarray], attributes: dict[str, Any]) -> xr.Dataset:
+def label_fringes(layers: dict[str, np.ndarray], attributes: dict[str, Any]) -> "xr.Dataset":
     """Layers (height, width) of a fringe camera with names, units and pixel numbers as axes."""
+    import xarray as xr
+
     rows, columns = layers["S0"].shape
     image = xr.Dataset(
         {name: (("y", "x"), values) for name, values in layers.items()},
@@ -224,7 +229,7 @@ def axis_of(header: dict[str, Any], name: str, size: int, path: str | Path) -> n
 
 
 @checked_arguments
-def read_scan(path: str | Path) -> xr.Dataset:
+def read_scan(path: str | Path) -> "xr.Dataset":
     """Read a scan of the backscatter lidar from an EXR file; the round trip is exact in float32.
 
     Parameters
@@ -251,6 +256,8 @@ def read_scan(path: str | Path) -> xr.Dataset:
     >>> scan = lm.read_scan("image_t1.exr")                              # doctest: +SKIP
     >>> wind = lm.retrieve_wind(scan["Y"], later["Y"], scan.attrs["dt"])  # doctest: +SKIP
     """
+    import xarray as xr
+
     header, layers = read_layers(path)
     gates: dict[int, dict[str, np.ndarray]] = {}
     for name, pixels in layers.items():
@@ -284,12 +291,12 @@ def read_scan(path: str | Path) -> xr.Dataset:
     )
 
 
-def _quantities(scan: xr.Dataset) -> list[str]:
+def _quantities(scan: "xr.Dataset") -> list[str]:
     """Variables of a scan for every gate."""
     return [str(name) for name, variable in scan.data_vars.items() if "gate" in variable.dims]
 
 
-def _once_per_scan(scan: xr.Dataset) -> list[str]:
+def _once_per_scan(scan: "xr.Dataset") -> list[str]:
     """Variables of a scan without gates: Y, what a detector adds, times and places of beams."""
     return [
         str(name) for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}
@@ -308,7 +315,7 @@ def unpack(
     }
 
 
-def label_scan(scan: xr.Dataset) -> xr.Dataset:
+def label_scan(scan: "xr.Dataset") -> "xr.Dataset":
     """The same scan with CF names and units on its variables."""
     meaning = _MEANING | {
         "S0_largest_share": "largest share of one Monte Carlo sample in the variance of S0",

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.io import savemat
 
 from lidar_mi.io.atomic import write_atomically
 
@@ -37,5 +37,7 @@ def write_mat(path: str | Path, data: xr.Dataset) -> None:
             meanings = np.array(variable.attrs["flag_meanings"].split(), dtype=object)
             about.setdefault("flag_meanings", {})[field] = meanings
     buffer = BytesIO()
-    savemat(buffer, {**values, **about}, long_field_names=True, do_compression=True, oned_as="row")
+    scipy.io.savemat(
+        buffer, {**values, **about}, long_field_names=True, do_compression=True, oned_as="row"
+    )
     write_atomically(path, buffer.getbuffer())

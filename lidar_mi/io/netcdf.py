@@ -6,10 +6,8 @@ import shlex
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import dask
-import h5py
 import numpy as np
 import xarray as xr
 
@@ -17,6 +15,10 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.compression import compression
 from lidar_mi.io.size import check_size
+
+if TYPE_CHECKING:
+    import h5py
+
 
 # What never written cells hold (NC_FILL_* of netcdf.h), but in types of one byte, which the library
 # does not check either, as all their values are in use.
@@ -99,6 +101,8 @@ def _open(path: str | Path, **how: Any) -> xr.Dataset:
 
 def _kind(path: Path) -> str:
     """CDF-1, CDF-2, CDF-5 or HDF5, by how a file begins; all others are refused."""
+    import h5py
+
     if path.is_dir() and any((path / name).exists() for name in _ZARR):
         name = shlex.quote(str(path))
         raise InputError(
@@ -134,6 +138,8 @@ def _convert(command: str, path: Path, wanted: str = "NetCDF-4 or NetCDF-3 class
 
 def _declared(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
     """Bytes read on opening and the largest chunk read for a value; filters that are missing."""
+    import h5py
+
     found: list[tuple[str, int]] = []
     filters: dict[int, str] = {}
     try:
@@ -158,8 +164,10 @@ def _declared(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
     return found, list(filters.values())
 
 
-def _missing_filters(variable: h5py.Dataset) -> dict[int, str]:
+def _missing_filters(variable: "h5py.Dataset") -> dict[int, str]:
     """Filters of a variable that this HDF5 library lacks, by their registered numbers."""
+    import h5py
+
     settings = variable.id.get_create_plist()
     stored = [settings.get_filter(index) for index in range(settings.get_nfilters())]
     return {
@@ -276,6 +284,8 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     InputError
         As of `write_atomically`.
     """
+    import dask
+
     packed: dict[Any, dict[str, Any]]
     packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
     # CF 2.5.1: no missing values in coordinate variables

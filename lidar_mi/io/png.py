@@ -2,16 +2,18 @@
 
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from lidar_mi import __version__
 from lidar_mi.io.atomic import write_atomically
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> None:
+
+def write_png(figure: "Figure", path: str | Path, *, cropped: bool = False) -> None:
     """Write a figure, 110 dots per inch, whole or not at all.
 
     Parameters
@@ -25,7 +27,7 @@ def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> Non
     write_atomically(path, _png(figure, dpi=110, **room))
 
 
-def png_bytes(figure: Figure) -> bytes:
+def png_bytes(figure: "Figure") -> bytes:
     """A figure as a small PNG file in memory, 70 dots per inch, cropped."""
     return _png(figure, dpi=70, bbox_inches="tight", pad_inches=0.1)
 
@@ -62,7 +64,7 @@ def write_preview(path: str | Path, pixels: np.ndarray) -> tuple[float, float]:
     return float(black), float(white)
 
 
-def _png(figure: Figure, **options: Any) -> bytes:
+def _png(figure: "Figure", **options: Any) -> bytes:
     buffer = BytesIO()
     software = {"Software": f"lidar-mi {__version__}"}
     figure.savefig(buffer, format="png", metadata=software, **options)

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import pint
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.netcdf import load_variable, open_netcdf
 from lidar_mi.io.text import read_text
 from lidar_mi.io.time_axis import count_unit
-from lidar_mi.units import parse_units
+from lidar_mi.units import conversion
 
 TIME = "t"
 """Name of the time, s."""
@@ -82,8 +81,8 @@ def _factor(unit: str | None, target: str, name: str, path: Path) -> float:
             raise InputError(f"{path}: {name}: without a unit; {allowed}")
         return 1.0
     try:
-        return float(parse_units(unit).to(parse_units(target).units).magnitude)
-    except (ValueError, pint.PintError):
+        return conversion(unit, target)
+    except ValueError:
         raise InputError(f"{path}: {name}: unit {unit!r} is not allowed; {allowed}") from None
 
 

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pint
 import xarray as xr
 
 from lidar_mi.atmosphere.regrid import even_axis, interpolated, is_even, statement
 from lidar_mi.errors import InputError
 from lidar_mi.io.netcdf import load_variable, open_netcdf, valid_range
 from lidar_mi.io.time_axis import count_unit, listing, state_at, tolerances
-from lidar_mi.units import parse_units
+from lidar_mi.units import conversion
 
 _DIMENSIONS = ("time", "x", "y", "z")
 _VARIABLES = {
@@ -37,8 +36,8 @@ def _scale_to(variable: xr.DataArray, target: str, name: str, path: Path) -> flo
     if text is None:
         raise InputError(f"{path}: {name} has no units attribute; {allowed}")
     try:
-        return float(parse_units(text).to(parse_units(target).units).magnitude)
-    except (ValueError, pint.PintError):
+        return conversion(text, target)
+    except ValueError:
         raise InputError(f"{path}: {name} has the unit {text!r}; {allowed}") from None
 
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import xarray as xr
 
@@ -19,7 +17,8 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.io.exr import label_scan, unpack
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.memory import samples_at_once
-from lidar_mi.rendering.phase import Molecules
+from lidar_mi.rendering.passes import within_memory
+from lidar_mi.rendering.phase import Molecules, loadable
 from lidar_mi.rendering.settings import RenderSettings
 
 MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
@@ -118,7 +117,7 @@ def render_scans(
     environment : float
         Extinction coefficient around the slab and up to it, m^-1.
     phase : dict
-        Mitsuba phase function of slab and environment.
+        Mitsuba phase function of slab and environment, also with a table as an array.
     albedo : float
         Single-scattering albedo of slab and environment.
     seed : int
@@ -178,6 +177,8 @@ class ScanRenderer:
         settings: RenderSettings,
         molecules: Molecules | None = None,
     ) -> None:
+        import mitsuba as mi
+
         air = (environment, phase, albedo, settings, molecules)
         self._scene = mi.load_dict(scene_dict(extinction, plan, lidar, *air))
         self._parameters = mi.traverse(self._scene)
@@ -203,12 +204,15 @@ class ScanRenderer:
         batches : Batches, optional
             Store of the samples while they are rendered.
         """
+        import drjit as dr
+        import mitsuba as mi
+
         _move(self._parameters, extinction, plan, self._albedo, self._molecules)
         integrator = self._scene.integrator()
         integrator.progress, integrator.batches = progress, batches
         start = time.perf_counter()
         seed %= 2**31  # a header holds 32 bits with a sign
-        image = np.array(mi.render(self._scene, seed=seed))
+        image = within_memory(integrator, lambda: np.array(mi.render(self._scene, seed=seed)))
         dr.flush_malloc_cache()  # the buffers of the tracing are as large as the image
         names = integrator.quantities()
         scan = _as_dataset(image, names, plan, self._lidar, self._environment, self._settings, seed)
@@ -229,6 +233,8 @@ def scene_dict(
     molecules: Molecules | None = None,
 ) -> dict[str, Any]:
     """The Mitsuba scene of one scan as a dictionary for ``mi.load_dict``."""
+    import mitsuba as mi
+
     samples = settings.without_detector(plan.gate_count)
     low, high = _box(extinction)
     place = mi.ScalarTransform4f().translate(low).scale(high - low)
@@ -240,6 +246,7 @@ def scene_dict(
         grid = mi.VolumeGrid(_voxels(field))
         return {"type": "gridvolume", "grid": grid, "to_world": place, "accel": False}
 
+    phase = loadable(phase)
     around = within = {"albedo": albedo, "phase": phase}
     if molecules:
         both, fraction = _mixed(xr.DataArray(environment), albedo, molecules)
@@ -257,7 +264,9 @@ def scene_dict(
             "covariance": mi.is_polarized,
             "shares": True,
             "estimator": settings.estimator,
-            "samples_per_pass": samples_at_once(settings.samples_per_pass, settings.memory),
+            "samples_per_pass": samples_at_once(
+                settings.given_per_pass, settings.memory, mi.variant()
+            ),
         },
         "environment": {"type": "homogeneous", "sigma_t": environment, **around},
         "sensor": {
@@ -324,6 +333,8 @@ def _move(
     molecules: Molecules | None,
 ) -> None:
     """Update the telescope, its beams and the air in the slab to a later scan."""
+    import mitsuba as mi
+
     parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
     beams = _beams(plan)
     parameters["sensor.origins"] = mi.Float(beams[:, :3].ravel())
@@ -387,6 +398,8 @@ def _as_dataset(
     seed: int,
 ) -> xr.Dataset:
     """The rendered tensor (rows from the top, y falling) as a labelled dataset."""
+    import mitsuba as mi
+
     variables = unpack(image, names, plan.gate_count)
     y = attenuated_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
     variables["Y"] = (("z", "y"), y[0].astype(np.float32))
@@ -403,7 +416,7 @@ def _as_dataset(
     attributes = {
         "software": f"lidar-mi {__version__}",
         "units": "Stokes: received over emitted energy; Y: m-1 sr-1; lengths: m; angles: rad",
-        "variant": settings.variant,
+        "variant": mi.variant(),
         "polarized": int(mi.is_polarized),
         "seed": int(seed),
         "samples_per_beam": settings.without_detector(plan.gate_count),

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import xarray as xr
 
@@ -17,6 +16,8 @@ from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.instrument.lens import singlet
 from lidar_mi.io.exr import label_fringes
 from lidar_mi.rendering.batches import Batches
+from lidar_mi.rendering.memory import samples_at_once
+from lidar_mi.rendering.passes import within_memory
 from lidar_mi.rendering.settings import FringeSettings
 
 # from the stop to the etalon, m: any distance that is large enough for a lens
@@ -67,6 +68,8 @@ def render_fringes(
     InputError
         A velocity that is not finite, or a lens that is too fast or has too wide a field.
     """
+    import mitsuba as mi
+
     speeds = np.asarray(v_los, float).ravel()
     if not np.isfinite(speeds).all():
         wrong = speeds[~np.isfinite(speeds)][0]
@@ -95,16 +98,13 @@ def scene_dict(
     etalon: Etalon, camera: FringeCamera, line: Line, settings: FringeSettings
 ) -> dict[str, Any]:
     """The Mitsuba scene of a fringe camera as a dictionary for ``mi.load_dict``."""
-    wavelength = line.wavelength
+    import mitsuba as mi
+
+    wavelength, field = line.wavelength, _field(camera)
     x, y = camera.centre_pixel
-    corner = math.hypot(max(x, camera.width - 1 - x) + 0.5, max(y, camera.height - 1 - y) + 0.5)
-    # what the CCD's defects let in from beyond
-    corner = corner * camera.pixel * (1 + abs(camera.distortion)) + camera.defocus / 2
-    field = math.atan(corner / camera.focal_length) * (1 + sum(map(abs, camera.tilt)))
-    lens: Any = "ideal"
-    if settings.lens == "singlet":
-        rows = singlet(camera.focal_length, wavelength, settings.stop_radius, field)
-        lens = mi.TensorXf(rows.ravel())  # three rows of anything are tried as a colour first
+    surfaces = lens_surfaces(camera, wavelength, settings)
+    # three rows of anything are tried as a colour first
+    lens = "ideal" if surfaces is None else mi.TensorXf(surfaces.ravel())
     source = {}
     if math.isfinite(camera.illumination_radius):
         radius = math.atan(camera.illumination_radius / camera.focal_length)
@@ -117,7 +117,9 @@ def scene_dict(
         "integrator": {
             "type": "fringes",
             "estimator": settings.estimator,
-            "samples_per_pass": settings.samples_per_pass,
+            "samples_per_pass": samples_at_once(
+                settings.given_per_pass, settings.memory, mi.variant()
+            ),
         },
         "line": {
             "type": "spectral_line",
@@ -171,6 +173,30 @@ def scene_dict(
     }
 
 
+def lens_surfaces(
+    camera: FringeCamera, wavelength: float, settings: FringeSettings
+) -> np.ndarray | None:
+    """Surfaces of a real lens as the plugin `ccd` takes them; None: it is ideal.
+
+    Raises
+    ------
+    InputError
+        A lens that is too fast or has too wide a field.
+    """
+    if settings.lens == "ideal":
+        return None
+    return singlet(camera.focal_length, wavelength, settings.stop_radius, _field(camera))
+
+
+def _field(camera: FringeCamera) -> float:
+    """Angle of the light to a pixel that is farthest from the axis, rad."""
+    x, y = camera.centre_pixel
+    corner = math.hypot(max(x, camera.width - 1 - x) + 0.5, max(y, camera.height - 1 - y) + 0.5)
+    # what the CCD's defects let in from beyond
+    corner = corner * camera.pixel * (1 + abs(camera.distortion)) + camera.defocus / 2
+    return math.atan(corner / camera.focal_length) * (1 + sum(map(abs, camera.tilt)))
+
+
 def render_image(scene: Any, samples: int = 0, seed: int = 0) -> xr.Dataset:
     """Render a loaded scene of a `ccd` with the `fringes` integrator and describe the image.
 
@@ -179,8 +205,10 @@ def render_image(scene: Any, samples: int = 0, seed: int = 0) -> xr.Dataset:
     samples : int
         Light paths per pixel; 0: as in the scene.
     """
+    import mitsuba as mi
+
     sensor, integrator = scene.sensors()[0], scene.integrator()
-    image = np.array(mi.render(scene, spp=samples, seed=seed))
+    image = within_memory(integrator, lambda: np.array(mi.render(scene, spp=samples, seed=seed)))
     layers = {name: image[..., k] for k, name in enumerate(integrator.quantities())}
     source, line = scene.environment(), scene.environment().line
     x, y = sensor.centre

@@ -1,7 +1,9 @@
 """Memory used by images of the backscatter lidar, and number of samples within the limit."""
 
 from lidar_mi.errors import InputError
-from lidar_mi.system.memory import GIB, machine_memory
+from lidar_mi.rendering.passes import LEAST
+from lidar_mi.rendering.settings import FringeSettings, RenderSettings
+from lidar_mi.system.memory import GIB, gpu_memory, machine_memory
 
 PROGRAM = 0.8e9
 """Bytes of Python, Mitsuba, torch and their kernels, and of drawing; measured: 0.84 GB."""
@@ -11,6 +13,10 @@ PER_PIXEL = 500
 """Bytes of a pixel of the fringe camera: sixty images in double precision."""
 FRACTION = 0.25
 """Of the memory, for samples that are traced at once."""
+MOST_AT_ONCE = {"llvm": 1 << 22, "cuda": 1 << 28}
+"""Samples of a pass by the device that renders, unless their number is given. On two to sixteen
+cores more of them are no faster. A GPU is the busier the more there are; their indices have 32
+bits."""
 
 
 def ceiling(memory: float | None) -> float:
@@ -18,9 +24,37 @@ def ceiling(memory: float | None) -> float:
     return machine_memory() / 2 if memory is None else memory
 
 
-def samples_at_once(samples_per_pass: int, memory: float | None) -> int:
-    """Samples of a pass, as given or as many as fit into memory; images do not depend on it."""
-    return max(1024, min(samples_per_pass, int(FRACTION * ceiling(memory) / PER_SAMPLE)))
+def samples_at_once(samples_per_pass: int | None, memory: float | None, variant: str) -> int:
+    """Samples of a pass, as given or as many as fit into the memory of the device that renders.
+
+    Images do not depend on it but for rounding.
+
+    Parameters
+    ----------
+    samples_per_pass : int, optional
+        Default: `MOST_AT_ONCE`.
+    memory : float, optional
+        Of the machine, that a run may take, bytes; of a GPU, what is free counts.
+    variant : str
+        Of Mitsuba.
+    """
+    backend = backend_of(variant)
+    most = MOST_AT_ONCE[backend] if samples_per_pass is None else samples_per_pass
+    room = gpu_memory() if backend == "cuda" else ceiling(memory)
+    return min(most, max(LEAST, int(FRACTION * room / PER_SAMPLE)))
+
+
+def host_bytes(samples: float, settings: RenderSettings | FringeSettings) -> float:
+    """Bytes of the machine's memory for that many samples of an image: none where a GPU renders."""
+    if backend_of(settings.variant) == "cuda":
+        return 0.0
+    at_once = samples_at_once(settings.given_per_pass, settings.memory, settings.variant)
+    return PER_SAMPLE * min(samples, at_once)
+
+
+def backend_of(variant: str) -> str:
+    """Either llvm or cuda."""
+    return variant.partition("_")[0]
 
 
 def image_bytes(beams: int, gates: int, quantities: int) -> float:

@@ -4,8 +4,6 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from lidar_mi.atmosphere.molecules import molecular_scattering, molecular_table
@@ -19,7 +17,7 @@ Keys: TypeAlias = Any
 
 
 class Scatterer(NamedTuple):
-    """``phase``: dictionary of the phase function for ``mi.load_dict``; ``albedo``."""
+    """``phase``: dictionary of the phase function, see `loadable`; ``albedo``."""
 
     phase: dict[str, Any]
     albedo: float
@@ -110,6 +108,20 @@ def backscatter_phase_function(air: Scatterer) -> float:
 
     1 / (4 pi) where light is scattered evenly; Rayleigh's is 3 / (8 pi).
     """
+    evenly = 1 / (4 * math.pi)
+    match air.phase:
+        case {"type": "isotropic"}:
+            return evenly
+        case {"type": "hg", "g": g}:
+            return evenly * (1 - g) / (1 + g) ** 2
+        case {"type": "rayleigh_polarized", "depolarization": factor}:
+            return evenly * float(rayleigh_table(factor, 1.0, 1.0).elements[-1, 0])
+        case {"type": "mueller", "table": np.ndarray() as rows}:
+            return evenly * float(rows[-1, 1])
+    # a table without a cross-section, which the plugin alone reads
+    import drjit as dr
+    import mitsuba as mi
+
     phase = mi.load_dict(air.phase)
     at = dr.zeros(mi.MediumInteraction3f)
     at.wi = mi.Vector3f(0, 0, 1)
@@ -161,5 +173,13 @@ def _table(
 
 
 def _tabulated(table: ScatteringTable) -> Scatterer:
-    rows = mi.TensorXf(np.column_stack([table.angle, table.elements]))
+    rows = np.column_stack([table.angle, table.elements])
     return Scatterer({"type": "mueller", "table": rows}, table.albedo)
+
+
+def loadable(phase: dict[str, Any]) -> dict[str, Any]:
+    """The dictionary of a phase function for ``mi.load_dict``: its table is a tensor."""
+    import mitsuba as mi
+
+    table = phase.get("table")
+    return phase | {"table": mi.TensorXf(table)} if isinstance(table, np.ndarray) else phase

@@ -17,7 +17,14 @@ from lidar_mi.io.library_name import is_text
 from lidar_mi.io.text import read_text
 from lidar_mi.io.xml import check_scene_file
 from lidar_mi.rendering.fringes import render_image
-from lidar_mi.rendering.memory import PROGRAM, check_memory, image_bytes, samples_at_once
+from lidar_mi.rendering.memory import (
+    MOST_AT_ONCE,
+    PROGRAM,
+    check_memory,
+    image_bytes,
+    samples_at_once,
+)
+from lidar_mi.rendering.passes import within_memory
 from lidar_mi.rendering.variant import use_variant
 
 
@@ -82,11 +89,15 @@ def render_file(
         write_fringes(out, image)
         return image
     integrator.shares = True
-    integrator.samples_per_pass = samples_at_once(integrator.samples_per_pass, None)
+    # what a scene does not say is the plugin's default
+    given = integrator.samples_per_pass
+    integrator.samples_per_pass = samples_at_once(
+        None if given == MOST_AT_ONCE["llvm"] else given, None, variant
+    )
     needed = image_bytes(sensor.beam_count, sensor.gate_count, len(integrator.quantities()))
     what = f"{scene_path}: {sensor.beam_count} beams x {sensor.gate_count} gates"
     check_memory(PROGRAM + needed, None, what, "fewer beams, gates or orders")
-    tensor = np.array(mi.render(scene, spp=samples, seed=seed))
+    tensor = within_memory(integrator, lambda: np.array(mi.render(scene, spp=samples, seed=seed)))
     scan = _as_dataset(tensor, integrator.quantities(), sensor)
     scan.attrs |= {
         "software": f"lidar-mi {__version__}",

@@ -23,6 +23,7 @@ Variant = Literal[
 VARIANTS: tuple[str, ...] = get_args(Variant)
 
 
+_PerPass = Annotated[int, Within(1024, 2**31 - 1, "fewer waste the processor; counted in 31 bits")]
 _CEILING = Within(1e8, 1e15, "from a small scene to the largest machine")
 
 
@@ -48,12 +49,19 @@ class RenderSettings(Description):
         4, description="scattering orders; 1 = single scattering"
     )
     estimator: Literal["gated", "analog"] = "gated"
-    samples_per_pass: Annotated[
-        int, Within(1024, 2**31 - 1, "fewer waste the processor; counted in 31 bits")
-    ] = Field(1 << 22, description="traced at once, fewer if memory does not hold them")
+    samples_per_pass: _PerPass = Field(
+        1 << 22,
+        description="traced at once, fewer if memory does not hold them; by default on a GPU as "
+        "many as it holds",
+    )
     memory: Annotated[Memory, _CEILING] | None = Field(
         None, description="that a run may take; default: half of the machine's"
     )
+
+    @property
+    def given_per_pass(self) -> int | None:
+        """Samples of a pass, if they are given."""
+        return _given_per_pass(self)
 
     def without_detector(self, gates: int) -> int:
         """Samples per beam as given, or `SAMPLES_PER_GATE` of every gate."""
@@ -86,9 +94,21 @@ class FringeSettings(Description):
     stop_radius: Annotated[Length, Within(1e-6, 1, "from a pinhole to the largest lens")] = Field(
         5e-3, description="of the light into the lens"
     )
-    samples_per_pass: Annotated[
-        int, Within(1024, 2**31 - 1, "fewer waste the processor; counted in 31 bits")
-    ] = Field(1 << 22, description="traced at once, fewer if memory does not hold them")
+    samples_per_pass: _PerPass = Field(
+        1 << 22,
+        description="traced at once, fewer if memory does not hold them; by default on a GPU as "
+        "many as it holds",
+    )
     memory: Annotated[Memory, _CEILING] | None = Field(
         None, description="that a run may take; default: half of the machine's"
     )
+
+    @property
+    def given_per_pass(self) -> int | None:
+        """Samples of a pass, if they are given."""
+        return _given_per_pass(self)
+
+
+def _given_per_pass(settings: RenderSettings | FringeSettings) -> int | None:
+    given = "samples_per_pass" in settings.model_fields_set
+    return settings.samples_per_pass if given else None

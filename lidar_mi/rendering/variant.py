@@ -1,7 +1,5 @@
 """Setting Mitsuba's variant, with a clear message if it cannot be set."""
 
-import mitsuba as mi
-
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.rendering.settings import VARIANTS
@@ -38,11 +36,9 @@ expected one of llvm_ad_mono_polarized, llvm_ad_mono, llvm_ad_rgb, llvm_ad_spect
 llvm_ad_spectral, cuda_ad_mono_polarized, cuda_ad_mono, cuda_ad_rgb, cuda_ad_spectral_polarized, \
 cuda_ad_spectral
     """
-    if name not in VARIANTS:
-        reason = ", as it has no arrays of rays" if name.startswith("scalar") else ""
-        raise InputError(
-            f"variant: {name!r} is not allowed{reason}; expected one of {', '.join(VARIANTS)}"
-        )
+    import mitsuba as mi
+
+    _check_name(name)
     if name.startswith("llvm"):
         require_llvm()
     try:
@@ -52,6 +48,36 @@ cuda_ad_spectral
         raise InputError(f"variant: {name} cannot run here: {reason}") from None
     # Mitsuba's hint that a monochrome film is monochrome is of no use to anyone here
     mi.set_log_level(mi.LogLevel.Error)
+
+
+def has_cuda() -> bool:
+    """Whether ``cuda_*`` variants can run here: an NVIDIA GPU, and a driver that Dr.Jit takes."""
+    import drjit as dr
+
+    return bool(dr.has_backend(dr.JitBackend.CUDA))
+
+
+def check_variant(name: str) -> None:
+    """Refuse a variant as `use_variant` does; Mitsuba is loaded for CUDA alone.
+
+    Raises
+    ------
+    InputError
+        As of `use_variant`.
+    """
+    if name.startswith("cuda"):
+        use_variant(name)
+        return
+    _check_name(name)
+    require_llvm()
+
+
+def _check_name(name: str) -> None:
+    if name not in VARIANTS:
+        reason = ", as it has no arrays of rays" if name.startswith("scalar") else ""
+        raise InputError(
+            f"variant: {name!r} is not allowed{reason}; expected one of {', '.join(VARIANTS)}"
+        )
 
 
 def _first_line(error: Exception) -> str:

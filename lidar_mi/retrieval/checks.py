@@ -8,6 +8,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.device import device_of
 
 LARGEST = 1e100
 """Of the values of an image: sums of their products are finite."""
@@ -62,7 +63,7 @@ def identical(
 def on_device(image: xr.DataArray, device: str | torch.device) -> torch.Tensor:
     """The image's pixels as a tensor."""
     try:
-        target = torch.device(device)
+        target = device_of(device)
         return torch.as_tensor(np.ascontiguousarray(image.values), device=target)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]

@@ -75,6 +75,14 @@ assert torch.fft.irfft2(torch.fft.rfft2(torch.ones(8, 8))).sum().item() == 64
 print(f'{build} build, {torch.get_num_threads()} threads{devices}')
 """
 
+_TRY_DEVICE = """
+import torch
+from lidar_mi.rendering.variant import has_cuda
+where = {True: 'the GPU', False: 'the processor'}
+rendering, retrieval = has_cuda(), torch.cuda.is_available()
+print(f'auto renders on {where[rendering]}, retrieves on {where[rendering and retrieval]}')
+"""
+
 # The embedded sample through h5netcdf, which installs without the HDF5 reader that it needs.
 _TRY_NETCDF = """
 from importlib import resources
@@ -146,6 +154,7 @@ def doctor() -> Checkup:
         _check_plugins,
         _check_netcdf,
         _check_torch,
+        _check_device,
     ]
     checks = [_check_python(), *_check_dependencies(), _check_llvm()]
     with ThreadPoolExecutor(max_workers=_cores()) as pool:
@@ -284,6 +293,11 @@ def _reinstall(*packages: str) -> str:
 def _check_torch() -> Check:
     ok, said = _attempt(_TRY_TORCH)
     return Check("torch computes", ok, said, "" if ok else _reinstall("torch"))
+
+
+def _check_device() -> Check:
+    ok, said = _attempt(_TRY_DEVICE)
+    return Check("device", ok, said, "" if ok else _reinstall("torch", "drjit"))
 
 
 def _check_netcdf() -> Check:

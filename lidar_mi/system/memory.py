@@ -1,9 +1,12 @@
 """The machine's memory, as far as a process may have it."""
 
 import os
+import subprocess
 from pathlib import Path
 
 GIB = 1 << 30
+UNKNOWN_GPU = 2 * GIB
+"""Bytes that a GPU is taken to have free where nothing says how many."""
 
 
 def machine_memory() -> int:
@@ -17,6 +20,22 @@ def available_memory() -> int:
     lines = meminfo.read_text().splitlines() if meminfo.is_file() else []
     free = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable")]
     return min([machine_memory(), *free])
+
+
+def gpu_memory() -> int:
+    """Bytes that are free on the GPU that renders: by the driver's tool, or else by torch.
+
+    Where neither says it, `UNKNOWN_GPU`.
+    """
+    asked = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0] or "0"
+    query = ["nvidia-smi", "-i", asked, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
+    try:
+        said = subprocess.run(query, check=True, capture_output=True, text=True, timeout=20).stdout
+        return int(said.split()[0]) << 20
+    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
+        import torch
+
+        return torch.cuda.mem_get_info()[0] if torch.cuda.is_available() else UNKNOWN_GPU
 
 
 def _container_limits() -> list[int]:

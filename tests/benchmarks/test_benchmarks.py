@@ -32,6 +32,7 @@ from benchmarks import (
     cases,
     estimators,
     fringes,
+    gpu,
     growth,
     measure,
     methods,
@@ -447,3 +448,50 @@ def test_errors_of_settings_are_those_of_the_truth():
         if method != "variational":
             rms, normalised = settings.mean_errors(errors, defaults, [1])
             assert 0.05 < rms < 2 and 0.5 < normalised < 2, case
+
+
+# --- a GPU
+
+
+def test_without_a_gpu_the_reason_is_said(monkeypatch):
+    monkeypatch.setattr(gpu, "has_cuda", lambda: False)
+    found = gpu.compare(1)
+    assert found.rows == ()
+    assert found.reason == "skipped: no NVIDIA GPU with a driver that is new enough"
+
+
+def test_a_gpu_beside_the_processor(monkeypatch):
+    """The processor in its place: the same images, z-scores as expected, ratios of time."""
+    renderer_of, retrieval = gpu.renderer_of, gpu.retrieval
+    monkeypatch.setattr(gpu, "has_cuda", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpu, "named", lambda: "a GPU")
+    monkeypatch.setattr(
+        gpu, "renderer_of", lambda pair, name, *how: renderer_of(pair, f"llvm{name[4:]}", *how)
+    )
+    monkeypatch.setattr(gpu, "retrieval", lambda pair, method, _: retrieval(pair, method, "cpu"))
+    found = gpu.compare(1, 40, 30, (8,), 64, ("mono",), ("cc", "vortex_fit"), tests=())
+    assert found.reason == "" and "a GPU" in found.notes[0]
+    for order in ("1 order", "4 orders"):
+        case = f"images in cuda_ad_mono, {order}, 64 samples"
+        rows = {line.quantity: line for line in found.rows if line.case == case}
+        same = [line.ours for name, line in rows.items() if name.startswith("same seed")]
+        assert same == [0, 0]
+        for name, expected in (("mean z-score", 0.0), ("variance of z-scores", 63 / 61)):
+            line = rows[f"other seed: {name}"]
+            # three sigma, as its remark says; four here
+            allowed = float(line.note.rsplit(" ", 1)[1]) * 4 / 3
+            assert abs(line.ours - expected) < allowed and allowed < 0.3
+    (rate,) = (line for line in found.rows if line.case == "rendering, 1 order, warm")
+    assert rate.ratio == pytest.approx(rate.ours / rate.other)
+    times = {line.quantity: line for line in found.rows if line.case == "retrieval of a pair"}
+    assert set(times) == {"cc", "vortex_fit"}
+    assert all("winds differ by 0 m/s" in line.note for line in times.values())
+
+
+@pytest.mark.slow
+def test_plugins_tests_run_in_the_variants_of_cuda():
+    """All are skipped where there is no GPU, none fails."""
+    found = {line.quantity: line.ours for line in gpu.tested("tests/plugins/test_laser.py")}
+    assert found["failed"] == 0 and found["passed"] + found["skipped"] > 0
+    assert gpu.has_cuda() or found["skipped"] > 0

@@ -9,7 +9,7 @@ import pytest
 from lidar_mi.campaign.collect import collect
 from lidar_mi.campaign.engine import prepare_campaign
 from lidar_mi.campaign.worker import carry_out
-from lidar_mi.experiment.folder.run_folder import read_metrics
+from lidar_mi.experiment.folder.records import read_metrics
 from lidar_mi.experiment.run import run
 from lidar_mi.io.netcdf import read_netcdf
 from tests.support.campaigns import described

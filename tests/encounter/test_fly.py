@@ -141,25 +141,34 @@ def test_keys_without_effect_are_warned_of():
     assert speed.endswith("makes it 75 m/s")
 
 
-def test_each_command_takes_its_own(tmp_path):
+def test_each_command_takes_its_own():
     with pytest.raises(InputError, match="is a flight, not a run; expected lidar-mi fly"):
         lm.run(experiment())
     with pytest.raises(InputError, match="encounter: missing in wake_sensor"):
         lm.fly("wake_sensor", notice=silent)
     with pytest.raises(InputError, match="expected the section of a flight, or lidar-mi run"):
         command("wake_sensor")
-    short = ("encounter.path.start=60 m", "encounter.path.beyond=10 m")
-    sets = [part for one in short for part in ("--set", one)]
-    done = shell("fly", "encounter", "--mode", "off", *sets, "-o", tmp_path / "out")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """What the command says of a short flight without control, and its folder."""
+    folder = tmp_path_factory.mktemp("flown") / "out"
+    changes = ("start=60 m", "beyond=10 m", "crossing_angle=20 deg")
+    sets = [part for one in changes for part in ("--set", f"encounter.path.{one}")]
+    return shell("fly", "encounter", "--mode", "off", *sets, "-o", folder), folder
+
+
+def test_the_command_flies(flown):
+    done, folder = flown
     assert done.returncode == 0, done.stderr
-    assert "largest roll angle" in done.stdout and (tmp_path / "out" / "flight.nc").is_file()
+    assert "largest roll angle" in done.stdout and (folder / "flight.nc").is_file()
     assert re.search(r"without control: \d+ of \d+ s", done.stderr)
 
 
-def test_info_shows_a_flight(tmp_path):
+def test_info_shows_a_flight(flown):
     """Its settings in usual units, without those that have no effect, and its numbers."""
-    lm.fly(experiment(control={"mode": "off"}, path=SHORT), tmp_path / "out", notice=silent)
-    done = shell("info", tmp_path / "out")
+    done = shell("info", flown[1])
     assert done.returncode == 0, done.stderr
     for words in ("encounter.path.crossing_angle", "20 deg", "532 nm", "largest roll angle"):
         assert words in done.stdout

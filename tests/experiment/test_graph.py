@@ -5,7 +5,9 @@ another type than is said, parts rendered again although they are there, a run i
 files or finds other numbers than one in a folder.
 """
 
+import ast
 import gc
+import importlib
 import inspect
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,6 +31,16 @@ from tests.support.experiments import check, small
 
 def load(name, changes=()):
     return config.load(experiment_file(name), list(changes))
+
+
+def hints(typed):
+    """Annotations of a function or a class, with the types that only a type checker imports."""
+    module = importlib.import_module(typed.__module__)
+    known = vars(module).copy()
+    for node in ast.parse(inspect.getsource(module)).body:
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            exec(ast.unparse(node.body), known)
+    return get_type_hints(typed, known, known)
 
 
 def names(stages):
@@ -158,16 +170,16 @@ def test_parts_that_are_there_are_not_made_again(experiment):
 
 def test_names_are_unambiguous_and_types_those_of_the_results():
     """No stage has the name of a section; every parameter is typed; results are what is said."""
-    said = get_type_hints(Results)
+    said = hints(Results)
     assert {stage.name for stage in STAGES} == set(said)
     for stage in STAGES:
         assert section_path(stage.name) is None
         functions = (stage.compute, stage.check, stage.remarks, stage.parts)
         for function in (f for f in functions if f is not None):
-            typed = get_type_hints(function)
+            typed = hints(function)
             assert {p.name for p in parameters(function)} <= set(typed), function
         if not inspect.isclass(stage.compute):
-            kind = get_type_hints(stage.compute)["return"]
+            kind = hints(stage.compute)["return"]
             assert get_origin(kind) is Iterator or kind == said[stage.name], stage.name
 
 

@@ -310,7 +310,8 @@ class TestScans:
         plans = self.plans(gate_count=3)
         lidar = BackscatterLidar(pulse_energy="2 mJ", stokes=(1, 0, 0, 1))
         calls = []
-        settings = RenderSettings(max_order=1, samples_per_beam=30)
+        # the header has the variant in force
+        settings = RenderSettings(max_order=1, samples_per_beam=30, variant="llvm_ad_mono")
         scans = list(
             render_scans(
                 list(self.fields(plans)),

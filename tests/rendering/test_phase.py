@@ -11,7 +11,7 @@ from lidar_mi.atmosphere.molecules import molecular_scattering
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.scattering import Scattering
 from lidar_mi.io.scattering_table import aerosol_table, write_table
-from lidar_mi.rendering.phase import backscatter_phase_function, scatterer, table_files
+from lidar_mi.rendering.phase import backscatter_phase_function, loadable, scatterer, table_files
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -64,7 +64,7 @@ def matrix(dictionary, cosine):
     mei.wi = mi.Vector3f(0, 0, 1)
     mei.sh_frame = mi.Frame3f(0, 0, -1)
     wo = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, -cosine)
-    value, _ = mi.load_dict(dictionary).eval_pdf(mi.PhaseFunctionContext(), mei, wo)
+    value, _ = mi.load_dict(loadable(dictionary)).eval_pdf(mi.PhaseFunctionContext(), mei, wo)
     return (
         4
         * np.pi

@@ -23,8 +23,9 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.plates import save_all
+from lidar_mi.assessment.report import page
 from lidar_mi.cli.exit_codes import exit_by
-from lidar_mi.experiment import pipeline
+from lidar_mi.experiment import measure, pipeline, report
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.graph import Stage
 from lidar_mi.experiment.schema import reading
@@ -154,9 +155,9 @@ def make_fake(seed):
         Stage("scans", lambda images: list(images.values())),
         Stage("wind", lambda scans: wind),
     )
-    experiment.measure = lambda *_: {"backscatter.cc.rmse_v": float(random.random())}
-    experiment.chapters = figures
-    experiment.page = lambda *_: "<html></html>"
+    measure.measure = lambda *_: {"backscatter.cc.rmse_v": float(random.random())}
+    report.chapters = figures
+    page.page = lambda *_: "<html></html>"
 
 
 def run_once(folder, seed, real, number=-1, fault=""):

@@ -9,7 +9,7 @@ import xarray as xr
 import yaml
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.folder import run_folder as resumable_folder
+from lidar_mi.experiment.folder import records
 from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.truth import flows as truth_module
@@ -214,6 +214,6 @@ def test_a_failed_run_is_recorded_in_its_log(tmp_path, quick, monkeypatch):
         replace_stages(patch, wind=broken)
         with pytest.raises(InputError):
             run(check(small()), folder)
-    assert resumable_folder.failure(folder) == "wind: 7 is not allowed; expected 8"
+    assert records.failure(folder) == "wind: 7 is not allowed; expected 8"
     run(check(small()), folder)
-    assert resumable_folder.failure(folder) is None
+    assert records.failure(folder) is None

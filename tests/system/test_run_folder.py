@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.folder.run_folder import MADE_BY, RunFolder, read_metrics
+from lidar_mi.experiment.folder.records import read_metrics
+from lidar_mi.experiment.folder.run_folder import MADE_BY, RunFolder
 from lidar_mi.experiment.run import run
 from lidar_mi.io.exr import read_scan
 from lidar_mi.io.folder import locked

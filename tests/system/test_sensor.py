@@ -494,6 +494,7 @@ def test_inconsistent_settings_are_reported_ahead(sections, start):
 )
 def test_a_check_reports_lines_in_one_plane(columns, rows, reported):
     directions = SMALL["sensor"]["directions"] | {"columns": columns, "rows": rows}
-    *_, (_, ((_, lines), *_)) = check.sections(changed(sensor={"directions": directions}))
+    found = dict(check.sections(changed(sensor={"directions": directions})))
+    (_, lines), *_ = found["both as one sensor"]
     assert lines.startswith(f"{columns * rows}, 20 pulses each")
     assert ("in one plane: no wind" in lines) == reported

@@ -16,6 +16,7 @@ import yaml
 from matplotlib.image import imread
 
 from lidar_mi.assessment.digits import three
+from lidar_mi.assessment.figures import comparison as figures
 from lidar_mi.assessment.report import comparison
 from lidar_mi.assessment.report.comparison import differences, flat
 from lidar_mi.encounter.check import geometry
@@ -172,9 +173,9 @@ VOLUME = {
 def test_volumes_are_compared(file, tmp_path, monkeypatch):
     """Their wind is another file with a layer more: drawn is the one nearest to the image."""
     monkeypatch.setattr("lidar_mi.assessment.figures.volume.draw_all", lambda *_: [])
-    drawn, draw = {}, study.draw_comparison
+    drawn, draw = {}, figures.draw_comparison
     monkeypatch.setattr(
-        study,
+        figures,
         "draw_comparison",
         lambda folder, rows, log: drawn.update(rows) or draw(folder, rows, log),
     )

@@ -19,6 +19,7 @@ from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
+from lidar_mi.retrieval.images.common_grid import resample
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
@@ -128,7 +129,7 @@ def test_the_noise_told_is_that_of_long_waves():
     for gate in (0, 7):
         noise = level[gate] * random.standard_normal((121, 121))
         places = {n: (n, reach[gate] * axis, {"units": "m"}) for n in "zy"}
-        image = volume_chain.resample(xr.DataArray(noise, places, ("z", "y")), *nodes[:0:-1])
+        image = resample(xr.DataArray(noise, places, ("z", "y")), *nodes[:0:-1])
         power = np.abs(np.fft.fft2(image.values)) ** 2 / 101**2
         density = power[(frequency > 0) & (frequency < 1 / 8)].mean()
         assert density == pytest.approx(told[gate].mean() ** 2, rel=0.15)

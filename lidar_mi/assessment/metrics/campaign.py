@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import stats
 
 from lidar_mi.assessment.metrics.names import EXACT, RENDERED, vortex_key
 from lidar_mi.assessment.metrics.vortices import Origin
@@ -137,7 +137,7 @@ def over_members(values: xr.DataArray) -> Interval:
     # a single member has no spread
     several = count.where(count > 1)
     stderr = values.std(MEMBER, ddof=1).where(count > 1) / np.sqrt(several)
-    half = stderr * stats.t.ppf((1 + LEVEL) / 2, several - 1)
+    half = stderr * scipy.stats.t.ppf((1 + LEVEL) / 2, several - 1)
     return Interval(mean, mean - half, mean + half)
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import ndimage
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
     vorticity = np.gradient(w, y, axis=1) - np.gradient(v, z, axis=0)
     spacing = y[1] - y[0]
     # over 1 m, as the peak of noise is a single node
-    smooth = ndimage.gaussian_filter(vorticity, 1.0 / spacing)
+    smooth = scipy.ndimage.gaussian_filter(vorticity, 1.0 / spacing)
     lateral, vertical = np.meshgrid(y, z)
     cores = []
     for sign in (1, -1):
@@ -131,7 +131,7 @@ def _ring_means(
     angle = np.arange(180) * (2 * np.pi / 180)
     rows = (cz + rings[:, None] * np.sin(angle) - z[0]) / (z[1] - z[0])
     columns = (cy + rings[:, None] * np.cos(angle) - y[0]) / (y[1] - y[0])
-    on_v, on_w = (ndimage.map_coordinates(f, [rows, columns], mode="nearest") for f in (v, w))
+    on_v, on_w = (scipy.ndimage.map_coordinates(f, [rows, columns], mode="nearest") for f in (v, w))
     swirl = on_w * np.cos(angle) - on_v * np.sin(angle)
     return np.stack([field.mean(1) for field in (on_v, on_w, swirl)])
 

@@ -22,6 +22,8 @@ _NAMES = {
     "feedforward": "with the lidar",
     "perfect": "perfect preview",
 }
+MODES = tuple(_NAMES)
+"""Flights, as files name them, in the order in which they are shown."""
 
 AFTER = 5
 """Slabs after which the track is compared with the truth."""

@@ -7,9 +7,9 @@ definition of a vector (window, path) are removed from the truth it is compared 
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy import ndimage
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
@@ -145,7 +145,7 @@ def chord_wind(
     spacing = np.array([axis[1] - axis[0] for axis in axes])[:, None]
     # in nodes and nodes per second, along z and y
     speeds = [
-        ndimage.spline_filter(truth[name].transpose("z", "y").values / h, mode="mirror")
+        scipy.ndimage.spline_filter(truth[name].transpose("z", "y").values / h, mode="mirror")
         for name, h in zip(("w", "v"), spacing, strict=True)
     ]
     place = np.stack([z, y]).astype(float)
@@ -155,7 +155,7 @@ def chord_wind(
     def wind(here: np.ndarray) -> np.ndarray:
         return np.stack(
             [
-                ndimage.map_coordinates(speed, here, prefilter=False, mode="nearest")
+                scipy.ndimage.map_coordinates(speed, here, prefilter=False, mode="nearest")
                 for speed in speeds
             ]
         )
@@ -195,7 +195,7 @@ def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | N
     if method == ImageMethod.MULTIPASS:
         smooth = {
             name: truth[name].copy(
-                data=ndimage.gaussian_filter(truth[name].values, template / 3, mode="nearest")
+                data=scipy.ndimage.gaussian_filter(truth[name].values, template / 3, mode="nearest")
             )
             for name in ("v", "w")
         }
@@ -257,7 +257,7 @@ def moved_rigidly(
         # the air of a window comes from where its mean wind leads back to
         place = (start - shift)[:, :, None, None] + pixel
         places.append(np.broadcast_to(place, regions.shape))
-    advected = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
+    advected = scipy.ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
 
     def cut(image: np.ndarray) -> np.ndarray:
         return sliding_window_view(image, (search, search))[::stride, ::stride]

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.interpolate import RectBivariateSpline
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 
@@ -28,7 +28,9 @@ def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
         known &= (places[name] >= axis[0]) & (places[name] <= axis[-1])
     found = {}
     for name in ("v", "w"):
-        spline = RectBivariateSpline(*axes.values(), truth[name].transpose("z", "y").values, s=0)
+        spline = scipy.interpolate.RectBivariateSpline(
+            *axes.values(), truth[name].transpose("z", "y").values, s=0
+        )
         values = np.full(known.shape, np.nan)
         values[known] = spline.ev(places["z"][known], places["y"][known])
         found[name] = (wind["v"].dims, values, wind[name].attrs)

@@ -127,3 +127,8 @@ def current_name(key: str) -> str:
     for former, current in _RENAMED:
         key = re.sub(former, current, key)
     return key
+
+
+def has_no_skill(metrics: Mapping[str, float], source: Source, method: str) -> bool:
+    """Whether a method says that most of its vectors are no better than zero wind."""
+    return metrics.get(wind_key(source, method, "no_skill_fraction"), 0.0) > 0.5

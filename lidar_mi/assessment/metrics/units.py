@@ -1,6 +1,6 @@
 """Units of metrics, by the quantity at the end of their names."""
 
-from lidar_mi.retrieval.vortices.pair import MEANING
+import functools
 
 _WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_", "monte_carlo_")
 _NAMED = {
@@ -24,9 +24,17 @@ _ENCOUNTER = {
     "look_ahead": "s",
     "core_error": "m",
 }
-_VORTEX = {
-    name: units.replace(" s-1", "/s").replace("m2", "m²") for name, (units, _) in MEANING.items()
-} | {"model_error": "m/s"}
+
+
+@functools.cache
+def _of_vortices() -> dict[str, str]:
+    from lidar_mi.retrieval.vortices.pair import MEANING
+
+    written = {
+        name: units.replace(" s-1", "/s").replace("m2", "m²")
+        for name, (units, _) in MEANING.items()
+    }
+    return written | {"model_error": "m/s"}
 
 
 def unit_of(key: str) -> str:
@@ -39,7 +47,7 @@ def unit_of(key: str) -> str:
     if key.startswith("encounter.") and parent != "removed_of_perfect":
         return _ENCOUNTER.get(name, "")
     if key.startswith("vortex."):
-        return _VORTEX.get(name.removesuffix("_stderr"), "")
+        return _of_vortices().get(name.removesuffix("_stderr"), "")
     if parent.endswith("_core"):
         return "m²/s" if name == "circulation" else "m"
     return {"timing": "s"}.get(parent, "")

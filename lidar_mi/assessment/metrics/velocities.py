@@ -2,12 +2,16 @@
 
 import math
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from lidar_mi.assessment.metrics.names import ring_key
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
+
+if TYPE_CHECKING:
+    import xarray as xr
+
 
 READERS: Mapping[str, str] = {
     RingMethod.ANNULAR: "all rings, full model",
@@ -25,7 +29,7 @@ PEAK_READERS = (RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG)
 CENTRES: Mapping[str, str] = {RingCentre.FREE: "centre found", RingCentre.KNOWN: "centre known"}
 
 
-def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
+def velocity_metrics(found: "xr.Dataset") -> dict[str, float]:
     """Error measures of every method, centre and number of averaged images.
 
     Keys ``doppler.METHOD.centre_CENTRE.averaged_N.`` and, all but the first in m/s,

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -9,7 +10,9 @@ import xarray as xr
 from lidar_mi.assessment.metrics.cores import Core, outside_cores, ring_averages
 from lidar_mi.assessment.metrics.errors import error_statistics
 from lidar_mi.assessment.metrics.names import vortex_key
-from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
 class Origin(StrEnum):
@@ -63,7 +66,7 @@ def core_metrics(cores: Sequence[Core]) -> dict[str, float]:
 
 
 def vortex_metrics(
-    fits: Mapping[str, VortexPairFit], truth: xr.Dataset, cores: Sequence[Core]
+    fits: "Mapping[str, VortexPairFit]", truth: xr.Dataset, cores: Sequence[Core]
 ) -> dict[str, float]:
     """Quantities of the true and the fitted pairs, and the errors of the fitted wind.
 
@@ -85,7 +88,7 @@ def vortex_metrics(
     return metrics
 
 
-def _quantities(fit: VortexPairFit) -> dict[str, float]:
+def _quantities(fit: "VortexPairFit") -> dict[str, float]:
     numbers = {"correlation": fit.correlation, "model_error": fit.model_error}
     if np.isfinite(fit.chi2):
         numbers["chi2"] = fit.chi2
@@ -94,7 +97,9 @@ def _quantities(fit: VortexPairFit) -> dict[str, float]:
     return {name: float(value) for name, value in numbers.items()}
 
 
-def _model_errors(fit: VortexPairFit, truth: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
+def _model_errors(
+    fit: "VortexPairFit", truth: xr.Dataset, cores: Sequence[Core]
+) -> dict[str, float]:
     y, z = truth["y"].values[None, :], truth["z"].values[:, None]
     model, far = fit.wind(y, z), outside_cores(y, z, list(cores))
     metrics = {}

@@ -1,14 +1,13 @@
 """Verdict on the cross-flow winds of a run: errors, efficiencies, strength of the true wind."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics, wind_metrics
-from lidar_mi.assessment.metrics.names import Source, sweep_key, wind_key
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.assessment.metrics.names import sweep_key, wind_key
 
 
 def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
@@ -59,6 +58,8 @@ def skill(wind: xr.Dataset) -> dict[str, float]:
     alone. ``no_skill_fraction``: 1 where they are as large as the true wind, else the fraction of
     all vectors with that flag.
     """
+    from lidar_mi.retrieval.images.quality import Flag
+
     flag = wind["flag"].values
     # no flag, or this one alone
     used = (flag | Flag.NO_SKILL.value) == Flag.NO_SKILL.value
@@ -75,11 +76,6 @@ def skill(wind: xr.Dataset) -> dict[str, float]:
         marked = float(((flag & Flag.NO_SKILL.value) > 0).mean())
         metrics["no_skill_fraction"] = 1.0 if none else marked
     return metrics
-
-
-def has_no_skill(metrics: Mapping[str, float], source: Source, method: str) -> bool:
-    """Whether a method says that most of its vectors are no better than zero wind."""
-    return metrics.get(wind_key(source, method, "no_skill_fraction"), 0.0) > 0.5
 
 
 def true_wind_metrics(

@@ -10,6 +10,7 @@ from lidar_mi.assessment.metrics.names import (
     Source,
     bound_key,
     far_from_cores,
+    has_no_skill,
     ring_key,
     vortex_key,
     wind_key,
@@ -23,7 +24,6 @@ from lidar_mi.assessment.metrics.requirements import (
 )
 from lidar_mi.assessment.metrics.sensor import without_skill
 from lidar_mi.assessment.metrics.velocities import READERS
-from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.assessment.report.simulation import simulation_sentence
 from lidar_mi.tables import with_error
 from lidar_mi.units import shown

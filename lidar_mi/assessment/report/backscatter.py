@@ -8,8 +8,7 @@ from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.assessment.metrics.names import Source, wind_key
-from lidar_mi.assessment.metrics.winds import has_no_skill
+from lidar_mi.assessment.metrics.names import Source, has_no_skill, wind_key
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.assessment.report.simulation import samples_of
 

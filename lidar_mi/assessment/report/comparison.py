@@ -2,17 +2,20 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
+from typing import TYPE_CHECKING
 
 from lidar_mi import __version__
 from lidar_mi.assessment.digits import fixed, three
-from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import RENDERED, Source, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
-from lidar_mi.assessment.report.page import picture, script, template
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.units import usual
+
+if TYPE_CHECKING:
+    from lidar_mi.assessment.figures.plates import Drawn
+
 
 # rows of the comparison: key, name, unit; {}: a method's winds
 _ROWS = (
@@ -75,7 +78,7 @@ def page(
     name: str,
     settings: Mapping[str, Mapping[str, object]],
     metrics: Mapping[str, Mapping[str, float]],
-    drawn: Sequence[Drawn],
+    drawn: "Sequence[Drawn]",
     answers: Mapping[str, Sequence[str]],
 ) -> str:
     """Settings, metrics and figures of the variants of a study, as self-contained HTML.
@@ -91,6 +94,8 @@ def page(
     answers : mapping of variant to list of str
         From `lidar_mi.assessment.report.answer.answer`.
     """
+    from lidar_mi.assessment.report.page import picture, script, template
+
     changed = [
         (key, "", [setting(value) for value in values])
         for key, values in differences({key: flat(one) for key, one in settings.items()}).items()

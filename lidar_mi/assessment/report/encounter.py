@@ -2,15 +2,18 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from lidar_mi.assessment.digits import fixed, percent, three
-from lidar_mi.assessment.figures.encounter import FLIGHTS
-from lidar_mi.assessment.figures.plates import Drawn
-from lidar_mi.assessment.metrics.encounter import AFTER, flight_name
+from lidar_mi.assessment.metrics.encounter import AFTER, MODES, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK, ACCEPTED_RATIO
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, fulfilled
-from lidar_mi.assessment.report.page import Chapter, Film, Tables
 from lidar_mi.tables import Table
+
+if TYPE_CHECKING:
+    from lidar_mi.assessment.figures.plates import Drawn
+    from lidar_mi.assessment.report.page import Chapter, Film, Tables
+
 
 GOAL = 0.8
 """Fraction of what perfect preview removes that the lidar should remove."""
@@ -60,7 +63,7 @@ _NO_ROLL = math.radians(0.01)
 
 def encounter_summary(metrics: Mapping[str, float], controller: str = "") -> list[Table]:
     """The main numbers for a terminal, with the name of a controller of one's own."""
-    modes = [mode for mode in FLIGHTS if f"encounter.{mode}.largest_roll" in metrics]
+    modes = [mode for mode in MODES if f"encounter.{mode}.largest_roll" in metrics]
     rows = [
         (f"{label} / {unit}" if unit else label, *_values(metrics, modes, key, factor))
         for key, label, unit, factor in _OF_A_FLIGHT
@@ -81,10 +84,10 @@ def encounter_summary(metrics: Mapping[str, float], controller: str = "") -> lis
 def encounter_chapter(
     metrics: Mapping[str, float],
     judged: Sequence[tuple[RequirementTable, Sequence[Finding]]],
-    drawn: Sequence[Drawn],
-    film: Film | None = None,
+    drawn: "Sequence[Drawn]",
+    film: "Film | None" = None,
     controller: str = "",
-) -> Chapter:
+) -> "Chapter":
     """Answer, figures and numbers of a flight.
 
     Parameters
@@ -98,7 +101,9 @@ def encounter_chapter(
     controller : str
         Name of a controller of one's own.
     """
-    modes = [mode for mode in FLIGHTS if f"encounter.{mode}.largest_roll" in metrics]
+    from lidar_mi.assessment.report.page import Chapter, Tables
+
+    modes = [mode for mode in MODES if f"encounter.{mode}.largest_roll" in metrics]
     flights = [
         (label, unit, _values(metrics, modes, key, factor))
         for key, label, unit, factor in _OF_A_FLIGHT
@@ -132,7 +137,7 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
 
     The roll of the aircraft in every flight, the time of the first detection, the limits.
     """
-    off, blind, ours, perfect = (metrics.get(f"encounter.{m}.largest_roll") for m in FLIGHTS)
+    off, blind, ours, perfect = (metrics.get(f"encounter.{m}.largest_roll") for m in MODES)
     if off is None:
         return []
     largest = max(angle for angle in (off, blind, ours, perfect) if angle is not None)
@@ -197,7 +202,9 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
     ]
 
 
-def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> Tables:
+def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> "Tables":
+    from lidar_mi.assessment.report.page import Tables
+
     words = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
     tables = []
     for table, findings in judged:

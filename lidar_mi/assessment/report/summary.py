@@ -8,10 +8,10 @@ from lidar_mi.assessment.metrics.names import (
     Source,
     bound_key,
     far_from_cores,
+    has_no_skill,
     ring_key,
     wind_key,
 )
-from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, with_error
 

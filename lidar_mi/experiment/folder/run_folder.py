@@ -13,10 +13,18 @@ from typing import Any
 import xarray as xr
 
 from lidar_mi import __version__
-from lidar_mi.assessment.metrics.names import Source, current_name
+from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import log
 from lidar_mi.experiment.folder.image_store import BATCHES, MADE_BY, ImageStore
+from lidar_mi.experiment.folder.records import (
+    LOG,
+    METRICS,
+    RECORD,
+    REPORT,
+    SUMMARY,
+    file_checksum,
+    read_record,
+)
 from lidar_mi.experiment.graph import Keys, Store
 from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.schema import reading
@@ -27,17 +35,12 @@ from lidar_mi.io import exr
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.folder import is_free, locked, make_folder
 from lidar_mi.io.images import read_pixels
-from lidar_mi.io.json import read_json, to_json
+from lidar_mi.io.json import to_json
 from lidar_mi.io.netcdf import write_netcdf
-from lidar_mi.io.png import write_preview
-from lidar_mi.io.text import encoded, read_text, write_text
-from lidar_mi.io.vortex_file import write_vortices
-from lidar_mi.io.yaml import read_yaml, to_yaml
+from lidar_mi.io.text import encoded, write_text
+from lidar_mi.io.yaml import to_yaml
 from lidar_mi.rendering.phase import table_files
 
-RECORD, LOG, METRICS, REPORT = "experiment.yaml", "log.txt", "metrics.json", "report.html"
-SUMMARY = "summary.txt"
-"""The answer of a run, a sentence a line."""
 FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
 RENDERED = (*IMAGES, "fringes_*.exr")
@@ -200,6 +203,8 @@ class RunFolder:
 
     def write_previews(self) -> None:
         """Write a PNG of its layer Y beside each rendered image, to look at."""
+        from lidar_mi.io.png import write_preview
+
         for image in self._those(RENDERED):
             write_preview(image.with_suffix(".png"), read_pixels(image))
 
@@ -260,6 +265,8 @@ def write_result(folder: Path, name: str, value: Any, experiment: str, signature
     experiment, signature : str
         Name of the experiment and hash of its record, see `made_by`.
     """
+    from lidar_mi.io.vortex_file import write_vortices
+
     if name not in RESULTS:
         return
     path = folder / RESULTS[name]
@@ -308,7 +315,7 @@ def new_record(experiment: Experiment, search_path: str | Path) -> dict[str, Any
     return {
         "experiment": reading.settings(experiment),
         "files": {
-            field: _checksum(path) for field, path in _inputs(experiment, search_path).items()
+            field: file_checksum(path) for field, path in _inputs(experiment, search_path).items()
         },
         "versions": dict(_versions()),
         "metrics": None,
@@ -365,78 +372,3 @@ def _inputs(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, search_path, "wake.file")
     return paths | timing_files(experiment, search_path)
-
-
-def _checksum(path: Path) -> str:
-    found = path.stat()
-    return _checksum_of(path, found.st_size, found.st_mtime_ns)
-
-
-@functools.lru_cache(64)
-def _checksum_of(path: Path, size: int, changed: int) -> str:
-    """Of a file as it was then: many runs of one process read the same file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def read_record(folder: str | Path) -> dict[str, Any]:
-    """Record of a run folder: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
-
-    Raises
-    ------
-    InputError
-        The folder's experiment.yaml is missing or was not written by a run.
-    """
-    marker = Path(folder) / RECORD
-    if not marker.is_file():
-        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder")
-    try:
-        record = read_yaml(marker, "a run's record")
-    except InputError:
-        record = None
-    if not isinstance(record, dict) or not all(
-        isinstance(record.get(key), dict) for key in ("experiment", "versions")
-    ):
-        raise InputError(f"{marker}: not written by a run; expected a run folder")
-    return record
-
-
-def read_metrics(folder: str | Path) -> dict[str, float] | None:
-    """Metrics of the run or the study in a folder, by today's names; None: not complete.
-
-    Raises
-    ------
-    InputError
-        The folder's metrics.json was not written by its run.
-    """
-    path, marker = Path(folder) / METRICS, Path(folder) / RECORD
-    if not path.is_file():
-        return None
-    metrics = read_json(path, "metrics of a run")
-    if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
-        raise InputError(f"{path}: not written by a run; expected names with numbers")
-    if marker.is_file():  # which a study has not
-        checksum = read_record(folder).get("metrics", "")
-        if checksum is None:  # of an earlier run; this one is not done
-            return None
-        # older versions wrote no checksum
-        if checksum and checksum != _checksum(path):
-            raise InputError(f"{path}: was changed or copied here; expected the metrics of its run")
-    return {current_name(key): value for key, value in metrics.items()}
-
-
-def read_answer(folder: str | Path) -> list[str]:
-    """The answer of the run in a folder, see `lidar_mi.assessment.report.answer`.
-
-    Empty: not complete, or of an earlier version.
-    """
-    path = Path(folder) / SUMMARY
-    return read_text(path, "the summary of a run").splitlines() if path.is_file() else []
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**63)
-
-
-def failure(folder: str | Path) -> str | None:
-    """The error that ended the last run in a folder; None: none, or it was only stopped."""
-    return log.failure(Path(folder) / LOG)

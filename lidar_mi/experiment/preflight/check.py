@@ -17,7 +17,6 @@ from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.pipeline import Results
-from lidar_mi.experiment.preflight.cost import cost, with_number
 from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.sensor import Sensor
@@ -75,6 +74,7 @@ def sections(
     # of the processor: other programs do not lengthen it
     start = time.process_time()
     prepared = experiment.prepare(asked, search_path, without_warnings(notice))
+    asked = prepared.experiment
     preparation, results = time.process_time() - start, prepared.results
     chosen: Samples | None = None
     if asked.wake:
@@ -96,10 +96,15 @@ def sections(
                 _timing(asked, call(lines_schedule, asked, search_path=prepared.search_path)),
             )
     if timed:
+        from lidar_mi.experiment.preflight.cost import with_number
+
         notice("timing a few samples and a retrieval", None)
         # with the number that is chosen already: choosing it takes pilots
         whole = with_number(asked, chosen.number) if chosen else asked
-        yield "cost of the run, to a factor of 2", _cost(whole, results, preparation)
+        rows = [*_time(whole, results, preparation), _memory(asked, results)]
+        yield "cost of the run, to a factor of 2", rows
+    else:
+        yield "cost of the run", [_memory(asked, results)]
     if prepared.warnings:
         yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
 
@@ -186,8 +191,10 @@ def _light(
     return rows
 
 
-def _cost(asked: Experiment, results: Results, preparation: float) -> list[tuple[str, str]]:
-    """Time of the parts of a run on one core of this machine, and its memory."""
+def _time(asked: Experiment, results: Results, preparation: float) -> list[tuple[str, str]]:
+    """Time of the parts of a run on one core of this machine."""
+    from lidar_mi.experiment.preflight.cost import cost
+
     found = cost(asked, results, preparation)
     names = {
         "preparation": "reading, advection of the air",
@@ -203,7 +210,11 @@ def _cost(asked: Experiment, results: Results, preparation: float) -> list[tuple
         for key, text in names.items()
         if parts[key] >= LEAST_SHOWN
     ]
-    rows.append(("all, on one core", f"about {duration(found.total)}"))
+    return [*rows, ("all, on one core", f"about {duration(found.total)}")]
+
+
+def _memory(asked: Experiment, results: Results) -> tuple[str, str]:
+    """Memory that a run takes, and that it may take."""
     beams = in_states = 0
     if asked.wake:
         plan = results["plans"][0]
@@ -213,8 +224,7 @@ def _cost(asked: Experiment, results: Results, preparation: float) -> list[tuple
     # an experiment without a wake has a Doppler lidar
     render = asked.render if asked.wake or not asked.doppler else asked.doppler.render
     allowed = ceiling(render.memory) / 1e9
-    rows.append(("memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"))
-    return rows
+    return "memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"
 
 
 def duration(seconds: float) -> str:

@@ -17,7 +17,6 @@ from lidar_mi.experiment.pipeline import Results, has_error_budget, has_vortices
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images
 from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
-from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 PROBE_SECONDS = 0.115
 """Processor time of `probe` when all costs below were measured."""
@@ -136,6 +135,8 @@ def slowness() -> float:
 
 def probe() -> None:
     """A fixed piece of work like that of a run: a correlation of images, and counted photons."""
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     rng = np.random.default_rng(1)
     axes = {axis: (axis, np.arange(96.0), {"units": "m"}) for axis in ("z", "y")}
     image = xr.DataArray(1 + 0.1 * rng.standard_normal((96, 96)), axes, ("z", "y"))

@@ -5,7 +5,7 @@ Each section has a file; those of the instruments are in `lidar_mi.instrument`.
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -39,6 +39,11 @@ class Experiment(Tabular, Section):
 
     name: str = Field(pattern=f"^{NAME}$")
     seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] = 1
+    device: Literal["auto", "cpu", "cuda"] | None = Field(
+        None,
+        description="that renders and retrieves; default: rendering by the variants, retrieval on "
+        "the processor",
+    )
     wake: Wake | None = Field(None, description="observed by the backscatter lidar")
     doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
     platform: Platform = Platform()

@@ -41,10 +41,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.retrieval.images.common_grid import resample_pair
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.wind.pair import retrieve_wind
-from lidar_mi.retrieval.wind.synchronised import synchronised
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
@@ -63,6 +60,7 @@ class _Sensor:
     volume: Volume | None
     seed: int
     search_path: Path
+    device: str | None = None
 
     def plans(self, truth: Truth) -> list[ScanPlan]:
         """The scans of both images."""
@@ -93,6 +91,7 @@ def error_budgets(
     retrieval: Retrieval,
     volume: Volume | None,
     seed: int,
+    device: str | None,
     flows: Flows,
     truth: Truth,
     scans: Sequence[xr.Dataset],
@@ -103,7 +102,7 @@ def error_budgets(
 ) -> dict[str, dict[str, float]]:
     """`budgets` from a run's winds, where these need not be retrieved again."""
     log("retrieving winds without each cause of error")
-    sensor = _Sensor(wake, platform, scan, lidar, detector, volume, seed, search_path)
+    sensor = _Sensor(wake, platform, scan, lidar, detector, volume, seed, search_path, device)
     return _budgets(sensor, retrieval, truth, scans, flows, log.bar, wind, cores)
 
 
@@ -149,12 +148,14 @@ def _budgets(
     known : xr.Dataset, optional
         Winds that need not be retrieved again, from `cross_flow_winds`.
     """
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     plans = sensor.plans(truth)
     images, blurred = _images(sensor, truth, flows, plans, scans)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = retrieval.methods
     dt, sizes = sensor.platform.dt, window_sizes(retrieval)
-    settings: dict[str, Any] = {"dt": dt, **window_settings(retrieval)}
+    settings: dict[str, Any] = {"dt": dt, **window_settings(retrieval, sensor.device)}
     blur = known_blur(retrieval, sensor.lidar, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if sensor.detector:
@@ -302,6 +303,9 @@ def _without_noise(
     blurred: bool = True,
 ) -> tuple[list[xr.DataArray], Times]:
     """The air as both scans see it, and the times of pixels where they are of their own air."""
+    from lidar_mi.retrieval.images.common_grid import resample_pair
+    from lidar_mi.retrieval.wind.synchronised import synchronised
+
     scan = sensor.scan
     depth = scan.thickness / scan.gate_count
     lidar = sensor.lidar if blurred else None

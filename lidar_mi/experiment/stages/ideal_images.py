@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import ndimage
 
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.volume import Volume
@@ -16,7 +16,6 @@ from lidar_mi.experiment.truth.in_time import air_in_time
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.retrieval.images.gridding import on_nodes
 
 
 def slab_images(
@@ -74,6 +73,8 @@ def ideal_scan(
         ``Y``, unit of ``air``; with beams also their ``beam_time``, s. From
         `lidar_mi.retrieval.images.gridding.on_nodes`; as this takes it if not ``gridded``.
     """
+    from lidar_mi.retrieval.images.gridding import on_nodes
+
     states = air if "time" in air.dims else air.expand_dims(time=[0.0])
     if lidar is not None:
         blurred = [blur_by_beam(state, lidar, plan.centre, depth) for state in states]
@@ -113,6 +114,6 @@ def _at_beams(states: xr.DataArray, time: np.ndarray, places: np.ndarray) -> np.
         weight = np.interp(time, times, one)
         met = weight > 0
         if met.any():
-            here = ndimage.map_coordinates(state, index[:, met], order=3, mode="nearest")
+            here = scipy.ndimage.map_coordinates(state, index[:, met], order=3, mode="nearest")
             values[met] += weight[met] * here
     return values

@@ -6,9 +6,9 @@ less than an order); the frames of each line are drawn by the CCD.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.experiment.schema.doppler import Doppler
@@ -16,6 +16,10 @@ from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, refere
 from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.fringe_camera import fringe_image
+
+if TYPE_CHECKING:
+    import torch
+
 
 PULSES = "sensor.pulses"
 # Speeds at which images without noise are made; those between are interpolated (Chebyshev).
@@ -41,17 +45,21 @@ class LineImages:
 
     middle: float
     half: float
-    air: torch.Tensor
-    laser: torch.Tensor
+    air: "torch.Tensor"
+    laser: "torch.Tensor"
 
-    def at(self, speed: float) -> torch.Tensor:
+    def at(self, speed: float) -> "torch.Tensor":
         """Image of air at a speed of the range, (height, width)."""
+        import torch
+
         place = (speed - self.middle) / self.half
         return torch.tensordot(torch.from_numpy(_lagrange(place)).to(self.air), self.air, 1)
 
 
 def line_images(doppler: Doppler, rings: Rings, slowest: float, fastest: float) -> LineImages:
     """Images of air with speeds (m/s) in a range."""
+    import torch
+
     # nodes must differ, even if all lines have one speed
     middle, half = (fastest + slowest) / 2, max((fastest - slowest) / 2, 1e-3)
     light, counted = photons(doppler.lidar), doppler.lidar.counted
@@ -74,7 +82,7 @@ def line_frames(
     pulses: int,
     seed: int,
     scan: int = 0,
-) -> tuple[torch.Tensor, torch.Tensor, list[int]]:
+) -> "tuple[torch.Tensor, torch.Tensor, list[int]]":
     """Frames of air and of the laser for some lines of a scan, sums over their pulses.
 
     Parameters
@@ -96,6 +104,8 @@ def line_frames(
     own : list of int
         The laser's frame of every line; lines may share one.
     """
+    import torch
+
     summed, sharing = reference_frames(pulses, doppler.reference.every, PULSES)
     light, first = photons(doppler.lidar), scan * _A_SCAN
     air = []

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -33,7 +33,10 @@ from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_l
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
-from lidar_mi.retrieval.rings.model import PixelNoise
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.rings.model import PixelNoise
+
 
 # Selects the random streams of the drifts of the first scan.
 _DRIFTS = 1 << 24
@@ -183,7 +186,7 @@ def measure_lines(
     return with_speeds(lines, v_los, std, systematic, laser_std, doppler, sensor.pulses, seed)
 
 
-def line_noises(doppler: Doppler, pulses: int, rings: Rings) -> list[PixelNoise]:
+def line_noises(doppler: Doppler, pulses: int, rings: Rings) -> "list[PixelNoise]":
     """Noise of the pixels of a line's frame, and of the frame of the laser."""
     own, _ = reference_frames(pulses, doppler.reference.every, PULSES)
     return [pixel_noise(doppler.ccd, rings.modes, number) for number in (pulses, own)]

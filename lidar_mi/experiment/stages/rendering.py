@@ -32,8 +32,7 @@ from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.settings import RenderSettings
-from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.wind.synchronised import synchronised
+from lidar_mi.rendering.variant import check_variant, use_variant
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""
@@ -73,9 +72,13 @@ def scattering_air(
     InputError
         A scattering table that is missing or not one.
     """
-    use_variant(render.variant)
+    check_variant(render.variant)
     log.bar("reading scattering matrices", None)
-    return scatterer(scattering, search_path, lidar.wavelength, log.bar)
+    found = scatterer(scattering, search_path, lidar.wavelength, log.bar)
+    if isinstance(found.phase.get("table"), str):
+        # a file that the plugin alone reads
+        use_variant(render.variant)
+    return found
 
 
 def environment_extinction(wake: Wake) -> float:
@@ -395,6 +398,8 @@ def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:
 
 def gridded_scans(platform: Platform, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     """The scans, on regular nodes where beams were reported elsewhere; see `synchronised`."""
+    from lidar_mi.retrieval.wind.synchronised import synchronised
+
     if any("y_reported" not in scan for scan in detected):
         return list(detected)
     # times in double precision, so that those of a node are not rounded twice

@@ -1,8 +1,7 @@
 """The instrument that the retrieval of a run assumes: as on paper, or calibrated."""
 
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
@@ -19,14 +18,16 @@ from lidar_mi.experiment.stages.ring_instrument import pixel_noise
 from lidar_mi.experiment.stages.ring_reference import calibration_drift
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.io.netcdf import read_netcdf
-from lidar_mi.retrieval.rings.calibration import Calibration, calibrated, calibration_of
-from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.rings.calibration import Calibration
+
 
 # First number of the frames of the calibration, which selects their random streams.
 _STREAMS = 3 << 25
 
 
-def calibration_file(doppler: Doppler, rings: Rings, search_path: Path) -> Calibration | None:
+def calibration_file(doppler: Doppler, rings: Rings, search_path: Path) -> "Calibration | None":
     """The calibration that an experiment names, or none.
 
     Raises
@@ -34,6 +35,8 @@ def calibration_file(doppler: Doppler, rings: Rings, search_path: Path) -> Calib
     InputError
         A file that is missing, no calibration, or one of another camera, wavelength or gap.
     """
+    from lidar_mi.retrieval.rings.calibration import calibrated, calibration_of
+
     asked = doppler.calibration
     if asked is None or asked.file is None:
         return None
@@ -46,7 +49,7 @@ def calibration_file(doppler: Doppler, rings: Rings, search_path: Path) -> Calib
 
 
 def assumed_rings(
-    doppler: Doppler, seed: int, rings: Rings, calibration_file: Calibration | None, log: Log
+    doppler: Doppler, seed: int, rings: Rings, calibration_file: "Calibration | None", log: Log
 ) -> Rings:
     """What the retrieval assumes of the instrument, calibrated where the experiment says so.
 
@@ -58,6 +61,11 @@ def assumed_rings(
     InputError
         Frames that do not fit the assumed instrument.
     """
+    import torch
+
+    from lidar_mi.retrieval.rings.calibration import calibrated
+    from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
+
     air, laser = ring_models(doppler)
     asked, found = doppler.calibration, calibration_file
     if asked is not None and found is None:
@@ -94,7 +102,7 @@ def assumed_rings(
     )
 
 
-def _summary(found: Calibration) -> str:
+def _summary(found: "Calibration") -> str:
     text = (
         f"calibration: focal length {found.focal_length * 1e3:.4f} mm, finesse "
         f"{found.finesse:.3g}, chi-square {found.chi_square:.3f}"

@@ -5,10 +5,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
-import torch
 import xarray as xr
 
 from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
@@ -24,12 +23,17 @@ from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import DopplerLidar, photons, solar_background, speckle_modes
 from lidar_mi.instrument.etalon import Etalon
-from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_image, ring_radii
-from lidar_mi.rendering.fringes import render_fringes, scene_dict
-from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory
+from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_values, ring_radii
+from lidar_mi.rendering.fringes import lens_surfaces, render_fringes
+from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory, host_bytes
 from lidar_mi.rendering.settings import FringeSettings
-from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.rings.model import RingModel
+from lidar_mi.rendering.variant import check_variant, use_variant
+
+if TYPE_CHECKING:
+    import torch
+
+    from lidar_mi.retrieval.rings.model import RingModel
+
 
 EMITTED, PHOTONS = "fringes_emitted", "fringes_photons"
 
@@ -42,12 +46,12 @@ class Rings(NamedTuple):
     """
 
     line: Line
-    model: RingModel
-    laser: RingModel
+    model: "RingModel"
+    laser: "RingModel"
     photons: float
     background: float
     modes: float
-    response: torch.Tensor | None = None
+    response: "torch.Tensor | None" = None
 
 
 @dataclass(frozen=True)
@@ -100,12 +104,12 @@ def ring_instrument(doppler: Doppler) -> Rings:
     """
     render, pixels = doppler.render, doppler.camera.width * doppler.camera.height
     # samples are traced pass by pass
-    at_once = min(render.samples_per_pass, pixels * render.samples_per_pixel)
+    samples = host_bytes(pixels * render.samples_per_pixel, render)
     check_memory(
-        PROGRAM + PER_PIXEL * pixels + PER_SAMPLE * at_once,
+        PROGRAM + PER_PIXEL * pixels + samples,
         render.memory,
         f"doppler.camera: {doppler.camera.width} x {doppler.camera.height} pixels and "
-        f"{at_once:.3g} samples at once",
+        f"{samples / PER_SAMPLE:.3g} samples at once",
         "fewer pixels or samples_per_pass",
         "doppler.render.memory",
     )
@@ -130,15 +134,14 @@ def ring_instrument(doppler: Doppler) -> Rings:
     modes = doppler.speckle_modes
     if modes == "derived":
         modes = speckle_modes(lidar, camera, etalon, line)
-    image = fringe_image(
+    image = fringe_values(
         camera, etalon, line, doppler.v_los[0], photons(lidar), lidar.counted, subsamples=1
     )
     background = solar_background(lidar, etalon) / (camera.width * camera.height)
     crest = ccd.quantum_efficiency * (float(image.max()) + background)
     noise = pixel_noise(ccd, modes)
     # crests of the noisiest pixels stay below
-    light = torch.tensor(crest, dtype=torch.float64)
-    spread = math.sqrt(noise.variance(light, light))
+    spread = math.sqrt(noise.variance(crest, crest))
     if not crest + 6 * spread < ccd.saturation:
         raise InputError(
             f"doppler.ccd: a pixel that holds {ccd.saturation:.3g} photoelectrons is not allowed; "
@@ -148,7 +151,7 @@ def ring_instrument(doppler: Doppler) -> Rings:
     return Rings(line, model, laser, float(image.sum()), background, modes)
 
 
-def ring_models(doppler: Doppler) -> tuple[RingModel, RingModel]:
+def ring_models(doppler: Doppler) -> "tuple[RingModel, RingModel]":
     """What the ring fit assumes of images of air and of the laser."""
     known, assumed = doppler.retrieval, doppler.assumed
     lidar, etalon, camera = doppler.lidar, assumed.of(doppler.etalon), assumed.of(doppler.camera)
@@ -166,22 +169,21 @@ def ring_models(doppler: Doppler) -> tuple[RingModel, RingModel]:
     return air, replace(laser, light_degree=light, background_degree=background)
 
 
-def check_rings(doppler: Doppler, rings: Rings) -> None:
+def check_rings(doppler: Doppler) -> None:
     """Check that scenes of the rings can be built.
 
     Raises
     ------
     InputError
-        Inconsistent settings of etalon, camera and rendering.
+        A lens that is too fast or has too wide a field; a variant that cannot run here.
     """
-    use_variant(doppler.render.variant)
-    laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
-    settings = [(rings.line, doppler.render), (laser, doppler.render)]
+    check_variant(doppler.render.variant)
+    settings = [doppler.render]
     if doppler.path_samples:
-        # single paths are traced through a real lens: another scene to check
-        settings[1] = laser, _path_by_path(doppler.render, doppler.path_samples)
-    for line, render in settings:
-        scene_dict(doppler.etalon, doppler.camera, line, render)
+        # single paths are traced through a real lens
+        settings.append(_path_by_path(doppler.render, doppler.path_samples))
+    for render in settings:
+        lens_surfaces(doppler.camera, doppler.lidar.wavelength, render)
 
 
 def ring_image_names(doppler_v_los: tuple[float, ...], doppler_path_samples: int) -> list[str]:
@@ -287,8 +289,10 @@ def reference_photons(doppler: Doppler, rings: Rings) -> float:
     return doppler.reference.photons or rings.photons
 
 
-def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:
+def expected_image(image: xr.Dataset, total: float) -> "torch.Tensor":
     """Mean photons per pixel of an image of ``total`` photons."""
+    import torch
+
     light = torch.from_numpy(image["S0"].values.astype(float))
     # rendered light is relative: the image gives the pattern alone
     return light * (total / light.sum())
@@ -297,17 +301,19 @@ def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:
 def exposed_frames(
     doppler: Doppler,
     rings: Rings,
-    expected: torch.Tensor,
+    expected: "torch.Tensor",
     averaged: int,
     seed: int,
     numbers: Sequence[int],
-) -> torch.Tensor:
+) -> "torch.Tensor":
     """Sums of so many noisy images each, photoelectrons; of one mean, or one each."""
+    import torch
+
     # one draw for all pulses, whose sum has the same statistics
     mean, ccd = averaged * expected, summed(doppler.ccd, averaged)
     modes, background = averaged * rings.modes, averaged * rings.background
 
-    def one(number: int, light: torch.Tensor) -> torch.Tensor:
+    def one(number: int, light: "torch.Tensor") -> "torch.Tensor":
         return expose(light, ccd, seed, [number], modes, background)
 
     # every image has its own random stream, so that it does not depend on the thread

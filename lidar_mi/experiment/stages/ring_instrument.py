@@ -6,6 +6,7 @@ The only module that imports both `lidar_mi.instrument` and `lidar_mi.retrieval`
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +17,10 @@ from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon, harmonics
 from lidar_mi.instrument.fringe_camera import FringeCamera
-from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+
 
 # Around the expected temperature: five nodes hold harmonics of air to 1e-4 of the ring contrast.
 TEMPERATURE_NODES = (0.75, 0.875, 1.0, 1.125, 1.25)
@@ -27,7 +31,7 @@ def ring_model(
     camera: FringeCamera,
     line: Line | Callable[[float], Line],
     temperatures: Sequence[float] = (),
-) -> RingModel:
+) -> "RingModel":
     """The model of a line's rings for the retrieval.
 
     Parameters
@@ -42,6 +46,8 @@ def ring_model(
     InputError
         A mirror that does not transmit, lines of different wavelengths.
     """
+    from lidar_mi.retrieval.rings.model import RingModel
+
     if callable(line) != (len(temperatures) > 0):
         raise InputError("line: expected a Line, or a function of the temperature and temperatures")
     lines = [line(float(t)) for t in temperatures] if callable(line) else [line]
@@ -71,7 +77,7 @@ def ring_model(
     )
 
 
-def laser_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> RingModel:
+def laser_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> "RingModel":
     """Rings of the laser's own light."""
     return ring_model(etalon, camera, laser_line(lidar.wavelength, lidar.laser_width))
 
@@ -85,7 +91,7 @@ def air_rings(
     temperature_std: float = math.inf,
     light_degree: int = 0,
     background_degree: int = 0,
-) -> RingModel:
+) -> "RingModel":
     """Rings of the backscatter at the lidar's altitude, for its temperature within 25 %.
 
     Parameters
@@ -120,13 +126,15 @@ def air_rings(
     )
 
 
-def pixel_noise(ccd: CCD, modes: float = math.inf, images: int = 1) -> PixelNoise:
+def pixel_noise(ccd: CCD, modes: float = math.inf, images: int = 1) -> "PixelNoise":
     """The CCD's noise in the sum of so many images, referred to photoelectrons.
 
     ``modes`` are those of the speckle in one image. Responses of the pixels that are not known
     have, like speckle, a variance that grows with the square of the signal; they are the same in
     every image.
     """
+    from lidar_mi.retrieval.rings.model import PixelNoise
+
     spread = 1 / (images * modes) + ccd.pixel_response_rms**2
     return PixelNoise(
         math.sqrt(images) * ccd.output_noise / ccd.multiplication_gain,

@@ -8,13 +8,17 @@ of k steps. Errors of pulses behind one frame are correlated, and its noise is c
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.constants import speed_of_light
+import scipy
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceUncertainty
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.rings.reference_error import ReferenceUncertainty
+
 
 DRIFTS = 2  # selects the random streams of drifts
 _CALIBRATION = 1 << 30  # group of pulses that no series has
@@ -42,7 +46,10 @@ def step_speed(doppler: Doppler) -> float:
     return math.hypot(
         # v = wavelength / 2 times a change of frequency; c / 2 times a relative one, as of the gap
         doppler.lidar.wavelength / 2 * doppler.reference.laser_drift,
-        speed_of_light / 2 * doppler.reference.expansion * doppler.reference.etalon_drift,
+        scipy.constants.speed_of_light
+        / 2
+        * doppler.reference.expansion
+        * doppler.reference.etalon_drift,
     )
 
 
@@ -121,8 +128,10 @@ def calibration_drift(doppler: Doppler, frames: int, seed: int) -> np.ndarray:
     return walk - walk[frames // 2]
 
 
-def reference_uncertainty(doppler: Doppler) -> ReferenceUncertainty:
+def reference_uncertainty(doppler: Doppler) -> "ReferenceUncertainty":
     """Errors of a pulse, the middle one behind its frame of the laser, that no image shows."""
+    from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceUncertainty
+
     known, etalon = doppler.reference, doppler.etalon
     # (every + 1) / 2 steps on average
     steps = math.sqrt((known.every + 1) / 2)
@@ -146,6 +155,8 @@ def plate_error(doppler: Doppler) -> float:
 
     Positive: the echo passes a wider gap than the laser.
     """
+    from lidar_mi.retrieval.rings.reference_error import Filling
+
     terms = reference_uncertainty(doppler).terms()
     sides = {
         # the gap of an etalon with a bow is widest in the middle

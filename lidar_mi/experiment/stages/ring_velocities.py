@@ -3,9 +3,9 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 import xarray as xr
 
 from lidar_mi import __version__
@@ -31,16 +31,13 @@ from lidar_mi.experiment.stages.ring_reference import (
 )
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
-from lidar_mi.retrieval.rings.bound import cramer_rao_of
-from lidar_mi.retrieval.rings.centre import circular_average
-from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
-from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
-from lidar_mi.retrieval.rings.peaks import (
-    COORDINATES,
-    find_centre,
-    ring_radius,
-    velocity_from_radii,
-)
+
+if TYPE_CHECKING:
+    import torch
+
+    from lidar_mi.retrieval.rings.likelihood_fit import RingFit
+    from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+
 
 FITS = (RingMethod.ANNULAR, RingMethod.PIXELS)
 # method and coordinate of the radius, see `lidar_mi.retrieval.rings.peaks.ring_radius`
@@ -78,6 +75,10 @@ def line_of_sight_winds(
 
 def ring_budget(doppler: Doppler, rings: Rings, lit_rings: RingImages, log: Log) -> RingBudget:
     """Light, line and etalon of the lidar, and limits of what can be retrieved from its images."""
+    import torch
+
+    from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
+
     log("computing the Cramer-Rao bound")
     images = lit_rings
     expected = [expected_image(image, rings.photons) for image in images.received]
@@ -108,6 +109,8 @@ def ring_budget(doppler: Doppler, rings: Rings, lit_rings: RingImages, log: Log)
 
 def _bounds(doppler: Doppler, rings: Rings) -> dict[str, tuple[float, float]]:
     """Cramer-Rao bounds of one image at the first speed and of its reference, m/s, by centre."""
+    from lidar_mi.retrieval.rings.bound import cramer_rao_of
+
     efficiency, centres = doppler.ccd.quantum_efficiency, doppler.retrieval.centre
     # photoelectrons, as the signal of the bound
     floor = efficiency * rings.background + doppler.ccd.dark_current * doppler.ccd.integration_time
@@ -132,7 +135,7 @@ def _bounds(doppler: Doppler, rings: Rings) -> dict[str, tuple[float, float]]:
     }
 
 
-def _unknown(model: RingModel, centre: str) -> list[str]:
+def _unknown(model: "RingModel", centre: str) -> list[str]:
     return [n for n in model.parameters if centre == RingCentre.FREE or n not in ("x", "y")]
 
 
@@ -140,7 +143,7 @@ def velocities(
     doppler: Doppler,
     rings: Rings,
     rendered: RingImages,
-    expected: Sequence[torch.Tensor],
+    expected: "Sequence[torch.Tensor]",
     seed: int,
     log: Log,
 ) -> xr.Dataset:
@@ -155,6 +158,8 @@ def velocities(
         ``peak_bias`` (coordinate, piece) of the innermost ring's peak without any noise, m/s, at
         the first speed.
     """
+    from lidar_mi.retrieval.rings.peaks import COORDINATES, velocity_from_radii
+
     settings, speeds = doppler.retrieval, doppler.v_los
     shape = (
         len(settings.methods),
@@ -285,11 +290,11 @@ def velocities(
 
 
 def speeds_to_laser(
-    frames: torch.Tensor,
-    laser: torch.Tensor,
+    frames: "torch.Tensor",
+    laser: "torch.Tensor",
     doppler: Doppler,
     rings: Rings,
-    noises: Sequence[PixelNoise],
+    noises: "Sequence[PixelNoise]",
     method: str,
     centre: str,
     *,
@@ -306,6 +311,8 @@ def speeds_to_laser(
         v_LOS, its random and systematic standard deviation, and the part of the random one by the
         laser's frame, m/s; NaN for images that `fit_rings` refuses.
     """
+    from lidar_mi.retrieval.rings.likelihood_fit import difference
+
     try:
         # the narrow rings of the laser need no 2-D fit: their error is a third of the air's
         emitted = _fit(laser, doppler, rings.laser, rings.response, noises[1], "annular", centre)
@@ -329,14 +336,16 @@ def speeds_to_laser(
 
 
 def _fit(
-    frames: torch.Tensor,
+    frames: "torch.Tensor",
     doppler: Doppler,
-    model: RingModel,
-    response: torch.Tensor | None,
-    noise: PixelNoise,
+    model: "RingModel",
+    response: "torch.Tensor | None",
+    noise: "PixelNoise",
     method: str,
     centre: str,
-) -> RingFit:
+) -> "RingFit":
+    from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
+
     return fit_rings(
         frames,
         model,
@@ -351,6 +360,9 @@ def _fit(
 
 def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, float]:
     """Innermost ring's radius (px) by the given peak methods; NaN where one fails."""
+    from lidar_mi.retrieval.rings.centre import circular_average
+    from lidar_mi.retrieval.rings.peaks import find_centre, ring_radius
+
     methods = [name for name in doppler.retrieval.methods if name in PEAKS]
     places: dict[str, tuple[float, float]] = {}
     averages: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
@@ -379,6 +391,9 @@ def _peak_bias(doppler: Doppler, rendered: RingImages) -> np.ndarray:
 
     From images without noise, about the true centre; NaN where a piece holds no peak.
     """
+    from lidar_mi.retrieval.rings.centre import circular_average
+    from lidar_mi.retrieval.rings.peaks import COORDINATES, ring_radius, velocity_from_radii
+
     camera = doppler.camera
     images = [p["S0"].values.astype(float) for p in (rendered.received[0], rendered.emitted)]
     averages = [circular_average(image, camera.centre_pixel) for image in images]

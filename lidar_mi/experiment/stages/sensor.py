@@ -27,9 +27,6 @@ from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS
-from lidar_mi.retrieval.lines.combine import combine
-from lidar_mi.retrieval.lines.common_time import estimated_drift
-from lidar_mi.retrieval.lines.vectors import COMPONENTS, wind_from_neighbours, wind_from_triples
 
 # Lines of sight per least-squares vector of the Doppler lidar alone: one and those around it.
 _AROUND = 9
@@ -83,6 +80,8 @@ def doppler_alone(lines: xr.Dataset, log: Log) -> dict[str, xr.Dataset]:
 
     Empty where the valid lines do not give any, which is logged as a warning.
     """
+    from lidar_mi.retrieval.lines.vectors import wind_from_neighbours, wind_from_triples
+
     try:
         triples = wind_from_triples(lines)
         if not (triples["flag"] == 0).any():
@@ -120,6 +119,8 @@ def with_systematic(found: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
         systematic error of v_LOS. It is one error, common to all lines and vectors; the differences
         of the vectors are what it makes of u, v and w.
     """
+    from lidar_mi.retrieval.lines.vectors import COMPONENTS
+
     for name in COMPONENTS:
         found[f"{name}_systematic"] = abs(shifted[name] - found[name]).assign_attrs(
             units="m s-1",
@@ -148,6 +149,8 @@ def _oblique_view(
 
 def _in_time(platform: Platform, sensor: Sensor, crossflow: xr.Dataset) -> dict[str, Any]:
     """Settings of `combine` for the time of the wind, half way between both images."""
+    from lidar_mi.retrieval.lines.common_time import estimated_drift
+
     settings: dict[str, Any] = {"time": platform.dt / 2}
     if sensor.drift == "estimated":
         drift = estimated_drift(crossflow, sensor.crossflow_std)
@@ -178,6 +181,9 @@ def with_truth(
     settings: Mapping[str, Any],
 ) -> xr.Dataset:
     """The wind of `combine` from lines and cross-flow wind, with the truth at its nodes."""
+    from lidar_mi.retrieval.lines.combine import combine
+    from lidar_mi.retrieval.lines.vectors import COMPONENTS
+
     found, shifted = combine(crossflow, lines, **settings), _shifted(lines)
     if shifted is not None:
         found = with_systematic(found, combine(crossflow, shifted, **settings))
@@ -274,6 +280,9 @@ def mean_squares_without(
         By cause; with all of them as "". Valid vectors, beyond two core radii where there are
         cores. Empty without any.
     """
+    from lidar_mi.retrieval.lines.combine import combine
+    from lidar_mi.retrieval.lines.vectors import COMPONENTS
+
     at = {axis: crossflow[axis] for axis in ("z", "y")}
     true = {name: truth[name].interp(at).transpose("z", "y").values for name in COMPONENTS}
     surely = {f"{name}_stderr": np.full_like(true[name], _SURE) for name in ("v", "w")}

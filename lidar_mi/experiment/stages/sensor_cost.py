@@ -3,11 +3,11 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable
-from lidar_mi.assessment.metrics.sensor import LidarCost
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, pulse_train
@@ -16,6 +16,9 @@ from lidar_mi.instrument.eye_safety import assess_pulses
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.pulse_budget import pulse_budget, pulses_for_error
 from lidar_mi.instrument.scan import Scan, plan_scans
+
+if TYPE_CHECKING:
+    from lidar_mi.assessment.metrics.sensor import LidarCost
 
 
 def lidar_costs(
@@ -26,8 +29,10 @@ def lidar_costs(
     platform: Platform,
     slab_wind: xr.Dataset,
     search_path: Path,
-) -> dict[str, LidarCost]:
+) -> "dict[str, LidarCost]":
     """Cost of the scans of "doppler" and "backscatter", at the pulse rates of their timing."""
+    from lidar_mi.assessment.metrics.sensor import LidarCost
+
     doppler = doppler_lidar
     far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
     directions = sensor.directions.columns * sensor.directions.rows

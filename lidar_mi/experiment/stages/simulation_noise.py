@@ -21,7 +21,6 @@ from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.settings import RenderSettings
-from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 
 def simulation_noise(
@@ -32,6 +31,7 @@ def simulation_noise(
     detector: Detector | None,
     render: RenderSettings,
     retrieval: Retrieval,
+    device: str | None,
     seed: int,
     detected: Sequence[xr.Dataset],
     plans: Sequence[ScanPlan],
@@ -52,6 +52,8 @@ def simulation_noise(
         where the noise has no more than ``render.monte_carlo_fraction`` of the detector's
         variance: neither has it then of the wind's.
     """
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     fraction = max(one.attrs.get("monte_carlo_fraction", np.inf) for one in detected)
     if fraction <= render.monte_carlo_fraction:
         return None
@@ -76,7 +78,7 @@ def simulation_noise(
             times=times,
             blur=known_blur(retrieval, lidar, plans[0]),
             standard_errors=False,
-            **window_settings(retrieval),
+            **window_settings(retrieval, device),
         )
         first = wind.sel(source=source, algorithm=method)
         valid = (found["flag"].values == 0) & (first["flag"].values == 0)

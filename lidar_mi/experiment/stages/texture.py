@@ -14,7 +14,6 @@ from lidar_mi.experiment.truth.extinction import true_air
 from lidar_mi.experiment.truth.flows import Flows, advection_by
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Relative rms of the texture."""
@@ -26,6 +25,7 @@ def texture_sweep(
     scan: Scan,
     volume: Volume | None,
     retrieval: Retrieval,
+    device: str | None,
     seed: int,
     flows: Flows,
     log: Log,
@@ -38,6 +38,8 @@ def texture_sweep(
         ``rmse_v``, ``rmse_w`` (m s^-1) over every vector with a displacement, NaN where there is
         none; ``valid_fraction``.
     """
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     points, advected = [], advection_by(wake, platform, scan, volume, flows)
     for index, rms in enumerate(LEVELS):
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))
@@ -49,7 +51,7 @@ def texture_sweep(
             truth.image(1),
             dt=platform.dt,
             method=ImageMethod.CC,
-            **window_settings(retrieval),
+            **window_settings(retrieval, device),
         )
         true = truth_at_vectors(wind, truth.wind)
         v, w = (wind[name].values - true[name].values for name in ("v", "w"))

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import map_coordinates
 
 from lidar_mi import __version__
 from lidar_mi.assessment.metrics.names import Source
@@ -21,15 +20,13 @@ from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_pair import Pair, both, combined_noise
 from lidar_mi.experiment.stages.rendering import environment_extinction
+from lidar_mi.experiment.stages.winds import retrieval_device
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.retrieval.images.common_grid import resample
-from lidar_mi.retrieval.images.windows import Windows
-from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
-from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
+from lidar_mi.retrieval.images.window_sizes import check_window_sizes
 
 
 @dataclass(frozen=True)
@@ -64,7 +61,7 @@ def check_volume(
     _check_gates(scan, flows[0])
     shape = tuple(map(len, grid(wake, scan, plans)))
     # refuses fewer voxels than a window has
-    Windows(shape, volume.template, volume.search, volume.stride)
+    check_window_sizes(shape, volume.template, volume.search, volume.stride)
 
 
 def _check_gates(scan: Scan, flow: xr.Dataset) -> None:
@@ -129,6 +126,8 @@ def scan_volume(
     nodes : x, z, y of the grid, m
         x in the frame of the air, one per gate; inside the beams of every gate.
     """
+    from lidar_mi.retrieval.images.common_grid import resample
+
     x, z, y = nodes
     values = attenuated_backscatter(
         s0.transpose("gate", "z", "y").values, plan, lidar.aperture_area, environment
@@ -166,7 +165,7 @@ def noise_map(error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]) 
     _, z, y = nodes
     mesh = np.stack(np.meshgrid(z, y, indexing="ij"), -1)
     variance = [
-        RegularGridInterpolator((row, column), square)(mesh)
+        scipy.interpolate.RegularGridInterpolator((row, column), square)(mesh)
         for square, row, column in zip(
             error**2, _places(plan, "z"), _places(plan, "y"), strict=True
         )
@@ -210,6 +209,7 @@ def volume_winds(
     platform: Platform,
     scan: Scan,
     volume: Volume,
+    device: str | None,
     flows: Flows,
     volumes: Volumes,
     log: Log,
@@ -221,6 +221,9 @@ def volume_winds(
     xr.Dataset, dims (source, algorithm, x, z, y)
         The variables of `retrieve_wind_volume` and ``u_true``, ``v_true``, ``w_true`` (m s^-1).
     """
+    from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
+    from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
+
     sources = []
     for source, pair in volumes.pairs.items():
         methods = []
@@ -236,6 +239,7 @@ def volume_winds(
                     windows=WindowSizes(volume.template, volume.search, volume.stride),
                     validation=VectorValidation(volume.min_correlation),
                     noise=volumes.noise[source],
+                    device=retrieval_device(device),
                 )
             )
         # attributes of single methods are not those of all
@@ -263,7 +267,9 @@ def true_wind(flow: xr.Dataset, places: xr.Dataset) -> dict[str, xr.DataArray]:
     found = {}
     for name in ("u", "v", "w"):
         values = flow[name].transpose("x", "y", "z").values
-        values = map_coordinates(values, mesh, order=3, mode="nearest").transpose(0, 2, 1)
+        values = scipy.ndimage.map_coordinates(values, mesh, order=3, mode="nearest").transpose(
+            0, 2, 1
+        )
         about = {"long_name": f"true {name}", "units": "m s-1"}
         found[name] = xr.DataArray(values.astype(np.float32), coords, ("x", "z", "y"), attrs=about)
     return found

@@ -6,24 +6,28 @@ anywhere, for use by a controller.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import xarray as xr
 
-from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
 from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.schema.wake import Wake
-from lidar_mi.experiment.stages.winds import common_error, pixel_times, rendered_pairs
+from lidar_mi.experiment.stages.winds import (
+    common_error,
+    pixel_times,
+    rendered_pairs,
+    retrieval_device,
+)
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.retrieval.lines.combine import CombinedFlag
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
-from lidar_mi.retrieval.vortices.image_fit import fit_vortices
-from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
 @dataclass(frozen=True)
@@ -40,13 +44,15 @@ class VortexFits:
         Method of the wind vectors; None if no pair was fitted to vectors.
     """
 
-    pairs: dict[str, VortexPairFit]
+    pairs: "dict[str, VortexPairFit]"
     refused: dict[str, str]
     method: str | None = None
 
 
 def combined_vectors(wind3d: xr.Dataset | None) -> xr.Dataset | None:
     """Cross-flow wind of both lidars, with the flags of v and w; None: there is none."""
+    from lidar_mi.retrieval.lines.combine import CombinedFlag
+
     if wind3d is None:
         return None
     # v and w do not need lines of sight
@@ -76,12 +82,16 @@ def fit_pairs(
     detector: Detector | None,
     retrieval: Retrieval,
     sensor: Sensor | None,
+    device: str | None,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
     vectors: xr.Dataset | None,
     log: Log,
 ) -> VortexFits:
     """Vortex pairs from the images and from the vectors, where there are or should be some."""
+    from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
+    from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+
     with_vectors = sensor is not None or vectors is not None
     method = vectors_method(sensor, retrieval) if with_vectors else None
     log(f"fitting vortex pairs to the images{f' and to the vectors by {method}' if method else ''}")
@@ -91,7 +101,7 @@ def fit_pairs(
     # as functions: a refused fit to the images must not prevent that to the vectors
     ways: dict[Origin, Callable[[], VortexPairFit]] = {
         Origin.IMAGES: lambda: fit_vortices(
-            pair[0], pair[1], platform.dt, noise, times=times
+            pair[0], pair[1], platform.dt, noise, times=times, device=retrieval_device(device)
         ).with_common_error(common, common, rotation)
     }
     if with_vectors:
@@ -114,7 +124,9 @@ def fit_pairs(
     return VortexFits(fits, refused, method)
 
 
-def _from_vectors(vectors: xr.Dataset | None) -> VortexPairFit:
+def _from_vectors(vectors: xr.Dataset | None) -> "VortexPairFit":
+    from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
+
     if vectors is None:
         raise InputError("vectors: no valid vectors")
     return fit_vortices_to_wind(vectors)

@@ -1,7 +1,7 @@
 """From two images to the cross-flow wind, by every method and from every source."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -19,15 +19,12 @@ from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.retrieval.common_error import with_common_error
-from lidar_mi.retrieval.images.common_grid import resample_pair
-from lidar_mi.retrieval.images.resampling_error import flag_resampled
-from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.images.window_sizes import check_window_sizes
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.wind.bound import wind_bound
-from lidar_mi.retrieval.wind.methods import METHODS
-from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
-from lidar_mi.retrieval.wind.pair import retrieve_wind
+
+if TYPE_CHECKING:
+    from lidar_mi.retrieval.wind.options import WindowSizes
+
 
 _FEW_VALID = 0.25
 _OF_TEMPLATES = (ImageMethod.CC, ImageMethod.MULTIPASS)
@@ -43,7 +40,7 @@ def check_windows(retrieval: Retrieval, plans: Sequence[ScanPlan]) -> None:
         A search region larger than the images.
     """
     image = len(plans[0].z), len(plans[0].y)
-    Windows(image, retrieval.template, retrieval.search, retrieval.stride)
+    check_window_sizes(image, retrieval.template, retrieval.search, retrieval.stride)
 
 
 def cross_flow_winds(
@@ -54,6 +51,7 @@ def cross_flow_winds(
     lidar: BackscatterLidar,
     detector: Detector | None,
     retrieval: Retrieval,
+    device: str | None,
     truth: Truth,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
@@ -71,6 +69,12 @@ def cross_flow_winds(
         From `retrieve_wind`, with ``score`` for the score of every method;
         ``v_true``, ``w_true`` and, from `wind_bound`, ``v_bound``, ``w_bound`` (m s^-1).
     """
+    from lidar_mi.retrieval.common_error import with_common_error
+    from lidar_mi.retrieval.images.resampling_error import flag_resampled
+    from lidar_mi.retrieval.wind.bound import wind_bound
+    from lidar_mi.retrieval.wind.methods import METHODS
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+
     log("retrieving winds")
     _warn_of_wide_beams(lidar, retrieval, truth, plans, log)
     blur, times = known_blur(retrieval, lidar, plans[0]), pixel_times(wake, scan, scans)
@@ -81,7 +85,10 @@ def cross_flow_winds(
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
         # the truth's images are photographs
         timed = times if source in RENDERED else None
-        bound = wind_bound(pair[0], pair[1], platform.dt, noise, window_sizes(retrieval), timed)
+        sizes = window_sizes(retrieval)
+        bound = wind_bound(
+            pair[0], pair[1], platform.dt, noise, sizes, timed, retrieval_device(device)
+        )
         methods: list[xr.Dataset] = []
         for method in retrieval.methods:
             wind = retrieve_wind(
@@ -89,7 +96,7 @@ def cross_flow_winds(
                 pair[1],
                 dt=platform.dt,
                 method=method,
-                **window_settings(retrieval),
+                **window_settings(retrieval, device),
                 noise=noise,
                 times=timed,
                 # the extinction itself has passed no instrument
@@ -169,6 +176,8 @@ def rendered_pairs(
 
     By source: the rendered backscatter, and with a detector the same with its noise.
     """
+    from lidar_mi.retrieval.images.common_grid import resample_pair
+
     noise = attenuated_backscatter_stderr(scans[0])
     images = both(lambda k: scans[k]["Y"])
     maps: dict[str, tuple[Pair, xr.DataArray]]
@@ -214,6 +223,8 @@ def pixel_times(wake: Wake, scan: Scan, scans: Sequence[xr.Dataset]) -> list[xr.
 
     None: all pixels of a scan show the air of its reference time.
     """
+    from lidar_mi.retrieval.images.common_grid import resample_pair
+
     if any("beam_time" not in one or one.attrs.get("frozen_air") for one in scans):
         return None
     times = [one["beam_time"] for one in scans]
@@ -249,14 +260,27 @@ def common_error(
     return pointing.stderr * distance / dt, pointing.roll / dt
 
 
-def window_settings(settings: Retrieval) -> dict[str, Any]:
-    """Sizes of windows and tests of vectors, as `retrieve_wind` takes them."""
+def retrieval_device(device: str | None) -> str:
+    """Name of torch's device, of an experiment that is on its device."""
+    return device or "cpu"
+
+
+def window_settings(settings: Retrieval, device: str | None) -> dict[str, Any]:
+    """Sizes of windows, tests of vectors and the device, as `retrieve_wind` takes them."""
+    from lidar_mi.retrieval.wind.options import VectorValidation
+
     limits = settings.min_correlation, settings.min_texture, settings.min_isotropy
-    return {"windows": window_sizes(settings), "validation": VectorValidation(*limits)}
+    return {
+        "windows": window_sizes(settings),
+        "validation": VectorValidation(*limits),
+        "device": retrieval_device(device),
+    }
 
 
-def window_sizes(settings: Retrieval) -> WindowSizes:
+def window_sizes(settings: Retrieval) -> "WindowSizes":
     """Sizes of windows, as `retrieve_wind` takes them."""
+    from lidar_mi.retrieval.wind.options import WindowSizes
+
     return WindowSizes(settings.template, settings.search, settings.stride)
 
 

@@ -1,8 +1,8 @@
 """Images blurred by beams of finite width."""
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import constants, stats
 
 from lidar_mi.instrument.lidar import BackscatterLidar
 
@@ -41,8 +41,8 @@ def _depths(lidar: BackscatterLidar, depth: float) -> tuple[np.ndarray, np.ndarr
     nodes = nodes * depth / 2
     if lidar.pulse_duration > 0:
         # ranges differ by the position in the pulse, FWHM of a Gaussian
-        spread = lidar.pulse_duration * constants.c / 2 / np.sqrt(8 * np.log(2))
-        ends = [stats.norm.cdf((end - nodes) / spread) for end in (depth / 2, -depth / 2)]
+        spread = lidar.pulse_duration * scipy.constants.c / 2 / np.sqrt(8 * np.log(2))
+        ends = [scipy.stats.norm.cdf((end - nodes) / spread) for end in (depth / 2, -depth / 2)]
         weights = weights * (ends[0] - ends[1])
     return nodes, weights / weights.sum()
 
@@ -54,7 +54,7 @@ def _beam_weights(axis: np.ndarray, stretch: float, metres: float) -> np.ndarray
     places = (axis * stretch - axis[0]) / spacing
     reach = int(np.ceil(6 * sigma + np.abs(places - np.arange(len(axis))).max())) + 1
     x = np.arange(-reach - 1, len(axis) + reach + 1) - places[:, None]
-    g = x * stats.norm.cdf(x / sigma) + sigma * stats.norm.pdf(x / sigma)
+    g = x * scipy.stats.norm.cdf(x / sigma) + sigma * scipy.stats.norm.pdf(x / sigma)
     weights = np.diff(g, 2)
     # beyond the plane the value of its edge
     inside = weights[:, reach:-reach].copy()

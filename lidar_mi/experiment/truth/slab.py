@@ -1,8 +1,8 @@
 """Fields averaged over the depth of planar gates."""
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import integrate
 
 from lidar_mi.errors import InputError
 
@@ -21,7 +21,7 @@ def slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
             )
         nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
         linear = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
-        weights = integrate.trapezoid(linear, nodes) / (gates[1] - gates[0])
+        weights = scipy.integrate.trapezoid(linear, nodes) / (gates[1] - gates[0])
     image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose(..., "z", "y")
     image.attrs = field.attrs
     for axis in ("y", "z"):

@@ -4,14 +4,17 @@ import math
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.pixels.frames import Frames, damaged, frames_of
 from lidar_mi.io.size import check_size
+
+if TYPE_CHECKING:
+    import h5py
+
 
 _COLOURS = 4
 """The last axis of so few may be colours."""
@@ -95,6 +98,8 @@ def read_hdf5(path: Path, layer: str | None) -> Frames:
     InputError
         A damaged file; no or several images; a filter that is not installed; packed numbers.
     """
+    import h5py
+
     try:
         with h5py.File(path, "r") as file:
             found: dict[str, Any] = {}
@@ -117,8 +122,10 @@ def read_hdf5(path: Path, layer: str | None) -> Frames:
     return _matrix(path, image.T) if matlab else _stack(path, image)
 
 
-def _refuse_unreadable(path: Path, part: h5py.Dataset) -> None:
+def _refuse_unreadable(path: Path, part: "h5py.Dataset") -> None:
     """Filters that are not there, values elsewhere, sizes out of proportion, packed numbers."""
+    import h5py
+
     filters = part.id.get_create_plist()
     for number in range(filters.get_nfilters()):
         code, _, _, name = filters.get_filter(number)

@@ -13,6 +13,7 @@ from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.spline import Spline
 from lidar_mi.retrieval.images.windows import Windows, averaged, separable
+from lidar_mi.retrieval.symmetric import largest_eigenvalue
 
 # Voxels of shifted volumes that are correlated at once: more do not fit into a core's cache.
 _AT_ONCE = 2**17
@@ -246,7 +247,7 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     curvature = slope.new_zeros(len(slope), 3, 3)
     for (a, b), term in zip(pairs, terms[4:], strict=True):
         curvature[:, a, b] = curvature[:, b, a] = term
-    peaked = torch.linalg.eigvalsh(curvature)[:, -1] < 0
+    peaked = largest_eigenvalue(curvature) < 0
     # a saddle has no top: it is replaced by what can be solved, and its offset by 0
     curvature = torch.where(peaked[:, None, None], curvature, -torch.eye(3).to(curvature))
     offset = -torch.linalg.solve(curvature, slope[..., None])[..., 0]

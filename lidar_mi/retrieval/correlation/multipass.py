@@ -274,7 +274,7 @@ def _fit(
     squares = dims * (dims + 1) // 2
     whole = float(gaussian.sum()) ** dims
     # a band repeats its neighbours' margins: thin volumes are best done at once
-    most_bytes = geometry.TILE_BYTES * (1 if dims == 2 else 8)
+    most_bytes = geometry.tile_bytes() * (1 if dims == 2 else 8)
     rows = max(1, most_bytes // (8 * 100 * steps[0] * math.prod(grid.shape[1:])))
     bands = []
     for part in places[0].split(rows):

@@ -66,7 +66,7 @@ def median_outliers(
     dims = d.ndim - 1
     rim = size // 2 * spacing
     padded = _continued(d, rim) if continued else pad(d, (rim,) * 2 * dims, value=torch.nan)
-    rows = max(1, geometry.TILE_BYTES // (8 * 5 * size**dims * math.prod(d.shape[2:])))
+    rows = max(1, geometry.tile_bytes() // (8 * 5 * size**dims * math.prod(d.shape[2:])))
     bands = []
     for top in range(0, d.shape[1], rows):
         residuals = [

@@ -11,6 +11,7 @@ from torch.nn.functional import max_pool2d, max_pool3d
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.windows import Windows, working
+from lidar_mi.retrieval.symmetric import largest_eigenvalue
 
 
 class Flag(enum.IntFlag):
@@ -237,7 +238,7 @@ def worst_variance(covariance: torch.Tensor) -> torch.Tensor:
     """Variance in the direction where it is largest, of matrices (components, components, ...)."""
     known = covariance.isfinite().all(0).all(0)
     matrices = torch.where(known, covariance, 0.0).movedim((0, 1), (-2, -1))
-    return torch.where(known, torch.linalg.eigvalsh(matrices)[..., -1], torch.inf)
+    return torch.where(known, largest_eigenvalue(matrices), torch.inf)
 
 
 def misfit_variance(misfit: torch.Tensor, number: int) -> float:

@@ -10,6 +10,8 @@ import torch
 from torch.nn.functional import pad
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.device import divisor
+from lidar_mi.retrieval.images.window_sizes import check_window_sizes
 
 # Working memory of one tile of windows. Small enough to stay near the cache, large enough that
 # the cost of a call is negligible.
@@ -19,6 +21,11 @@ _BLOCK = 48
 # Longest side (px) of fields whose Gaussian sums are products with whole matrices: at 400 px they
 # take as long as those in blocks, at 200 px a third of it.
 _WHOLE = 320
+
+
+def tile_bytes() -> int:
+    """Working memory of one tile: `TILE_BYTES`, or less where a device has less."""
+    return TILE_BYTES // divisor()
 
 
 class Tile(NamedTuple):
@@ -60,22 +67,7 @@ class Windows:
     stride: int = 1
 
     def __post_init__(self) -> None:
-        image = self.dims == 2
-        unit = "px" if image else "voxels"
-        lowest = {"template": 2 if image else 4, "search": self.template + 2, "stride": 1}
-        for name, low in lowest.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                allowed = "template + 2" if name == "search" else low
-                raise InputError(f"{name}: {value!r} {unit} is not an integer >= {allowed}")
-        if min(self.shape) < self.inner:
-            sizes = " x ".join(map(str, self.shape))
-            raise InputError(
-                f"search: {self.search} px does not fit into the image of {sizes} (z x y) px"
-                if image
-                else f"template: {self.template} voxels do not fit into the volume of {sizes} "
-                "(x, z, y); expected at least as many voxels (gates along x) in every direction"
-            )
+        check_window_sizes(self.shape, self.template, self.search, self.stride)
 
     @property
     def dims(self) -> int:
@@ -132,9 +124,9 @@ class Windows:
         return row - self.lead, column - self.lead, rim
 
     def tiles(self, bytes_per_window: int) -> Iterator[Tile]:
-        """The windows of an image in blocks of at most TILE_BYTES (but at least one window)."""
+        """The windows of an image in blocks of at most `tile_bytes` (but at least one window)."""
         rows, columns = self.count
-        most = max(1, TILE_BYTES // bytes_per_window)
+        most = max(1, tile_bytes() // bytes_per_window)
         width = min(columns, most)
         height = max(1, most // width)
         for top in range(0, rows, height):

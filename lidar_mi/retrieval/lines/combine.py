@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.spatial import ConvexHull, QhullError
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.common_error import ROTATION
@@ -324,8 +324,8 @@ def _inside(middles: np.ndarray, z: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether nodes lie among the lines, (z, y)."""
     places = np.stack(np.meshgrid(y, z), -1)
     try:
-        sides = ConvexHull(middles).equations
-    except (QhullError, ValueError):  # lines in a row, or fewer than three
+        sides = scipy.spatial.ConvexHull(middles).equations
+    except (scipy.spatial.QhullError, ValueError):  # lines in a row, or fewer than three
         return np.zeros(places.shape[:2], bool)
     # distances beyond the sides, m
     return (places @ sides[:, :2].T + sides[:, 2] <= 1e-9).all(-1)

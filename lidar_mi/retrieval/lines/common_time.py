@@ -8,8 +8,8 @@ the flow that each induces on the other, turbulence with the mean wind (Taylor 1
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.ndimage import map_coordinates
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.common_grid import nearest_filled
@@ -223,7 +223,9 @@ def _blurred(
     of_lines = np.zeros((2, len(when)))
     for factor, slope in zip(across.T, slopes, strict=True):
         for axis in range(2):
-            of_lines[axis] += factor * map_coordinates(slope[axis], nodes, order=1, mode="nearest")
+            of_lines[axis] += factor * scipy.ndimage.map_coordinates(
+                slope[axis], nodes, order=1, mode="nearest"
+            )
     off = np.sqrt(((of_lines * np.reshape(drift_std, (2, 1)) * (time - when)) ** 2).sum(0))
     std = scan["v_los_std"]
     return flow.assign(stated), scan.assign(v_los_std=std.copy(data=np.hypot(std.values, off)))
@@ -247,18 +249,18 @@ def _vectors(crossflow: xr.Dataset, time: float, drift: tuple[float, float]) -> 
     # times vary slowly over what the pattern moves: twice is enough
     source = nodes - speed[:, None, None] * (time - when)
     source = nodes - speed[:, None, None] * (
-        time - map_coordinates(when, source, order=1, mode="nearest")
+        time - scipy.ndimage.map_coordinates(when, source, order=1, mode="nearest")
     )
     valid = (flow["flag"].values == 0) & np.isfinite(flow["v"].values + flow["w"].values)
     ends = np.reshape([n - 1 for n in when.shape], (2, 1, 1))
     inside = ((source > -_ROUNDING) & (source < ends + _ROUNDING)).all(0)
-    around = map_coordinates(valid.astype(float), source, order=1, mode="nearest")
+    around = scipy.ndimage.map_coordinates(valid.astype(float), source, order=1, mode="nearest")
     known = inside & (around > 1 - _ROUNDING)
     found = {}
     for name in (name for name in _FIELDS if name in flow):
         filled = nearest_filled(np.where(valid, flow[name].values.astype(float), np.nan))
         order = 3 if name in ("v", "w") else 1
-        moved = map_coordinates(filled, source, order=order, mode="nearest")
+        moved = scipy.ndimage.map_coordinates(filled, source, order=order, mode="nearest")
         found[name] = flow[name].copy(data=np.where(known, moved, np.nan))
     flag = flow["flag"]
     found["flag"] = flag.copy(data=np.where(known, 0, np.maximum(flag.values, 1)))

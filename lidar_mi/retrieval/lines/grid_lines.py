@@ -4,8 +4,8 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import sparse
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines.crossflow import Crossflow
@@ -114,10 +114,12 @@ def covariances_of_lines(
     count, parts = len(weight), weight.shape[-1]
     row = np.repeat(np.arange(count), weight.shape[1])
     sums = [
-        sparse.csr_array((weight[..., part].ravel(), (row, node.ravel())), (count, len(place)))
+        scipy.sparse.csr_array(
+            (weight[..., part].ravel(), (row, node.ravel())), (count, len(place))
+        )
         for part in range(parts)
     ]
-    together = sparse.vstack(sums, "csr")
+    together = scipy.sparse.vstack(sums, "csr")
     step = max(1, int(CHUNK_NUMBERS / len(place)))
     chunks = [slice(start, start + step) for start in range(0, len(place), step)]
     pieces = [[matrix[:, chunk] for matrix in sums] for chunk in chunks]

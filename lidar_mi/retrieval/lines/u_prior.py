@@ -5,8 +5,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
-from scipy.linalg import lapack
+import scipy
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines.crossflow import Crossflow
@@ -69,7 +68,9 @@ def relative_std(
         known += both
     # over the lines' spacing: finer variations of u are not observed
     width = [spacing / np.diff(nodes).mean() for nodes in (z, y)]
-    square, known = (ndimage.gaussian_filter(a, width, mode="constant") for a in (square, known))
+    square, known = (
+        scipy.ndimage.gaussian_filter(a, width, mode="constant") for a in (square, known)
+    )
     uniform = np.ones_like(square)
     known_here = known > 1e-3
     if not (square[known_here] > 0).any():
@@ -201,7 +202,7 @@ def _tridiagonal(
     """
     if matrices.shape[1] == 1:
         return matrices[:, 0], matrices[:, 0, :0], vectors
-    parts = [lapack.dsytrd(matrix, lower=1) for matrix in matrices]
+    parts = [scipy.linalg.lapack.dsytrd(matrix, lower=1) for matrix in matrices]
     reflectors, middle, side, scale = (np.stack([part[k] for part in parts]) for k in range(4))
     turned = vectors.copy()
     for k in range(matrices.shape[1] - 1):

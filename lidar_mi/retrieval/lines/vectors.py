@@ -3,8 +3,8 @@
 import enum
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy.spatial import Delaunay, KDTree, QhullError
 
 from lidar_mi.errors import InputError
 
@@ -173,8 +173,8 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     along = wind_along_lines(scan)
     tangents = _tangents(scan)
     try:
-        corners = Delaunay(tangents).simplices
-    except QhullError:
+        corners = scipy.spatial.Delaunay(tangents).simplices
+    except scipy.spatial.QhullError:
         raise InputError(
             f"scan.direction: all {len(tangents)} lines lie in one plane; expected three lines "
             "that do not"
@@ -216,7 +216,7 @@ def wind_from_neighbours(scan: xr.Dataset, count: int = 9) -> xr.Dataset:
     tangents = _tangents(scan)
     if not 3 <= count <= len(tangents):
         raise InputError(f"count: {count} is not allowed; expected 3 to {len(tangents)}")
-    _, nearest = KDTree(tangents).query(tangents, k=count)
+    _, nearest = scipy.spatial.KDTree(tangents).query(tangents, k=count)
     return _vectors(scan, along, nearest, "neighbours")
 
 

@@ -8,10 +8,13 @@ fitted as such, whatever the camera made of them.
 
 import math
 from dataclasses import dataclass
-
-import torch
+from typing import TYPE_CHECKING
 
 from lidar_mi.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
 
 # Steps of a fixed-point iteration; each gains the factor of the distortion itself (0.1 % to 5 %).
 _STEPS = 12
@@ -63,12 +66,14 @@ class Geometry:
 
 
 def straightened(
-    geometry: Geometry, x: torch.Tensor, y: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+    geometry: Geometry, x: "torch.Tensor", y: "torch.Tensor"
+) -> "tuple[torch.Tensor, torch.Tensor]":
     """Places in the ideal image of places (x, y) on the camera; pixels from the top left one.
 
     The axis stays where it is.
     """
+    import torch
+
     if geometry.ideal:
         return x, y
     left, top = geometry.axis
@@ -85,8 +90,8 @@ def straightened(
 
 
 def by_tilt_and_distortion(
-    geometry: Geometry, centre: tuple[float, float], x: torch.Tensor, y: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    geometry: Geometry, centre: tuple[float, float], x: "torch.Tensor", y: "torch.Tensor"
+) -> "tuple[torch.Tensor, torch.Tensor, torch.Tensor]":
     """Derivatives of r^2 by both tilts and the distortion, px^2.
 
     r is the distance from ``centre`` in the ideal image, at its places (x, y), which are from that

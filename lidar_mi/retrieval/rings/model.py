@@ -7,15 +7,18 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
-import torch
 from scipy.constants import speed_of_light
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.geometry import Geometry
 from lidar_mi.retrieval.rings.smooth import MOST_DEGREE, term_names
+
+if TYPE_CHECKING:
+    import torch
+
 
 FRAME = ("v_los", "x", "y", "level", "background", "temperature", "falloff", "aerosol")
 """Parameters of every image: m/s, px, px, electrons per pixel (mean over an order, at the centre),
@@ -34,6 +37,8 @@ distortion at the corner, px^2 (squared radius of the disc of a defocused point)
 factor exp(-a n - b n^2) of the n-th harmonic: the mirrors' reflectivity and the plates' defects."""
 
 PARAMETERS = (*FRAME, *LIGHT, *BACKGROUND, *INSTRUMENT)
+
+Electrons = TypeVar("Electrons", float, "torch.Tensor")
 
 NEGLIGIBLE = 1e-7  # harmonics below this fraction of A_0 change velocities by less than 1e-4 m/s
 # Of the aerosol's narrow line; the omitted harmonics are nearly orthogonal to a change of speed.
@@ -202,8 +207,10 @@ class RingModel:
             self.distortion,
         )
 
-    def start(self, device: str | torch.device = "cpu") -> torch.Tensor:
+    def start(self, device: "str | torch.device" = "cpu") -> "torch.Tensor":
         """Prior means (1, `PARAMETERS`); level 1."""
+        import torch
+
         values = {
             "level": 1.0,
             "temperature": self.middle_temperature,
@@ -223,7 +230,9 @@ class RingModel:
         scaled = (nodes - nodes[0]) / (nodes[-1] - nodes[0])
         return np.linalg.solve(np.vander(scaled, increasing=True), self.harmonics)
 
-    def amplitudes(self, parameters: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def amplitudes(
+        self, parameters: "torch.Tensor"
+    ) -> "tuple[torch.Tensor, dict[str, torch.Tensor]]":
         """Harmonics A_1 ... of images with these parameters, and their derivatives.
 
         Parameters
@@ -237,6 +246,8 @@ class RingModel:
         derivatives : dict
             By temperature and aerosol (where the model has them), damping and roughness.
         """
+        import torch
+
         device = parameters.device
         temperature, aerosol, damping, roughness = (
             parameters[:, PARAMETERS.index(name), None]
@@ -318,7 +329,7 @@ class PixelNoise:
         if not (math.isfinite(self.excess) and self.excess >= 1):
             raise InputError(f"excess: {self.excess!r} is not allowed; expected 1 or more")
 
-    def variance(self, mean: torch.Tensor, signal: torch.Tensor) -> torch.Tensor:
+    def variance(self, mean: Electrons, signal: Electrons) -> Electrons:
         """Electrons^2, of pixels with ``mean`` electrons, ``signal`` of them laser light.
 
         A Poisson number whose mean is Gamma distributed is negative binomial: mean +
@@ -336,10 +347,10 @@ class SpeedsOfRings(Protocol):
     """Speeds read from images, by whatever method, as of `RingFit`."""
 
     @property
-    def v_los(self) -> torch.Tensor: ...  # noqa: D102
+    def v_los(self) -> "torch.Tensor": ...  # noqa: D102
     @property
-    def v_los_std(self) -> torch.Tensor: ...  # noqa: D102
+    def v_los_std(self) -> "torch.Tensor": ...  # noqa: D102
     @property
-    def sensitivity(self) -> torch.Tensor: ...  # noqa: D102
+    def sensitivity(self) -> "torch.Tensor": ...  # noqa: D102
     @property
-    def systematic(self) -> torch.Tensor: ...  # noqa: D102
+    def systematic(self) -> "torch.Tensor": ...  # noqa: D102

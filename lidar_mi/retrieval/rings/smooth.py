@@ -6,10 +6,13 @@ the `falloff` about the rings' centre, so it is not among the light's terms.
 """
 
 from functools import lru_cache
-
-import torch
+from typing import TYPE_CHECKING
 
 from lidar_mi.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
 
 MOST_DEGREE = 8
 
@@ -30,8 +33,10 @@ def term_names(kind: str, degree: int) -> tuple[str, ...]:
     )
 
 
-def term_values(names: tuple[str, ...], u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+def term_values(names: tuple[str, ...], u: "torch.Tensor", v: "torch.Tensor") -> "torch.Tensor":
     """Values at places (u, v), half diagonals from the middle; shape (places, names)."""
+    import torch
+
     indices = [tuple(map(int, name.split("_")[1:])) for name in names]
     # n - |m| is even: products of r e^(i phi) and r^2, no roots or powers of all pixels
     highest = max((n for n, _ in indices), default=0)

@@ -16,6 +16,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.defects.rest import all_at_rest
+from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.images.beam_times import checked_times
 from lidar_mi.retrieval.images.inpainting import filled_in
 from lidar_mi.retrieval.images.intensity import normalised
@@ -151,12 +152,16 @@ def fit_vortices(
     taken = _checked_acquisition(stack, dt, noise, profile, frozen, times, telescope, device)
     _check_start(start, profile)
     pixels = [on_device(image, device) for image in stack]
-    with threads_for(image1.size):
+
+    def fitted() -> VortexPairFit:
+        first, second = pixels
         # smaller images hold no search region, in which motion around structure is found
         if min(image1.shape) >= Windows.search:
-            pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).masked(pixels)
-        first, second = pixels
+            first, second = all_at_rest(pixels, Windows(tuple(image1.shape))).masked(pixels)
         return fit_pixels(first, second, taken, start)
+
+    with threads_for(image1.size):
+        return within_memory(fitted)
 
 
 def started_fit(

@@ -21,6 +21,7 @@ def wind_bound(
     noise: float | xr.DataArray,
     windows: WindowSizes = IMAGE_WINDOWS,
     times: Sequence[xr.DataArray] | None = None,
+    device: str | torch.device = "cpu",
 ) -> xr.Dataset:
     """Least standard error of v and w (m/s) that any unbiased method has from each template alone.
 
@@ -45,14 +46,14 @@ def wind_bound(
     frame = windows.on(image1.shape)
     level: float | torch.Tensor | None
     if isinstance(known, xr.DataArray):
-        level = on_device(known.clip(min=1e-3 * float(known.median())), "cpu")
+        level = on_device(known.clip(min=1e-3 * float(known.median())), device)
     else:
         level = known
-    pair = [on_device(image, "cpu") for image in (image1, image2)]
+    pair = [on_device(image, device) for image in (image1, image2)]
     covariance = displacement_bound(filled(pair[0]), filled(pair[1]), level, frame.template)
     rows, columns = (torch.as_tensor(frame.starts(axis)) for axis in (0, 1))
     root = covariance[:2, rows][:, :, columns].sqrt()
-    bound = torch.where(non_finite(pair, frame), torch.nan, root).numpy()
+    bound = torch.where(non_finite(pair, frame), torch.nan, root).cpu().numpy()
     tau = checked_times(times, [image1, image2], dt)
     interval = vector_times(tau, dt, frame, np.zeros((2, *frame.count)), False).difference
     found = {}

@@ -14,6 +14,7 @@ from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.defects.removal import CleanImages, as_they_are, without_defects
 from lidar_mi.retrieval.defects.unrelated import unrelated
+from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.beam_times import vector_times
 from lidar_mi.retrieval.images.displacement import Displacement
@@ -93,7 +94,8 @@ def retrieve_wind(
         False: "cc", "ws" and "multipass" state none and flag no vector for its own, which halves
         their time. The others have theirs from the fit.
     device : str or torch.device
-        Where to compute.
+        Where to compute: "cpu", "cuda", or "auto" for CUDA where there is one. Where its memory is
+        full, smaller parts are computed at once.
 
     Returns
     -------
@@ -132,10 +134,14 @@ def retrieve_wind(
     chosen = method_of(method)
     images = [image1, image2, *more]
     given = checked_input(images, dt, chosen, windows, noise, times, blur, device)
-    with threads_for(image1.size):
+
+    def found() -> tuple[CleanImages, Vectors]:
         remove = without_defects if checks else as_they_are
         clean = remove(given.pixels, given.windows)
-        vectors = _vectors(chosen, given, clean, validation, settings, checks, standard_errors)
+        return clean, _vectors(chosen, given, clean, validation, settings, checks, standard_errors)
+
+    with threads_for(image1.size):
+        clean, vectors = within_memory(found)
     return pair_dataset(chosen, given, clean, vectors, validation)
 
 

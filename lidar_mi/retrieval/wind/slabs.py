@@ -19,16 +19,19 @@ from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 
 def expected_wind(
-    image1: xr.DataArray, start: Flow, noise: float | xr.DataArray | None = None
+    image1: xr.DataArray,
+    start: Flow,
+    noise: float | xr.DataArray | None = None,
+    device: str | torch.device = "cpu",
 ) -> ExpectedFlow:
     """A start for `wind_of_slab`: the flow expected, and the first image, before the second one.
 
-    `noise` is that of `retrieve_wind`.
+    `noise` and `device` are those of `retrieve_wind`.
     """
     (image1,), level = checked_stack([image1], noise)
-    known = on_device(level, "cpu") if isinstance(level, xr.DataArray) else level
+    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
     with threads_for(image1.size):
-        return expected_flow(start, on_device(image1, "cpu"), known)
+        return expected_flow(start, on_device(image1, device), known)
 
 
 def wind_of_slab(

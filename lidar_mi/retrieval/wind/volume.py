@@ -17,11 +17,12 @@ from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.defects.rest import all_at_rest
 from lidar_mi.retrieval.defects.unrelated import unrelated
+from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, of_fit
-from lidar_mi.retrieval.images.windows import working
+from lidar_mi.retrieval.images.windows import Windows, working
 from lidar_mi.retrieval.wind.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.options import (
@@ -124,9 +125,40 @@ def retrieve_wind_volume(
     frame = windows.on(stack[0].shape)
     raw = [on_device(volume, device) for volume in stack]
     known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    steps, same = spacing(stack[0]), identical(stack, "volumes")
+    found = within_memory(
+        lambda: _displacements(raw, known, method, frame, validation, settings, steps)
+    )
+    if same:
+        found = found._replace(flag=found.flag | Flag.AT_REST.value)
+    variables = winds(found, AXES, steps, dt)
+    long_name = "correlation of the volumes warped to mid-time"
+    variables["correlation"] = field(AXES, found.score, long_name, "1")
+    variables["flag"] = flags(found, AXES)
+    attributes = {
+        "method": method,
+        **asdict(windows),
+        "dt": dt,
+        "min_correlation": validation.min_correlation,
+    }
+    if same:
+        attributes["identical_images"] = same
+    coords = centres(stack[0], frame, "window")
+    return dataset(variables, coords, "Wind from two volumes", attributes, found)
+
+
+def _displacements(
+    raw: Sequence[torch.Tensor],
+    noise: float | torch.Tensor | None,
+    method: str,
+    frame: Windows,
+    validation: VectorValidation,
+    settings: MultipassSettings | VariationalSettings | None,
+    steps: Sequence[float],
+) -> Displacement:
+    """Displacements in voxels, with errors and flags; `steps` are the spacings, m."""
     defects = all_at_rest(raw, frame)
-    volumes, relative = without_attenuation(defects.masked(raw), known)
-    steps = spacing(stack[0])
+    volumes, relative = without_attenuation(defects.masked(raw), noise)
     options: dict[str, Any] = {
         "min_correlation": validation.min_correlation,
         "noise": relative,
@@ -156,24 +188,7 @@ def retrieve_wind_volume(
     # shear lowers the correlation of windows as large as a volume is thick: all windows together
     if bool(unrelated(volumes, frame, False, relative).all()):
         flag = flag | Flag.UNRELATED.value
-    same = identical(stack, "volumes")
-    if same:
-        flag = flag | Flag.AT_REST.value
-    found = found._replace(flag=flag)
-    variables = winds(found, AXES, steps, dt)
-    long_name = "correlation of the volumes warped to mid-time"
-    variables["correlation"] = field(AXES, found.score, long_name, "1")
-    variables["flag"] = flags(found, AXES)
-    attributes = {
-        "method": method,
-        **asdict(windows),
-        "dt": dt,
-        "min_correlation": validation.min_correlation,
-    }
-    if same:
-        attributes["identical_images"] = same
-    coords = centres(stack[0], frame, "window")
-    return dataset(variables, coords, "Wind from two volumes", attributes, found)
+    return found._replace(flag=flag)
 
 
 def without_attenuation(

@@ -8,7 +8,7 @@ import json
 import pytest
 
 from lidar_mi.assessment.metrics.names import current_name, title_of
-from lidar_mi.experiment.folder.run_folder import read_metrics
+from lidar_mi.experiment.folder.records import read_metrics
 
 # as 0.9 wrote them, in a run and (with a variant's name before it) in a study
 FORMER = {

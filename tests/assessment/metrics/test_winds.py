@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.metrics.names import Source
-from lidar_mi.assessment.metrics.winds import cross_flow_metrics, has_no_skill
+from lidar_mi.assessment.metrics.names import Source, has_no_skill
+from lidar_mi.assessment.metrics.winds import cross_flow_metrics
 from lidar_mi.retrieval.images.quality import Flag
 
 

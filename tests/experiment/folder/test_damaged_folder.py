@@ -7,12 +7,11 @@ and names in a record that lead out of the folder.
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import study
+from lidar_mi.experiment.folder import records
 from lidar_mi.experiment.folder import run_folder as resumable_folder
-from lidar_mi.experiment.folder.run_folder import read_metrics
+from lidar_mi.experiment.folder.records import read_metrics, read_study
 from lidar_mi.experiment.log import Log, failure
 from lidar_mi.experiment.schema import reading
-from lidar_mi.experiment.study import read_study
 
 
 @pytest.mark.parametrize(
@@ -57,11 +56,11 @@ def test_variants_of_a_record_stay_in_its_folder(tmp_path, name):
 
 def test_no_variant_is_called_like_a_file_beside_it(tmp_path):
     ours = {
-        study.RECORD,
-        resumable_folder.RECORD,
-        resumable_folder.LOG,
-        resumable_folder.METRICS,
-        resumable_folder.REPORT,
+        records.STUDY,
+        records.RECORD,
+        records.LOG,
+        records.METRICS,
+        records.REPORT,
         resumable_folder.FIGURES,
     }
     assert ours == set(reading.RESERVED_NAMES)

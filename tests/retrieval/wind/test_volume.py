@@ -343,7 +343,7 @@ def test_more_volumes_tell_more():
 @pytest.mark.parametrize("method", ["correlation", "variational"])
 def test_one_volume_given_twice_has_no_valid_wind(method):
     """It was 0 m/s, and valid all over."""
-    one, other = shifted((16, 24, 28), np.array([0.0, 0.3, -0.6]), 0.0, seed=1, length=2.0)
+    one, other = shifted((10, 12, 14), np.array([0.0, 0.3, -0.6]), 0.0, seed=1, length=2.0)
     wind = retrieve_wind_volume(one, one.copy(), DT, method)
     assert wind.identical_images == "volumes 1 and 2 are the same, bit for bit"
     assert bool((wind.flag & Flag.AT_REST.value).all())

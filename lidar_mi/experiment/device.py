@@ -1,0 +1,75 @@
+"""The device that renders and retrieves, as an experiment asks for it.
+
+Rendering and retrieval are of two libraries, each of which may or may not compute on a GPU.
+"""
+
+from typing import TypeVar
+
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.rendering.settings import FringeSettings, RenderSettings
+from lidar_mi.rendering.variant import has_cuda
+
+Settings = TypeVar("Settings", RenderSettings, FringeSettings)
+
+CPU, CUDA = "cpu", "cuda"
+_BACKENDS = {CPU: "llvm", CUDA: "cuda"}
+
+
+def on_its_device(experiment: Experiment) -> Experiment:
+    """The experiment with the variants and the retrieval's device that its `device` asks for.
+
+    Variants keep what follows llvm or cuda. Where rendering alone can be on the GPU, `auto` puts
+    retrieval on the processor. An experiment that is on its device stays as it is.
+
+    Raises
+    ------
+    InputError
+        CUDA is asked for, and one of both does not compute there.
+    """
+    asked = experiment.device
+    if asked is None:
+        return experiment
+    rendering, retrieval = (CPU, CPU) if asked == CPU else _found(asked)
+    update: dict[str, object] = {
+        "device": retrieval if rendering == retrieval else None,
+        "render": _of(experiment.render, rendering),
+    }
+    if experiment.doppler:
+        render = _of(experiment.doppler.render, rendering)
+        update["doppler"] = experiment.doppler.model_copy(update={"render": render})
+    return experiment.model_copy(update=update).read_from(experiment.folder)
+
+
+def devices_in_words(experiment: Experiment) -> str:
+    """Where an experiment that is on its device renders and retrieves, for the log."""
+    sections = (
+        experiment.wake and experiment.render,
+        experiment.doppler and experiment.doppler.render,
+    )
+    variants = dict.fromkeys(section.variant for section in sections if section)
+    return f"rendering in {' and '.join(variants)}, retrieval on {experiment.device or CPU}"
+
+
+def _found(asked: str) -> tuple[str, str]:
+    """Devices of rendering and of retrieval: CUDA's where they are there."""
+    # loaded where a device is asked for alone
+    import torch
+
+    rendering, retrieval = has_cuda(), torch.cuda.is_available()
+    if asked == CUDA and not (rendering and retrieval):
+        reason = (
+            "this torch does not compute with CUDA"
+            if rendering
+            else "no NVIDIA GPU with a driver that is new enough"
+        )
+        raise InputError(f"device: cuda cannot be used here ({reason}); expected auto or cpu")
+    if retrieval and not rendering:
+        return CPU, CPU
+    return (CUDA if rendering else CPU), (CUDA if retrieval else CPU)
+
+
+def _of(render: Settings, device: str) -> Settings:
+    """Settings with the variant of a device."""
+    _, _, kind = render.variant.partition("_")
+    return render.model_copy(update={"variant": f"{_BACKENDS[device]}_{kind}"})

@@ -1,0 +1,55 @@
+"""Rendering in smaller passes where the memory of the device is full."""
+
+import gc
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from lidar_mi.errors import InputError, causes
+
+T = TypeVar("T")
+
+LEAST = 1024
+"""Samples of a pass: fewer waste the device."""
+_SMALLER = 4
+
+
+def within_memory(integrator: Any, render: Callable[[], T]) -> T:
+    """What a function renders; where memory is full, again in passes of a quarter of the samples.
+
+    The integrator keeps the smaller passes, for the images that follow. Images do not depend on
+    them but for rounding.
+
+    Parameters
+    ----------
+    integrator : mi.Integrator
+        With ``samples_per_pass``, `gated_volpath` or `fringes`.
+    render : callable
+
+    Raises
+    ------
+    InputError
+        Memory is full with the smallest passes, too.
+    """
+    import drjit as dr
+
+    while True:
+        try:
+            return render()
+        except Exception as error:
+            if not _is_full(error):
+                raise
+            if integrator.samples_per_pass <= LEAST:
+                raise InputError(
+                    f"render: {integrator.samples_per_pass} samples at once are not allowed; the "
+                    "memory of the device that renders is full, expected fewer beams, gates or "
+                    "orders, other programs ended, or device: cpu"
+                ) from None
+        # outside of the clause, whose traceback holds arrays
+        gc.collect()
+        dr.flush_malloc_cache()
+        integrator.samples_per_pass = max(LEAST, integrator.samples_per_pass // _SMALLER)
+
+
+def _is_full(error: BaseException) -> bool:
+    """Whether Dr.Jit got no memory: it has no type for it."""
+    return any("out of memory" in str(one).lower() for one in causes(error))

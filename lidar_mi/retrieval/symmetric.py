@@ -1,0 +1,29 @@
+"""Eigenvalues of many small symmetric matrices, on any device."""
+
+import torch
+
+MOST = 1 << 15
+"""Matrices of a call: the solver of CUDA refuses more than 65 535."""
+
+
+def largest_eigenvalue(matrices: torch.Tensor) -> torch.Tensor:
+    """The largest eigenvalue of symmetric matrices.
+
+    Of 2 x 2 in closed form, (a + d) / 2 + ((a - d)^2 / 4 + b^2)^(1/2), exact to rounding of the
+    largest element; of others by `torch.linalg.eigvalsh`, some at a time.
+
+    Parameters
+    ----------
+    matrices : torch.Tensor, shape (..., n, n)
+        Finite.
+
+    Returns
+    -------
+    torch.Tensor, shape (...)
+    """
+    if matrices.shape[-1] == 2:
+        a, b, d = matrices[..., 0, 0], matrices[..., 1, 0], matrices[..., 1, 1]
+        return a / 2 + d / 2 + torch.hypot(a / 2 - d / 2, b)
+    flat = matrices.flatten(0, -3) if matrices.ndim > 2 else matrices[None]
+    found = torch.cat([torch.linalg.eigvalsh(part)[:, -1] for part in flat.split(MOST)])
+    return found.reshape(matrices.shape[:-2])
