@@ -13,8 +13,9 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.air import air_along_path
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
 from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
@@ -24,7 +25,7 @@ from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.series import FlightRecorder, flights_dataset, track_dataset
 from lidar_mi.encounter.slab_recorder import SlabRecorder
 from lidar_mi.encounter.user_controller import name_of, user_controller
-from lidar_mi.encounter.wake import encounter_of, wake_along_path
+from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.schema.encounter import Encounter
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.progress import Notice
@@ -98,7 +99,7 @@ def simulate_flights(
         As `VirtualLidar` takes them.
     """
     encounter = encounter_of(experiment)
-    wake = wake_along_path(experiment)
+    wake = air_along_path(experiment)
     levelling = encounter.control.levelling_time
     new = aircraft or (lambda: aircraft_of(encounter))
     name = name_of(controller) if controller else ""
@@ -128,7 +129,10 @@ def simulate_flights(
     # from no help to all help; simulated in another order, so that the slow one comes last
     order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in found]
     series = flights_dataset({mode: found[mode] for mode in order})
-    return FlightData(series.assign_attrs({CONTROLLER: name} if name else {}), track, slabs)
+    about = {CONTROLLER: name} if name else {}
+    if encounter.air is not None:
+        about[MET] = "air"
+    return FlightData(series.assign_attrs(about), track, slabs)
 
 
 def simulate_flight(

@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.assessment.metrics.encounter import CONTROLLER, encounter_metrics
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, encounter_metrics
 from lidar_mi.assessment.report.encounter import encounter_summary
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import FlightData, OwnAircraft, OwnController, simulate_flights
@@ -73,7 +73,11 @@ class Flights(Tabular):
         rows += [("warning", text) for text in self.warnings]
         return [
             Table("flight", rows),
-            *encounter_summary(self.metrics, self.series.attrs.get(CONTROLLER, "")),
+            *encounter_summary(
+                self.metrics,
+                self.series.attrs.get(CONTROLLER, ""),
+                self.series.attrs.get(MET, "wake"),
+            ),
         ]
 
     def show(self) -> None:

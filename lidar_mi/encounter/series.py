@@ -38,12 +38,12 @@ _STATES: dict[str, tuple[str, str]] = {
     "departed": ("1", "1 from the moment at which the aircraft is upset"),
 }
 _LOADS = {
-    "force_x": ("N", "force of the wake forward"),
-    "force_y": ("N", "force of the wake to the left"),
-    "force_z": ("N", "force of the wake upwards"),
-    "roll_moment": ("N m", "rolling moment of the wake, port wing up"),
-    "pitch_moment": ("N m", "pitching moment of the wake, nose down"),
-    "yaw_moment": ("N m", "yawing moment of the wake, nose to port"),
+    "force_x": ("N", "force of the wind forward"),
+    "force_y": ("N", "force of the wind to the left"),
+    "force_z": ("N", "force of the wind upwards"),
+    "roll_moment": ("N m", "rolling moment of the wind, port wing up"),
+    "pitch_moment": ("N m", "pitching moment of the wind, nose down"),
+    "yaw_moment": ("N m", "yawing moment of the wind, nose to port"),
 }
 _COMMANDS = {name: ("rad", f"{name} asked for") for name in ("aileron", "elevator", "rudder")}
 _DEFLECTION = ("rad", "aileron as deflected")

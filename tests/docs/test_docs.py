@@ -25,8 +25,8 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
+from lidar_mi.experiment.schema import air, reading, scattering, wake
 from lidar_mi.experiment.schema import experiment as schema
-from lidar_mi.experiment.schema import reading, scattering, wake
 from lidar_mi.experiment.truth import extinction as truth
 from lidar_mi.instrument import motion
 from lidar_mi.instrument.reported import Reported
@@ -40,6 +40,7 @@ EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experim
 PAGES = (
     "README.md",
     "docs/theory.md",
+    "docs/theory_air.md",
     "docs/accuracy.md",
     "docs/user_guide.md",
     "docs/plugins.md",
@@ -56,6 +57,12 @@ OPTIONAL = (
     motion.Sinusoid,
     motion.Attitude,
     Reported,
+    air.Air,
+    air.Turbulence,
+    air.Gust,
+    air.LinearShear,
+    air.LogarithmicShear,
+    air.Microburst,
 )
 # what they need
 REQUIRED = {

@@ -16,6 +16,9 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 CONTROLLER = "controller"
 """Attribute of the time series: the name of a controller of one's own."""
 
+MET = "met"
+"""Attribute of the time series: what a flight meets, "wake" (by default) or "air"."""
+
 _NAMES = {
     "off": "without control",
     "autopilot": "autopilot",
@@ -59,6 +62,7 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
         key, roll = f"encounter.{mode}", _largest(one["roll"])
         found[f"{key}.largest_roll"] = roll
         found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
+        found[f"{key}.largest_lift"] = _largest(one["force_z"])
         found[f"{key}.residual_moment"] = residual_moment(one)
         found[f"{key}.roll_control_ratio"] = roll_control_ratio(one["roll_moment"].values, largest)
         found[f"{key}.departed"] = float(one["departed"].max())
@@ -209,12 +213,17 @@ def _largest(values: xr.DataArray) -> float:
 
 
 def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
-    """Fraction of what perfect preview removes that the lidar removes."""
-    keys = [f"encounter.{mode}.{quantity}" for mode in ("off", "feedforward", "perfect")]
-    if not all(key in found for key in keys):
-        return {}
-    off, ours, perfect = (found[key] for key in keys)
-    # nothing is removed: the fraction would be one of rounding
-    if abs(off - perfect) <= _ROUNDING:
-        return {}
-    return {f"encounter.removed_of_perfect.{quantity}": (off - ours) / (off - perfect)}
+    """Fractions of what perfect preview removes that the lidar removes.
+
+    Of what no control leaves, and of what the autopilot leaves, which has no preview.
+    """
+    removed = {}
+    for name, baseline in (("of_perfect", "off"), ("beyond_autopilot", "autopilot")):
+        keys = [f"encounter.{mode}.{quantity}" for mode in (baseline, "feedforward", "perfect")]
+        if not all(key in found for key in keys):
+            continue
+        before, ours, perfect = (found[key] for key in keys)
+        # nothing is removed: the fraction would be one of rounding
+        if abs(before - perfect) > _ROUNDING:
+            removed[f"encounter.removed_{name}.{quantity}"] = (before - ours) / (before - perfect)
+    return removed

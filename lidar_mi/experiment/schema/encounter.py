@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from lidar_mi.experiment.schema.air import Air
 from lidar_mi.experiment.schema.section import Section
 from lidar_mi.units import (
     Angle,
@@ -142,6 +143,7 @@ class Encounter(Section):
     aircraft: Aircraft = Aircraft()
     path: Path = Path()
     wake: WakeInTime = WakeInTime()
+    air: Air | None = Field(None, description="beside the wake, or in its place; default: at rest")
     rate: Annotated[Frequency, Within(0.1, 1000, "slabs a second")] = 10.0
     look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
         150.0, description="range of the farther gate's start"

@@ -32,6 +32,7 @@ def flight(roll, control, predicted=np.nan):
         "airspeed": np.full(401, 75.0),
         "departed": np.zeros(401),
         "roll_moment": wake,
+        "force_z": -0.2 * wake,
         "control_roll_moment": -control * wake,
         "predicted_roll_moment": predicted * wake,
     }
@@ -41,8 +42,9 @@ def flight(roll, control, predicted=np.nan):
 
 @pytest.fixture
 def series():
-    flights = [flight(0.5, 0.0), flight(-0.14, 0.75, 0.9), flight(0.05, 0.9)]
-    names = xr.DataArray(["off", "feedforward", "perfect"], dims="flight", name="flight")
+    flights = [flight(0.5, 0.0), flight(-0.14, 0.75, 0.9), flight(0.05, 0.9), flight(-0.2, 0.6)]
+    names = ["off", "feedforward", "perfect", "autopilot"]
+    names = xr.DataArray(names, dims="flight", name="flight")
     return xr.concat(flights, names)
 
 
@@ -85,10 +87,12 @@ def test_roll_and_moments(series):
     assert found["encounter.feedforward.largest_roll"] == pytest.approx(0.14)
     assert found["encounter.perfect.largest_roll_rate"] == pytest.approx(0.1)
     assert found["encounter.removed_of_perfect.largest_roll"] == pytest.approx(0.36 / 0.45)
+    assert found["encounter.removed_beyond_autopilot.largest_roll"] == pytest.approx(0.06 / 0.15)
+    assert found["encounter.perfect.largest_lift"] == pytest.approx(2e4)
     assert found["encounter.feedforward.residual_moment"] == pytest.approx(0.25)
     assert found["encounter.off.roll_control_ratio"] == pytest.approx(0.5)
     # 0.14 rad are 8 degrees, 0.05 rad are 3
-    assert [found[f"encounter.{m}.hazardous"] for m in series["flight"].values] == [1, 1, 0]
+    assert [found[f"encounter.{m}.hazardous"] for m in series["flight"].values] == [1, 1, 0, 1]
     assert not any("track" in key for key in found)
 
 

@@ -1,0 +1,135 @@
+"""The air of an encounter: what flies, what is seen and what is advected is in all of it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidar_mi.atmosphere.air.along_path import AirAlongPath, LevelFrame, MovingAir
+from lidar_mi.atmosphere.air.gust import Gust
+from lidar_mi.atmosphere.air.microburst import Microburst
+from lidar_mi.atmosphere.air.shear import LinearShear, LogarithmicShear
+from lidar_mi.atmosphere.air.standards import (
+    CS_25_LENGTH,
+    design_gust_speed,
+    flight_profile_alleviation,
+    mil_f_8785c,
+)
+from lidar_mi.atmosphere.air.turbulence import Turbulence, turbulence
+from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema import air as schema
+from lidar_mi.experiment.schema.encounter import Path
+from lidar_mi.experiment.schema.experiment import Experiment
+
+# Planes across the path, in separations from the middle, over which a wake's drift is averaged.
+_AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
+
+
+def air_along_path(experiment: Experiment) -> WakeAlongPath:
+    """The wind of the wake and of all other air along the flight path.
+
+    Raises
+    ------
+    InputError
+        No encounter, a wake that is not known along its axis, air out of range.
+    """
+    encounter, wake = encounter_of(experiment), wake_along_path(experiment)
+    air, path = encounter.air, encounter.path
+    if air is None:
+        return wake
+    parts = moving_air(air, path, experiment.seed)
+    frame = LevelFrame(path.altitude, path.climb_angle)
+    if not air.wake:
+        return AirAlongPath(None, parts, frame)
+    met = path.start / path.speed
+    # a gust is shorter than the wake: it does not move all of it
+    wide = [part for part in parts if not isinstance(part, Gust)]
+    return AirAlongPath(wake, parts, frame, _drift(wake, wide, frame, path.start, met), met)
+
+
+def moving_air(air: schema.Air, path: Path, seed: int) -> tuple[MovingAir, ...]:
+    """The parts of the air that are not the wake.
+
+    Parameters
+    ----------
+    air : lidar_mi.experiment.schema.air.Air
+    path : lidar_mi.experiment.schema.encounter.Path
+        Heights are above its ground; turbulence and gusts are those at its start.
+    seed : int
+        Of the experiment.
+    """
+    parts: list[MovingAir] = []
+    if air.turbulence is not None:
+        parts.append(_turbulence(air.turbulence, path.altitude, seed))
+    for gust in air.gusts:
+        speed = gust.speed
+        if speed is None:
+            factor = gust.alleviation or 1.0
+            if gust.maximum_altitude is not None:
+                factor = flight_profile_alleviation(
+                    path.altitude, gust.maximum_altitude, gust.landing_weight, gust.zero_fuel_weight
+                )
+            speed = design_gust_speed(path.altitude, gust.gradient, factor)
+        parts.append(Gust(gust.direction, gust.gradient, gust.start, speed))
+    if air.linear_shear is not None:
+        shear = air.linear_shear
+        parts.append(LinearShear(shear.du_dz, shear.dv_dz, path.altitude))
+    if air.logarithmic_shear is not None:
+        layer = air.logarithmic_shear
+        parts.append(
+            LogarithmicShear(
+                layer.speed, layer.reference, layer.roughness, layer.towards, path.altitude
+            )
+        )
+    if air.microburst is not None:
+        burst = air.microburst
+        parts.append(
+            Microburst(burst.outflow, burst.radius, burst.outflow_height, burst.x, burst.y)
+        )
+    return tuple(parts)
+
+
+def _turbulence(given: schema.Turbulence, altitude: float, seed: int) -> Turbulence:
+    sigma, length = given.sigma, given.length
+    if given.standard == "cs_25":
+        length = length or CS_25_LENGTH
+    else:
+        rms, scale = mil_f_8785c(altitude, given.level)
+        sigma, length = rms if sigma is None else sigma, length or scale
+    assert sigma is not None  # the section refuses its absence with cs_25
+    if given.shortest > length / 10:
+        raise InputError(
+            f"encounter.air.turbulence.shortest: {given.shortest:g} m is not allowed with the "
+            f"length of {length:.3g} m at {altitude:g} m; expected at most {length / 10:.3g} m"
+        )
+    return turbulence(
+        sigma,
+        length,
+        seed if given.seed is None else given.seed,
+        spectrum=given.spectrum,
+        shortest=given.shortest,
+        evolution=given.evolution,
+    )
+
+
+def _drift(
+    wake: WakeAlongPath, parts: Sequence[MovingAir], frame: LevelFrame, x: float, time: float
+) -> tuple[float, float, float]:
+    """Mean wind (m/s) of the other air along both vortices, where and when the wake is met.
+
+    Of a wake that lies across the path: at the place where the aircraft is then.
+    """
+    middle = vortices_in_plane(wake, x, time)
+    places = [(x, 0.0, 0.0)]
+    if middle:
+        separation = abs(middle[0].y - middle[1].y)
+        planes = [x + part * separation for part in _AROUND]
+        places = [
+            (plane, one.y, one.z)
+            for plane in planes
+            for one in vortices_in_plane(wake, plane, time) or ()
+        ]
+    at = np.array(places).T
+    u, v, w = (float(a.mean()) for a in frame.wind(parts, *at, time))
+    return u, v, w
