@@ -2,7 +2,7 @@
 
 All flights meet the same wake. Only the flight that steers by the lidar needs its images. The
 autopilot is the controller of the flights with a preview, at a preview of no loads: the difference
-between both is the benefit of a preview.
+between both is the benefit of a preview. Where the lidar has no track, the autopilot steers.
 """
 
 import math
@@ -17,7 +17,14 @@ from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.air import air_along_path
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
-from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
+from lidar_mi.encounter.control import (
+    Controller,
+    Preview,
+    bumpless_transfer,
+    feedforward,
+    no_loads,
+    wings_level,
+)
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.preview import Lidar, WakeTracker, preview_in
 from lidar_mi.encounter.roll_model import RollModel
@@ -100,7 +107,6 @@ def simulate_flights(
     """
     encounter = encounter_of(experiment)
     wake = air_along_path(experiment)
-    levelling = encounter.control.levelling_time
     new = aircraft or (lambda: aircraft_of(encounter))
     name = name_of(controller) if controller else ""
     found: dict[str, xr.Dataset] = {}
@@ -109,11 +115,9 @@ def simulate_flights(
         model, progress = new(), _titled(notice, flight_name(mode, name))
         fly = partial(simulate_flight, model, wake=wake, encounter=encounter, notice=progress)
         if mode == OFF:
-            found[mode] = fly(wings_level(model, levelling))
+            found[mode] = fly(wings_level(model, encounter.control.levelling_time))
             continue
-        steering = (
-            user_controller(controller, model) if controller else feedforward(model, levelling)
-        )
+        steering = user_controller(controller, model) if controller else feedforward(model)
         if mode == AUTOPILOT:
             found[mode] = fly(steering, preview_at=lambda state: no_loads)
         elif mode == PERFECT:
@@ -157,12 +161,13 @@ def simulate_flight(
     encounter : Encounter
     notice : callable
     preview_at : callable
-        The preview in a state; None: there is none.
+        The preview in a state; None: there is none, and the controller gets what
+        `bumpless_transfer` makes of the last one.
     """
     period = 1 / encounter.rate
     a_scan = math.ceil(period / _STEP)
     dt, count = period / a_scan, round(duration(encounter) / period) * a_scan
-    record, deflection = FlightRecorder(), np.zeros(3)
+    record, deflection, transfer = FlightRecorder(), np.zeros(3), bumpless_transfer()
     for step in range(count + 1):
         state = aircraft.state
         if step % a_scan == 0:
@@ -170,7 +175,7 @@ def simulate_flight(
         preview = preview_at(state)
         loads = loads_in_wind(aircraft.strips, state, wake.wind, aircraft.density)
         predicted = preview(state.time) if preview else None
-        commands = controller(preview, state)
+        commands = controller(transfer(preview, state), state)
         record.add(state, loads, predicted, commands, deflection, aircraft.control_moments)
         if step < count:
             aircraft.step(dt, loads, commands)

@@ -41,6 +41,7 @@ PAGES = (
     "README.md",
     "docs/theory.md",
     "docs/theory_air.md",
+    "docs/flight_control.md",
     "docs/accuracy.md",
     "docs/user_guide.md",
     "docs/plugins.md",

@@ -127,7 +127,7 @@ class Control(Section):
         0.12, description="from the second scan of a slab to its estimate"
     )
     levelling_time: Annotated[Time, Within(0.1, 1000, "a pilot")] | None = Field(
-        3.0, description="in which the wings are levelled, in every mode; null: they are not"
+        3.0, description="in which the wings are levelled without control; null: they are not"
     )
 
     @field_validator("mode", mode="before")
