@@ -18,6 +18,14 @@ from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from tests.support.turbulence import (
+    correlations,
+    finer_variance,
+    line_spectra,
+    plunge,
+    plunge_variance,
+    roll_rate_variance,
+)
 
 SIGMA, LENGTH = 1.5, 150.0
 SEEDS = range(100, 160)
@@ -26,23 +34,9 @@ SHORTEST = 3.0
 K_SIGMA = 4.0
 
 
-def along(r):
-    """Von Karman's longitudinal and transverse correlation (Hinze 1975, eq. 3-168 and 3-169)."""
-    x = np.asarray(r, float) / (1.339 * LENGTH)
-    scale = 2 ** (2 / 3) / special.gamma(1 / 3)
-    f = scale * x ** (1 / 3) * special.kv(1 / 3, x)
-    g = scale * x ** (1 / 3) * (special.kv(1 / 3, x) - x / 2 * special.kv(2 / 3, x))
-    return f, g
-
-
-def finer(sigma=SIGMA, length=LENGTH, shortest=SHORTEST):
-    """Variance of a component in waves that the field does not have."""
-    energy, _ = integrate.quad(
-        lambda s: np.exp(s) * energy_spectrum(np.exp(s), sigma, length, "von_karman"),
-        np.log(2 * np.pi / shortest),
-        np.log(1e6),
-    )
-    return 2 / 3 * energy
+def finer():
+    """Variance of a component in waves that the fields here do not have."""
+    return finer_variance(SIGMA, LENGTH, SHORTEST)
 
 
 def agree(samples, expected, k=K_SIGMA):
@@ -83,9 +77,7 @@ def test_line_spectra_are_those_of_the_standards():
         return integrate.quad(integrand, np.log(k1), np.log(1e4), limit=200)[0]
 
     for k1 in (1e-4, 1e-3, 1e-2, 0.1, 1.0):
-        q = (1.339 * LENGTH * k1) ** 2
-        longitudinal = SIGMA**2 * 2 * LENGTH / np.pi / (1 + q) ** (5 / 6)
-        transverse = SIGMA**2 * LENGTH / np.pi * (1 + 8 / 3 * q) / (1 + q) ** (11 / 6)
+        longitudinal, transverse = line_spectra(k1, SIGMA, LENGTH)
         assert line(k1, across=False) == pytest.approx(longitudinal, rel=2e-3)
         assert line(k1, across=True) == pytest.approx(transverse, rel=2e-3)
 
@@ -120,7 +112,7 @@ def test_structure_functions(fields, axis):
             change = np.subtract(field.velocity(*there, 0.0), field.velocity(*here, 0.0))
             square = (change**2).mean(axis=1)
             found.append([square[axis], (square.sum() - square[axis]) / 2])
-        expected = 2 * SIGMA**2 * (1 - np.array(along(r))) - 2 * finer()
+        expected = 2 * SIGMA**2 * (1 - np.array(correlations(r, LENGTH))) - 2 * finer()
         agree(found, expected)
 
 
@@ -138,11 +130,7 @@ def test_line_spectrum_of_a_flight(fields):
             density = power * 2 * step / (2 * np.pi * (window**2).sum())
             rows.append([density[octave].mean() for octave in octaves(k1)])
         found.append(rows)
-    q = (1.339 * LENGTH * k1) ** 2
-    laws = (
-        SIGMA**2 * 2 * LENGTH / np.pi / (1 + q) ** (5 / 6),
-        SIGMA**2 * LENGTH / np.pi * (1 + 8 / 3 * q) / (1 + q) ** (11 / 6),
-    )
+    laws = line_spectra(k1, SIGMA, LENGTH, SHORTEST)
     expected = [[law[octave].mean() for octave in octaves(k1)] for law in laws]
     agree(found, np.array(expected))
 
@@ -236,43 +224,22 @@ def test_correlation_in_time(evolution):
 def test_plunge_of_a_small_aircraft():
     """A point mass with lift: its acceleration is the integral of the standard's spectrum |H|^2.
 
-    m w' = -q S a (w - w_gust)/V: H = i omega/(1 + i omega tau), tau = m V/(q S a). A Cessna 172 of
-    1000 kg and 16.2 m^2 at 60 m/s, its span that of a point against the length.
+    m w' = -q S a (w - w_gust)/V: tau = m V/(q S a). A Cessna 172 of 1000 kg and 16.2 m^2 at 60 m/s,
+    its span that of a point against the length.
     """
     mass, area, speed, slope, density = 1000.0, 16.2, 60.0, 4.9, 1.2
     tau = mass / (0.5 * density * speed * area * slope)
-    step = 0.02
-    time = step * np.arange(3000)
+    time = 0.02 * np.arange(3000)
     found = []
     for seed in SEEDS:
         field = turbulence(SIGMA, LENGTH, seed, shortest=SHORTEST)
         gust = field.velocity(speed * time, 0.0, 0.0, time)[2]
-        # exact for a gust that is constant over a step
-        velocity, decay = 0.0, np.exp(-step / tau)
-        acceleration = np.empty(len(gust))
-        for number, one in enumerate(gust):
-            acceleration[number] = (one - velocity) / tau
-            velocity = one + (velocity - one) * decay
-        found.append((acceleration[500:] ** 2).mean())
-
-    def integrand(s):
-        k1 = np.exp(s)
-        q, omega = (1.339 * LENGTH * k1) ** 2, k1 * speed
-        law = SIGMA**2 * LENGTH / np.pi * (1 + 8 / 3 * q) / (1 + q) ** (11 / 6)
-        return k1 * law * omega**2 / (1 + (omega * tau) ** 2)
-
-    expected = integrate.quad(integrand, np.log(1e-6), np.log(1e3), limit=300)[0]
-    # waves of less than 3 m are in the standard's spectrum: 2 sigma^2 k^(-2/3) at high rates
-    expected -= finer() / tau**2
-    agree(found, expected)
+        found.append((plunge(gust, 0.02, tau)[500:] ** 2).mean())
+    agree(found, plunge_variance(SIGMA, LENGTH, SHORTEST, speed, tau))
 
 
 def test_roll_of_the_default_aircraft():
-    """Roll rate of a Boeing 737 by strips: from the transverse correlation between all strips.
-
-    I p' = L_p p + sum c_i w_i: <p^2> = tau / I^2 integral of R_L(t) exp(-t/tau), with
-    R_L(t) = sum c_i c_j R_ww(V t, y_i - y_j).
-    """
+    """Roll rate of a Boeing 737 by strips: from the transverse correlation between all strips."""
     path = Path(climb_angle=0.0)
     step, count = 0.025, 1600
     time = step * np.arange(count)
@@ -287,20 +254,7 @@ def test_roll_of_the_default_aircraft():
             model.step(step, Loads(force, moment), Commands())
         assert not model.state.departed
         found.append((np.square(rates)[80:]).mean())
-    y = model.strips.places[:, 1]
-    weight = 0.5 * model.density * path.speed * model.strips.areas * model.strips.roll_slopes * y
-    between = np.abs(y[:, None] - y)
-
-    def correlation(lag):
-        # of w, across the separation in x and in y; on the diagonal at lag 0 it is 1
-        r = np.hypot(path.speed * lag, between)
-        return SIGMA**2 * float(weight @ along(np.maximum(r, 1e-6))[1] @ weight)
-
-    tau = model.time_constant
-    expected = integrate.quad(
-        lambda t: correlation(t) * np.exp(-t / tau), 0, 20 * tau, limit=100, epsrel=1e-4
-    )[0]
-    agree(found, expected * tau / model.roll_inertia**2)
+    agree(found, roll_rate_variance(SIGMA, LENGTH, RollModel(Aircraft(), path)))
 
 
 @pytest.mark.parametrize(
