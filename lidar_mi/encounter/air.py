@@ -1,6 +1,8 @@
 """The air of an encounter: what flies, what is seen and what is advected is in all of it."""
 
 from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -15,12 +17,16 @@ from lidar_mi.atmosphere.air.standards import (
     mil_f_8785c,
 )
 from lidar_mi.atmosphere.air.turbulence import Turbulence, turbulence
+from lidar_mi.atmosphere.air.volume import AirVolume
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.schema import air as schema
-from lidar_mi.experiment.schema.encounter import Path
+from lidar_mi.experiment.schema import encounter as flight
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.io.wake_file import read_wake
 
 # Planes across the path, in separations from the middle, over which a wake's drift is averaged.
 _AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -40,6 +46,10 @@ def air_along_path(experiment: Experiment) -> WakeAlongPath:
         return wake
     parts = moving_air(air, path, experiment.seed)
     frame = LevelFrame(path.altitude, path.climb_angle)
+    if air.volume is not None:
+        volume = _volume(air.volume, experiment)
+        _check_covered(volume, air.volume.file, experiment, wake, frame)
+        parts = (volume, *parts)
     if not air.wake:
         return AirAlongPath(None, parts, frame)
     met = path.start / path.speed
@@ -48,8 +58,8 @@ def air_along_path(experiment: Experiment) -> WakeAlongPath:
     return AirAlongPath(wake, parts, frame, _drift(wake, wide, frame, path.start, met), met)
 
 
-def moving_air(air: schema.Air, path: Path, seed: int) -> tuple[MovingAir, ...]:
-    """The parts of the air that are not the wake.
+def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir, ...]:
+    """The parts of the air that are neither the wake nor read from a file.
 
     Parameters
     ----------
@@ -111,6 +121,53 @@ def _turbulence(given: schema.Turbulence, altitude: float, seed: int) -> Turbule
         shortest=given.shortest,
         evolution=given.evolution,
     )
+
+
+def _volume(given: schema.AirVolume, experiment: Experiment) -> AirVolume:
+    path = find_file(given.file, experiment.folder, "encounter.air.volume.file")
+    # its time of change: a file that is written anew is read anew
+    height = encounter_of(experiment).path.altitude
+    return _read_volume(path, path.stat().st_mtime_ns, given.model_dump_json(), height)
+
+
+# check, flight and lidar need it again: it takes seconds to read
+@lru_cache(maxsize=1)
+def _read_volume(path: Path, stamp: int, keys: str, height: float) -> AirVolume:
+    given = schema.AirVolume.model_validate_json(keys)
+    flow = read_wake(path, given.time, given.names, require=["u"])
+    start = float(flow["x"][0]) if given.start is None else given.start
+    centre = float(flow["y"].mean()) if given.centre is None else given.centre
+    return AirVolume(flow[["u", "v", "w"]], start, centre, height)
+
+
+def _check_covered(
+    volume: AirVolume, file: str, experiment: Experiment, wake: WakeAlongPath, frame: LevelFrame
+) -> None:
+    """Refuse a volume that does not hold the wing along the path and, with a lidar, its images."""
+    encounter = encounter_of(experiment)
+    across, above = encounter.aircraft.span / 2, 0.0
+    if encounter.control.mode == "feedforward":
+        width, height = _image_size(experiment, wake)
+        across, above = max(across, width / 2), height / 2
+    along = np.array([0.0, encounter.path.start + encounter.path.beyond])
+    x, z = frame.places(along[:, None], [-above, above])
+    missing = volume.missing(x, [-across, across], z)
+    for name, (first, last, low, high) in missing.items():
+        what = {"x": "start", "y": "centre", "z": "path.altitude"}[name]
+        raise InputError(
+            f"encounter.air.volume.file: {file} covers {name} = {first:g} to {last:g} m; the "
+            f"flight needs {low:.4g} to {high:.4g} m (a larger volume, a shorter path, or another "
+            f"{what})"
+        )
+
+
+def _image_size(experiment: Experiment, wake: WakeAlongPath) -> tuple[float, float]:
+    """Width and height of the lidar's images, m."""
+    if isinstance(wake, VolumeAlongPath):
+        return float(np.ptp(wake.flow["y"])), float(np.ptp(wake.flow["z"]))
+    given = experiment.wake
+    assert given is not None and given.vortex_pair is not None  # an analytic wake
+    return given.vortex_pair.width, given.vortex_pair.height
 
 
 def _drift(

@@ -7,13 +7,14 @@ between both is the benefit of a preview. Where the lidar has no track, the auto
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
+from lidar_mi.atmosphere.air.along_path import AirAlongPath
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.air import air_along_path
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
@@ -136,7 +137,20 @@ def simulate_flights(
     about = {CONTROLLER: name} if name else {}
     if encounter.air is not None:
         about[MET] = "air"
+        series = series.assign(_wake_alone(wake, new(), series["time"].values))
     return FlightData(series.assign_attrs(about), track, slabs)
+
+
+def _wake_alone(
+    air: WakeAlongPath, aircraft: AircraftModel, times: np.ndarray
+) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+    """The rolling moment of the wake without the air about it, on the nominal path."""
+    if not isinstance(air, AirAlongPath) or air.wake is None:
+        return {}
+    wind = replace(air, parts=()).wind
+    loads = loads_in_wind(aircraft.strips, aircraft.state, wind, aircraft.density, times)
+    about = {"units": "N m", "long_name": "rolling moment of the wake alone, port wing up"}
+    return {"wake_roll_moment": ("time", loads.moment[:, 0], about)}
 
 
 def simulate_flight(

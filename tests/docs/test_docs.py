@@ -60,6 +60,7 @@ OPTIONAL = (
     Reported,
     air.Air,
     air.Turbulence,
+    air.AirVolume,
     air.Gust,
     air.LinearShear,
     air.LogarithmicShear,
@@ -68,6 +69,7 @@ OPTIONAL = (
 # what they need
 REQUIRED = {
     scattering.Part: {"phase": "rayleigh", "fraction": 1.0},
+    air.AirVolume: {"file": "air.nc"},
     ScanTiming: {"duration": 0.1},
     motion.Sinusoid: {"axis": "y", "amplitude": 1.0, "frequency": 1.0},
     motion.Attitude: {"rms": 0, "bandwidth": 1.0},

@@ -23,14 +23,17 @@ from lidar_mi.encounter.flight import aircraft_of, simulate_flights
 from lidar_mi.encounter.slabs import air_of, gates_of
 from lidar_mi.encounter.wake import vortices_in_plane
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.folder.run_folder import new_record
 from lidar_mi.experiment.log import silent
+from tests.support.air_volumes import sampled
 from tests.support.encounters import both_lidars, small_encounter
+
+LEVEL = {"start": "190 m", "crossing_angle": "0 deg", "climb_angle": "0 deg"}
 
 
 def in_air(path=None, aircraft=None, control=None, **air):
     """The small encounter in air."""
-    level = {"start": "190 m", "crossing_angle": "0 deg", "climb_angle": "0 deg"}
-    encounter = {"path": level | (path or {}), "air": air, "control": control or {"mode": "off"}}
+    encounter = {"path": LEVEL | (path or {}), "air": air, "control": control or {"mode": "off"}}
     return small_encounter(encounter=encounter | ({"aircraft": aircraft} if aircraft else {}))
 
 
@@ -101,6 +104,81 @@ def test_a_gust_in_place_of_the_wake_lifts_the_wing():
     flights = simulate_flights(experiment, silent)
     found = float(flights.series["force_z"].max())
     assert found == pytest.approx(largest, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def air_file(tmp_path_factory):
+    """Waves of 20 m and more, x of 50 to 290 m, heights of 270 to 330 m."""
+    path = tmp_path_factory.mktemp("air") / "air.nc"
+    field = turbulence(1.5, 200.0, 3, shortest=20.0)
+    volume = sampled(field, (6.0, 1.0), x=(50.0, 290.0), y=(-40.0, 40.0), z=(270.0, 330.0))
+    volume.to_netcdf(path)
+    return path, field
+
+
+SHORT = {"start": "150 m", "beyond": "85 m"}
+
+
+def test_air_from_a_file(air_file):
+    """Its wind on the path, in the frame of its mean; a height is one above the ground."""
+    path, field = air_file
+    air = air_along_path(in_air(SHORT, wake=False, volume={"file": str(path)}))
+    x = np.linspace(10, 220, 50)
+    found = np.stack(air.wind(x, 5.0, -4.0, 1.0))
+    true = np.stack(field.velocity(x + 50, 5.0, 296.0, 0.0))
+    difference = found - true
+    assert np.abs(difference - difference.mean(axis=1, keepdims=True)).max() < 0.03
+    assert np.abs(difference[2]).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("path", "air", "control", "message"),
+    [
+        (
+            {"start": "190 m", "beyond": "300 m"},
+            {},
+            "off",
+            r"air\.nc covers x = 50 to 290 m; the flight needs 50 to 540 m \(a larger volume",
+        ),
+        (SHORT | {"altitude": "100 m"}, {}, "off", r"covers z = 270 to 330 m; .* 100 to 100 m"),
+        (SHORT, {"centre": "35 m"}, "off", r"covers y = -40 to 40 m; .* 20\.55 to 49\.45 m"),
+        (SHORT | {"altitude": "315 m"}, {}, "feedforward", r"covers z .* 295 to 335 m"),
+        (SHORT, {"names": {"u": "U"}}, "off", r"variable 'U' \(u\) is missing"),
+        (SHORT, {"file": "none.nc"}, "off", r"encounter\.air\.volume\.file: none\.nc not found"),
+    ],
+)
+def test_volumes_that_are_refused(air_file, path, air, control, message):
+    volume = {"file": str(air_file[0])} | air
+    with pytest.raises(InputError, match=message):
+        air_along_path(in_air(path, control={"mode": control}, volume=volume))
+
+
+def test_the_content_of_the_file_belongs_to_the_experiment(air_file, tmp_path):
+    copy = tmp_path / "air.nc"
+    copy.write_bytes(air_file[0].read_bytes())
+    experiment = in_air(SHORT, volume={"file": str(copy)})
+    first = new_record(experiment, experiment.folder)["files"]["encounter.air.volume.file"]
+    sampled(air_file[1], (5.0, 1.0), x=(50.0, 290.0), z=(270.0, 330.0)).to_netcdf(copy)
+    assert new_record(experiment, experiment.folder)["files"] != {
+        "encounter.air.volume.file": first
+    }
+
+
+def test_the_moment_of_the_wake_alone_is_recorded():
+    """That of the flight in calm air but for its bank, whatever the turbulence."""
+    path = {"crossing_angle": "20 deg"}
+    rough = simulate_flights(in_air(path, turbulence={"level": "severe"}), silent).series
+    calm = simulate_flights(in_air(path, linear_shear={}), silent).series
+    assert rough.attrs["met"] == "air"
+    true = calm["roll_moment"].sel(flight="off").values
+    largest = np.abs(true).max()
+    assert np.abs(calm["wake_roll_moment"].values - true).max() < 0.15 * largest
+    # the wake drifts by a metre or two until it is met
+    assert np.abs(rough["wake_roll_moment"].values).max() == pytest.approx(largest, rel=0.1)
+    added = rough["roll_moment"].sel(flight="off") - rough["wake_roll_moment"]
+    assert np.abs(added).max() > 0.1 * largest
+    without = simulate_flights(in_air(wake=False, linear_shear={}), silent).series
+    assert "wake_roll_moment" not in without
 
 
 def test_the_wake_drifts_with_the_air_about_it():

@@ -96,8 +96,13 @@ def prediction_error(one: xr.Dataset) -> float:
 
 
 def felt_from(series: xr.Dataset) -> float:
-    """Time (s) at which the wake's rolling moment on the flight off is first felt; NaN: never."""
-    moment = np.abs(series["roll_moment"].sel(flight="off").values)
+    """Time (s) at which the wake's rolling moment is first felt without control; NaN: never.
+
+    In other air that of the wake alone, on the nominal path.
+    """
+    alone = "wake_roll_moment" in series
+    moment = series["wake_roll_moment"] if alone else series["roll_moment"].sel(flight="off")
+    moment = np.abs(moment.values)
     felt = np.flatnonzero(moment > _FELT * moment.max())
     return float(series["time"][felt[0]]) if felt.size else float("nan")
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from lidar_mi.experiment.schema.section import Section
-from lidar_mi.units import Angle, Frequency, Length, Number, Speed, Within, quantity
+from lidar_mi.units import Angle, Frequency, Length, Number, Speed, Time, Within, quantity
 
 _Place = Annotated[Length, Within(-1e5, 1e5, "an encounter")]
 
@@ -144,11 +144,28 @@ class Microburst(Section):
     y: _Place = Field(0.0, description="of its axis, to the left of the path")
 
 
+class AirVolume(Section):
+    """Air of a simulation: one instant, at rest in the mean wind."""
+
+    file: str = Field(description="NetCDF file with u, v, w on (x, y, z), z above the ground")
+    time: Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")] | None = Field(
+        None, description="needed when the file holds several"
+    )
+    names: dict[str, str] = Field({}, description="our dimension or variable names: the file's")
+    start: Annotated[Length, Within(-1e6, 1e6, "models of a region")] | None = Field(
+        None, description="x in the file where the path starts; default: its first plane"
+    )
+    centre: Annotated[Length, Within(-1e6, 1e6, "models of a region")] | None = Field(
+        None, description="y in the file of the path; default: its middle"
+    )
+
+
 class Air(Section):
     """The air about the wake, or in its place."""
 
     wake: bool = Field(True, description="false: this air replaces the wake")
     turbulence: Turbulence | None = None
+    volume: AirVolume | None = None
     gusts: tuple[Gust, ...] = ()
     linear_shear: LinearShear | None = None
     logarithmic_shear: LogarithmicShear | None = None

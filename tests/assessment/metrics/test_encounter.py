@@ -102,6 +102,16 @@ def test_still_air_has_no_fraction(series):
     assert "encounter.off.residual_moment" not in encounter_metrics(calm, None)
 
 
+def test_a_wake_in_turbulence_is_felt_by_its_own_moment(series):
+    """Turbulence of a tenth of the wake's moment from the beginning on; the wake comes at 2.5 s."""
+    rough = series.assign(
+        roll_moment=series["roll_moment"] + 2e4,
+        wake_roll_moment=("time", np.where(TIME >= 2.5, 1e5, 0.0)),
+    )
+    assert felt_from(rough) == pytest.approx(2.5)
+    assert felt_from(rough.drop_vars("wake_roll_moment")) == 0
+
+
 def test_the_lidar_in_flight(series, track):
     found = encounter_metrics(series, track)
     assert prediction_error(series.isel(flight=1)) == pytest.approx(0.1)
