@@ -26,7 +26,9 @@ from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.schema import air as schema
 from lidar_mi.experiment.schema import encounter as flight
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.section import Section
 from lidar_mi.io.wake_file import read_wake
+from lidar_mi.units import AS_GIVEN
 
 # Planes across the path, in separations from the middle, over which a wake's drift is averaged.
 _AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -73,14 +75,7 @@ def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir
     if air.turbulence is not None:
         parts.append(_turbulence(air.turbulence, path.altitude, seed))
     for gust in air.gusts:
-        speed = gust.speed
-        if speed is None:
-            factor = gust.alleviation or 1.0
-            if gust.maximum_altitude is not None:
-                factor = flight_profile_alleviation(
-                    path.altitude, gust.maximum_altitude, gust.landing_weight, gust.zero_fuel_weight
-                )
-            speed = design_gust_speed(path.altitude, gust.gradient, factor)
+        speed = _largest_speed(gust, path.altitude)
         parts.append(Gust(gust.direction, gust.gradient, gust.start, speed))
     if air.linear_shear is not None:
         shear = air.linear_shear
@@ -100,14 +95,55 @@ def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir
     return tuple(parts)
 
 
-def _turbulence(given: schema.Turbulence, altitude: float, seed: int) -> Turbulence:
+def described(air: schema.Air, path: flight.Path) -> list[tuple[str, str]]:
+    """What the air is, for people: names of its parts, and a line for each."""
+    rows = []
+    if air.turbulence is not None:
+        sigma, length = _scales(air.turbulence, path.altitude)
+        kind = f"{air.turbulence.spectrum}, {air.turbulence.evolution}".replace("_", " ")
+        rows.append(("turbulence", f"{sigma:.3g} m/s rms, length {length:.3g} m, {kind}"))
+    if air.volume is not None:
+        rows.append(("air of a simulation", air.volume.file))
+    for gust in air.gusts:
+        speed = _largest_speed(gust, path.altitude)
+        where = f"{2 * gust.gradient:g} m long, from {gust.start:g} m on"
+        rows.append(("gust", f"{speed:.3g} m/s {gust.direction}, {where}"))
+    for name in ("linear_shear", "logarithmic_shear", "microburst"):
+        part = getattr(air, name)
+        if part is not None:
+            rows.append((name.replace("_", " "), _keys(part)))
+    return rows
+
+
+def _keys(part: Section) -> str:
+    values = part.model_dump(mode="json", context=AS_GIVEN)
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def _largest_speed(gust: schema.Gust, altitude: float) -> float:
+    """Of a gust, m/s: its own, or the design speed."""
+    if gust.speed is not None:
+        return gust.speed
+    factor = gust.alleviation or 1.0
+    if gust.maximum_altitude is not None:
+        factor = flight_profile_alleviation(
+            altitude, gust.maximum_altitude, gust.landing_weight, gust.zero_fuel_weight
+        )
+    return design_gust_speed(altitude, gust.gradient, factor)
+
+
+def _scales(given: schema.Turbulence, altitude: float) -> tuple[float, float]:
+    """Rms (m/s) and length (m) of turbulence: its own, or those of the standard."""
     sigma, length = given.sigma, given.length
     if given.standard == "cs_25":
-        length = length or CS_25_LENGTH
-    else:
-        rms, scale = mil_f_8785c(altitude, given.level)
-        sigma, length = rms if sigma is None else sigma, length or scale
-    assert sigma is not None  # the section refuses its absence with cs_25
+        assert sigma is not None  # the section refuses its absence with cs_25
+        return sigma, length or CS_25_LENGTH
+    rms, scale = mil_f_8785c(altitude, given.level)
+    return rms if sigma is None else sigma, length or scale
+
+
+def _turbulence(given: schema.Turbulence, altitude: float, seed: int) -> Turbulence:
+    sigma, length = _scales(given, altitude)
     if given.shortest > length / 10:
         raise InputError(
             f"encounter.air.turbulence.shortest: {given.shortest:g} m is not allowed with the "

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_mi.encounter.air import air_along_path
+from lidar_mi.encounter.air import air_along_path, described
 from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
 from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import aircraft_of, duration
@@ -110,7 +110,10 @@ def sections(
             f"{_strongest(experiment, aircraft_of(encounter)):.0%} of the ailerons'",
         ),
     ]
-    yield f"{experiment.name}: flight into the wake", rows
+    if encounter.air is not None:
+        rows += described(encounter.air, path)
+    has_wake = encounter.air is None or encounter.air.wake
+    yield f"{experiment.name}: flight into the {'wake' if has_wake else 'air'}", rows
     if timed:
         notice("timing a few samples and a retrieval", None)
         steers = encounter.control.mode == "feedforward"

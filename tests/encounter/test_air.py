@@ -15,9 +15,9 @@ from lidar_mi.atmosphere.air.along_path import AirAlongPath
 from lidar_mi.atmosphere.air.microburst import Microburst
 from lidar_mi.atmosphere.air.turbulence import turbulence
 from lidar_mi.atmosphere.wake_path import PairAlongPath
-from lidar_mi.encounter.air import air_along_path, moving_air
+from lidar_mi.encounter.air import air_along_path, described, moving_air
 from lidar_mi.encounter.aircraft import loads_in_wind
-from lidar_mi.encounter.check import geometry
+from lidar_mi.encounter.check import geometry, sections
 from lidar_mi.encounter.doppler import Midway, doppler_scans
 from lidar_mi.encounter.flight import aircraft_of, simulate_flights
 from lidar_mi.encounter.slabs import air_of, gates_of
@@ -65,6 +65,22 @@ def test_keys_reach_the_parts():
     assert (linear.du_dz, linear.dv_dz, linear.height) == (0.05, 0.01, 200)
     assert (layer.speed, layer.height) == (12, 200) and layer.towards == pytest.approx(math.pi / 2)
     assert burst == Microburst(20.0, 500.0, 60.0, 300.0, 40.0)
+
+
+def test_check_describes_the_air():
+    experiment = in_air(
+        path={"altitude": "300 m"},
+        turbulence={"level": "severe"},
+        gusts=[{"gradient": "50 m", "start": "400 m"}],
+        linear_shear={"du_dz": "0.05 / s"},
+    )
+    found = dict(described(experiment.encounter.air, experiment.encounter.path))
+    assert found["turbulence"] == "2.32 m/s rms, length 300 m, von karman, frozen"
+    assert found["gust"] == "15 m/s up, 100 m long, from 400 m on"
+    assert found["linear shear"].startswith("du_dz 0.05 / s, dv_dz 0.0")
+    titles = dict(sections(experiment))
+    rows = dict(titles[f"{experiment.name}: flight into the wake"])
+    assert rows["gust"] == found["gust"]
 
 
 def test_alleviation_of_the_design_speed():
