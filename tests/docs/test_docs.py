@@ -184,6 +184,7 @@ def _unit(field):
             (units.Extinction, "1/m"),
             (units.Circulation, "m²/s"),
             (units.Frequency, "Hz"),
+            (units.Shear, "1/s"),
             (units.SpectralRadiance, "W/m³/sr"),
             (units.Backscatter, "1/m/sr"),
             (units.Area, "m²"),

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from lidar_mi.experiment.schema.section import Section
-from lidar_mi.units import Angle, Frequency, Length, Number, Speed, Time, Within, quantity
+from lidar_mi.units import Angle, Length, Number, Shear, Speed, Time, Within, quantity
 
 _Place = Annotated[Length, Within(-1e5, 1e5, "an encounter")]
 
@@ -94,10 +94,10 @@ class Gust(Section):
 class LinearShear(Section):
     """A horizontal wind that grows linearly with the height."""
 
-    du_dz: Annotated[Frequency, Within(-1, 1, "a jet at the ground has 0.1 / s")] = Field(
+    du_dz: Annotated[Shear, Within(-1, 1, "a jet at the ground has 0.1 / s")] = Field(
         0.0, description="of the wind along the path"
     )
-    dv_dz: Annotated[Frequency, Within(-1, 1, "a jet at the ground has 0.1 / s")] = Field(
+    dv_dz: Annotated[Shear, Within(-1, 1, "a jet at the ground has 0.1 / s")] = Field(
         0.0, description="of the wind to the left"
     )
 
