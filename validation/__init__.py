@@ -14,6 +14,7 @@ receivers            analysers of the Doppler shift: published efficiencies, cos
 strips               loads of a wake on a wing: closed forms, a lattice of vortices
 track                track of a vortex pair: errors over simulated flights are as stated
 timing               winds of beams with times and poses: closed forms
+air                  turbulence, gusts and a microburst: theory, regulations
 stored_state         stored state of the shipped simulation: how much is wind, how much numerics
 coverage             standard errors of winds where air changes: its section, by name or --slow
 instrument           winds by an etalon with defects; only by name
@@ -36,6 +37,7 @@ GROUPS = (
     "strips",
     "track",
     "timing",
+    "air",
     "stored_state",
     "coverage",
 )

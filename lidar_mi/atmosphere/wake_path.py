@@ -39,6 +39,12 @@ class WakeAlongPath(Protocol):
         """u, v, w (m s^-1) at places (m, path frame) and times (s), which broadcast."""
         ...
 
+    def extinction(
+        self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike
+    ) -> np.ndarray | None:
+        """Aerosol and exhaust without texture, m^-1; None: the background everywhere."""
+        ...
+
     def vortices(self, x: float, time: float) -> tuple[Vortex, Vortex]:
         """Port and starboard vortex in the plane x at a time."""
         ...
@@ -208,6 +214,9 @@ class PairAlongPath:
             v = v + omega * (tangent[2] * d[0] - tangent[0] * d[2])
             w = w + omega * (tangent[0] * d[1] - tangent[1] * d[0])
         return u, v, w
+
+    def extinction(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> None:
+        """None: analytic vortices have the background everywhere."""
 
     def vortices(self, x: float, time: float) -> tuple[Vortex, Vortex]:
         """Port and starboard vortex in the plane x at a time.

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, Device, FlightName
+from lidar_mi.cli.options import Changes, Device, OptionalFlightName
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.shipped import experiment_file
@@ -15,6 +15,7 @@ from lidar_mi.progress import progress
 
 EXAMPLES = (
     "Examples: `lidar-mi fly encounter` - `lidar-mi fly encounter --mode perfect` - "
+    "`lidar-mi fly --replay outputs/encounter --set encounter.aircraft.aileron_rate='20 deg/s'` - "
     "`lidar-mi fly my.yaml -o outputs/mine --set encounter.path.crossing_angle='30 deg'`"
 )
 
@@ -28,9 +29,12 @@ class Mode(StrEnum):
 
 
 def fly(
-    experiment: FlightName,
+    experiment: OptionalFlightName = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder. Default: outputs/NAME.")
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="Folder. Default: outputs/NAME, with --replay outputs/NAME_replay."
+        ),
     ] = None,
     mode: Annotated[
         Mode | None,
@@ -41,6 +45,15 @@ def fly(
     ] = None,
     device: Device = None,
     set_: Changes = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FLIGHT",
+            help="Folder of a flight with the lidar, whose estimates are delivered again, to "
+            "another aircraft (encounter.aircraft) or control (encounter.control). Nothing is "
+            "rendered.",
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a flight of a different experiment.")
     ] = False,
@@ -59,13 +72,20 @@ def fly(
 
     Writes the flights and the track (NetCDF), metrics (JSON), figures, an animation and a report.
     """
+    from lidar_mi.experiment.folder.records import RECORD
     from lidar_mi.experiment.schema import reading
 
-    path, changes = experiment_file(experiment), list(set_ or [])
+    changes = list(set_ or [])
     if device:
         changes.append(f"device={device}")
     if mode:
         changes.append(f"encounter.control.mode={mode.value!r}")
+    if experiment is not None:
+        path = experiment_file(experiment)
+    elif replay is not None:
+        path = replay / RECORD
+    else:
+        raise InputError("EXPERIMENT: missing; expected an experiment, or --replay FLIGHT")
     variants = reading.load_variants(path, changes)
     if variants:
         raise InputError(f"{path}: variants: not allowed for a flight; expected one experiment")
@@ -75,12 +95,14 @@ def fly(
             f"encounter: missing in {loaded.name}; expected the section of a flight, or lidar-mi "
             "run for an experiment without one"
         )
-    folder = out or Path("outputs") / loaded.name
+    folder = out or Path("outputs") / (loaded.name + ("_replay" if replay else ""))
     with progress() as notice:
         notice(f"starting {loaded.name}", None)
         from lidar_mi.encounter.fly import fly as start
 
-        done = start(loaded, folder, overwrite=overwrite, processes=processes, notice=notice)
+        done = start(
+            loaded, folder, replay=replay, overwrite=overwrite, processes=processes, notice=notice
+        )
     print_answer(done.answer)
     for table in done.tables()[1:]:
         print_table(table)

@@ -70,7 +70,12 @@ def complete_method(incomplete: str) -> list[str]:
 _HELP = "Experiment file, or the name of a shipped one."
 ExperimentName = Annotated[str, typer.Argument(help=_HELP, autocompletion=_complete_experiment)]
 RunName = Annotated[str, typer.Argument(help=_HELP, autocompletion=complete_run)]
-FlightName = Annotated[str, typer.Argument(help=_HELP, autocompletion=complete_flight)]
+OptionalFlightName = Annotated[
+    str | None,
+    typer.Argument(
+        help=f"{_HELP} With --replay by default that of the flight.", autocompletion=complete_flight
+    ),
+]
 Changes = Annotated[
     list[str] | None,
     typer.Option(

@@ -5,11 +5,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from lidar_mi.encounter.air import air_along_path, described
 from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
 from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
-from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
+from lidar_mi.encounter.wake import encounter_of, vortices_in_plane
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import silent
@@ -48,13 +49,22 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
         _check_latency(experiment, gates)
     found = _without_effect(experiment, gates)
     strength = _strongest(experiment, aircraft or aircraft_of(encounter))
+    has_wake = encounter.air is None or encounter.air.wake
     if strength < _MISSED:
         found.append(
             "encounter.path: the flight misses the wake: its largest rolling moment is "
             f"{strength:.1%} of the ailerons'; expected a smaller miss or a smaller crossing angle"
+            if has_wake
+            else "encounter.air: no rolling moment: its largest on the path is "
+            f"{strength:.1%} of the ailerons'; expected turbulence or a wake"
         )
     slabs = _slabs_in_view(experiment, gates)
-    if encounter.control.mode == "feedforward" and slabs < _LEAST_SLABS:
+    if encounter.control.mode == "feedforward" and not has_wake:
+        found.append(
+            "encounter.air.wake: false leaves the lidar no vortices to track: its flight is that "
+            "of the autopilot; expected true, or encounter.control.mode: perfect"
+        )
+    elif encounter.control.mode == "feedforward" and slabs < _LEAST_SLABS:
         found.append(
             f"encounter.look_ahead: the images hold both vortices in {slabs} slabs; a track needs "
             f"{_LEAST_SLABS} (expected a wider image, wake.vortex_pair.width and height)"
@@ -99,7 +109,10 @@ def sections(
             f"{_strongest(experiment, aircraft_of(encounter)):.0%} of the ailerons'",
         ),
     ]
-    yield f"{experiment.name}: flight into the wake", rows
+    if encounter.air is not None:
+        rows += described(encounter.air, path)
+    has_wake = encounter.air is None or encounter.air.wake
+    yield f"{experiment.name}: flight into the {'wake' if has_wake else 'air'}", rows
     if timed:
         from lidar_mi.experiment.preflight.cost import flight_seconds
 
@@ -175,7 +188,7 @@ def _check_latency(experiment: Experiment, gates: Gates) -> None:
 
 def _strongest(experiment: Experiment, aircraft: AircraftModel) -> float:
     """Largest rolling moment of the wake on the nominal path, over that of the ailerons."""
-    encounter, wake = encounter_of(experiment), wake_along_path(experiment)
+    encounter, wake = encounter_of(experiment), air_along_path(experiment)
     most = aircraft.control_moments[0, 0] * aircraft.limits.deflection[0]
     times = np.linspace(0, duration(encounter), _INSTANTS)
     loads = loads_in_wind(aircraft.strips, aircraft.state, wake.wind, aircraft.density, times)
@@ -186,7 +199,7 @@ def _strongest(experiment: Experiment, aircraft: AircraftModel) -> float:
 
 def _slabs_in_view(experiment: Experiment, gates: Gates) -> int:
     """Slabs of the nominal path whose images hold both vortices."""
-    encounter, wake = encounter_of(experiment), wake_along_path(experiment)
+    encounter, wake = encounter_of(experiment), air_along_path(experiment)
     y, z = gates.y, gates.z
     count = 0
     for number in range(

@@ -1,7 +1,8 @@
 """Controllers: commands from the preview of the wake's loads and the state.
 
 Without control a pilot levels the wings. Feedforward steers by the loads predicted from the lidar's
-track, perfect preview by the true loads, the autopilot by a preview of no loads.
+track, perfect preview by the true loads, the autopilot by a preview of no loads. Without a track
+feedforward is the autopilot: `bumpless_transfer`.
 """
 
 from collections.abc import Callable
@@ -16,8 +17,11 @@ from lidar_mi.encounter.strips import Loads
 Preview = Callable[[ArrayLike], Loads]
 """The wake's loads expected at a time or at several (s), for the state flown on."""
 
-Controller = Callable[[Preview | None, AircraftState], Commands]
-"""Commands from the preview (None while there is none) and the state."""
+Controller = Callable[[Preview, AircraftState], Commands]
+"""Commands from the preview, of no loads while nothing is known, and the state."""
+
+Transfer = Callable[[Preview | None, AircraftState], Preview]
+"""The preview to steer by, from the present one (None: there is none) and the state."""
 
 HORIZON, KNOTS = 2.0, 16
 """Time for which the aileron is planned (s), and intervals of it."""
@@ -35,6 +39,35 @@ def no_loads(time: ArrayLike) -> Loads:
     return Loads(none, none)
 
 
+def bumpless_transfer() -> Transfer:
+    """From a preview that is lost to no loads, over the `HORIZON` of the plan.
+
+    Loads that a lost preview expects are weighted by a factor that falls linearly from 1 to 0. So
+    an aileron that holds against a wake does not let go at once, and what is extrapolated from a
+    track that has ended counts less and less. Before the first preview no loads are expected.
+    """
+    last: Preview = no_loads
+    seen = -np.inf
+
+    def transfer(preview: Preview | None, state: AircraftState) -> Preview:
+        nonlocal last, seen
+        if preview is not None:
+            last, seen = preview, state.time
+            return preview
+        fraction = 1 - (state.time - seen) / HORIZON
+        return _fraction_of(last, fraction) if fraction > 0 else no_loads
+
+    return transfer
+
+
+def _fraction_of(preview: Preview, fraction: float) -> Preview:
+    def expected(time: ArrayLike) -> Loads:
+        loads = preview(time)
+        return Loads(fraction * loads.force, fraction * loads.moment)
+
+    return expected
+
+
 def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
     """Levelling alone: the roll rate -roll / time is asked for.
 
@@ -50,13 +83,13 @@ def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
     power = aircraft.control_moments[0, 0]
     gain = aircraft.roll_damping / (power * time) if time and power else 0.0
 
-    def controller(preview: Preview | None, state: AircraftState) -> Commands:
+    def controller(preview: Preview, state: AircraftState) -> Commands:
         return Commands(aileron=float(gain * state.roll))
 
     return controller
 
 
-def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Controller:
+def feedforward(aircraft: AircraftModel) -> Controller:
     """The aileron planned against the roll by the wake ahead; the other controls cancel moments.
 
     Where the wake has more moment than the ailerons, cancelling leaves the difference. An aircraft
@@ -66,16 +99,14 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
     commanded, and all are planned again at the next call. Elevator and rudder cancel, as in
     `cancelling`; the rudder's rolling moment is part of the plan.
 
-    Without a preview the wings are levelled as in `wings_level`. A preview without loads makes it
-    an autopilot that holds the wings level as well as the ailerons can.
+    A preview of no loads makes it an autopilot that holds the wings level as well as the ailerons
+    can.
 
     Parameters
     ----------
     aircraft : AircraftModel
-    levelling_time : float or None
-        As in `wings_level`.
     """
-    level, cancel = wings_level(aircraft, levelling_time), cancelling(aircraft, None)
+    cancel = cancelling(aircraft, None)
     limits, moments = aircraft.limits, aircraft.control_moments
     # without an aileron that moves there is no roll to plan
     if not (moments[0, 0] and limits.deflection[0] and limits.rate[0]):
@@ -91,27 +122,25 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
     largest, reach = limits.deflection[0], limits.rate[0] * dt
     last, before, deflection = Commands(), np.nan, np.zeros(3)
 
-    def controller(preview: Preview | None, state: AircraftState) -> Commands:
+    def controller(preview: Preview, state: AircraftState) -> Commands:
         nonlocal last, before, deflection
         # the controls follow this controller's commands alone: where they are is known
         if state.time > before:
             deflection, _ = deflected(deflection, last, state.time - before, limits)
         before = state.time
-        last = level(preview, state)
-        if preview is not None:
-            others = cancel(preview, state) if has_others else Commands()
-            expected = preview(state.time + middles).moment[:, 0]
-            wake = expected + moments[0, 1:] @ others.array[1:]
-            start = from_rate * state.roll_rate + [[state.roll], [0.0]]
-            target = -np.concatenate(
-                [start[0] + rolls @ wake, RATE_TIME * (start[1] + rates @ wake), np.zeros(KNOTS)]
-            )
-            now = np.zeros(KNOTS)
-            now[0] = np.clip(deflection[0], -largest, largest)
-            least = np.concatenate([np.full(2 * KNOTS, -largest), now - reach, -now - reach])
-            aileron = _least_squares(matrix, target, allowed, least)[0]
-            aileron = float(np.clip(aileron, -largest, largest))
-            last = Commands(aileron, others.elevator, others.rudder)
+        others = cancel(preview, state) if has_others else Commands()
+        expected = preview(state.time + middles).moment[:, 0]
+        wake = expected + moments[0, 1:] @ others.array[1:]
+        start = from_rate * state.roll_rate + [[state.roll], [0.0]]
+        target = -np.concatenate(
+            [start[0] + rolls @ wake, RATE_TIME * (start[1] + rates @ wake), np.zeros(KNOTS)]
+        )
+        now = np.zeros(KNOTS)
+        now[0] = np.clip(deflection[0], -largest, largest)
+        least = np.concatenate([np.full(2 * KNOTS, -largest), now - reach, -now - reach])
+        aileron = _least_squares(matrix, target, allowed, least)[0]
+        aileron = float(np.clip(aileron, -largest, largest))
+        last = Commands(aileron, others.elevator, others.rudder)
         return last
 
     return controller
@@ -139,10 +168,8 @@ def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Control
     times = np.divide(2 * limits.deflection, limits.rate, out=np.zeros(3), where=limits.rate > 0)
     instants = np.linspace(0.0, times.max(), _INSTANTS)
 
-    def controller(preview: Preview | None, state: AircraftState) -> Commands:
+    def controller(preview: Preview, state: AircraftState) -> Commands:
         commands = level(preview, state)
-        if preview is None:
-            return commands
         moments = preview(state.time + instants).moment
         needs = np.clip(-moments @ per_moment.T, -limits.deflection, limits.deflection)
         ways = instants[:, None] * limits.rate

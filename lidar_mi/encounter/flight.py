@@ -2,27 +2,36 @@
 
 All flights meet the same wake. Only the flight that steers by the lidar needs its images. The
 autopilot is the controller of the flights with a preview, at a preview of no loads: the difference
-between both is the benefit of a preview.
+between both is the benefit of a preview. Where the lidar has no track, the autopilot steers.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
+from lidar_mi.atmosphere.air.along_path import AirAlongPath
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.air import air_along_path
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
-from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
+from lidar_mi.encounter.control import (
+    Controller,
+    Preview,
+    bumpless_transfer,
+    feedforward,
+    no_loads,
+    wings_level,
+)
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.user_controller import name_of, user_controller
-from lidar_mi.encounter.wake import encounter_of, wake_along_path
+from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.schema.encounter import Encounter
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.progress import Notice
@@ -104,8 +113,7 @@ def simulate_flights(
     from lidar_mi.encounter.slab_recorder import SlabRecorder
 
     encounter = encounter_of(experiment)
-    wake = wake_along_path(experiment)
-    levelling = encounter.control.levelling_time
+    wake = air_along_path(experiment)
     new = aircraft or (lambda: aircraft_of(encounter))
     name = name_of(controller) if controller else ""
     found: dict[str, xr.Dataset] = {}
@@ -114,11 +122,9 @@ def simulate_flights(
         model, progress = new(), _titled(notice, flight_name(mode, name))
         fly = partial(simulate_flight, model, wake=wake, encounter=encounter, notice=progress)
         if mode == OFF:
-            found[mode] = fly(wings_level(model, levelling))
+            found[mode] = fly(wings_level(model, encounter.control.levelling_time))
             continue
-        steering = (
-            user_controller(controller, model) if controller else feedforward(model, levelling)
-        )
+        steering = user_controller(controller, model) if controller else feedforward(model)
         if mode == AUTOPILOT:
             found[mode] = fly(steering, preview_at=lambda state: no_loads)
         elif mode == PERFECT:
@@ -134,7 +140,23 @@ def simulate_flights(
     # from no help to all help; simulated in another order, so that the slow one comes last
     order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in found]
     series = flights_dataset({mode: found[mode] for mode in order})
-    return FlightData(series.assign_attrs({CONTROLLER: name} if name else {}), track, slabs)
+    about = {CONTROLLER: name} if name else {}
+    if encounter.air is not None:
+        about[MET] = "air"
+        series = series.assign(_wake_alone(wake, new(), series["time"].values))
+    return FlightData(series.assign_attrs(about), track, slabs)
+
+
+def _wake_alone(
+    air: WakeAlongPath, aircraft: AircraftModel, times: np.ndarray
+) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+    """The rolling moment of the wake without the air about it, on the nominal path."""
+    if not isinstance(air, AirAlongPath) or air.wake is None:
+        return {}
+    wind = replace(air, parts=()).wind
+    loads = loads_in_wind(aircraft.strips, aircraft.state, wind, aircraft.density, times)
+    about = {"units": "N m", "long_name": "rolling moment of the wake alone, port wing up"}
+    return {"wake_roll_moment": ("time", loads.moment[:, 0], about)}
 
 
 def simulate_flight(
@@ -159,14 +181,15 @@ def simulate_flight(
     encounter : Encounter
     notice : callable
     preview_at : callable
-        The preview in a state; None: there is none.
+        The preview in a state; None: there is none, and the controller gets what
+        `bumpless_transfer` makes of the last one.
     """
     from lidar_mi.encounter.series import FlightRecorder
 
     period = 1 / encounter.rate
     a_scan = math.ceil(period / _STEP)
     dt, count = period / a_scan, round(duration(encounter) / period) * a_scan
-    record, deflection = FlightRecorder(), np.zeros(3)
+    record, deflection, transfer = FlightRecorder(), np.zeros(3), bumpless_transfer()
     for step in range(count + 1):
         state = aircraft.state
         if step % a_scan == 0:
@@ -174,7 +197,7 @@ def simulate_flight(
         preview = preview_at(state)
         loads = loads_in_wind(aircraft.strips, state, wake.wind, aircraft.density)
         predicted = preview(state.time) if preview else None
-        commands = controller(preview, state)
+        commands = controller(transfer(preview, state), state)
         record.add(state, loads, predicted, commands, deflection, aircraft.control_moments)
         if step < count:
             aircraft.step(dt, loads, commands)

@@ -5,17 +5,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.assessment.metrics.encounter import CONTROLLER, encounter_metrics
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, encounter_metrics
 from lidar_mi.assessment.report.encounter import encounter_summary
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import FlightData, OwnAircraft, OwnController, simulate_flights
 from lidar_mi.encounter.folder import EncounterFolder
 from lidar_mi.encounter.preview import Lidar
+from lidar_mi.encounter.replay import recorded_flight, recorded_lidar, with_recorded
 from lidar_mi.encounter.report import answer, write_report
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError, is_interrupt
@@ -74,7 +76,11 @@ class Flights(Tabular):
         rows += [("warning", text) for text in self.warnings]
         return [
             Table("flight", rows),
-            *encounter_summary(self.metrics, self.series.attrs.get(CONTROLLER, "")),
+            *encounter_summary(
+                self.metrics,
+                self.series.attrs.get(CONTROLLER, ""),
+                self.series.attrs.get(MET, "wake"),
+            ),
         ]
 
     def show(self) -> None:
@@ -92,6 +98,7 @@ def fly(
     lidar: Lidar | None = None,
     aircraft: OwnAircraft | None = None,
     controller: OwnController | None = None,
+    replay: str | Path | None = None,
     overwrite: bool = False,
     processes: int = 1,
     notice: Notice | None = None,
@@ -116,6 +123,9 @@ def fly(
     controller : callable, optional
         Gives, for an aircraft, a function of the preview and the state that returns `Commands`;
         default: `lidar_mi.encounter.control.feedforward`. It steers all flights with a preview.
+    replay : path, optional
+        Folder of a flight with the lidar, whose estimates are delivered again: nothing is rendered.
+        The experiment may differ in `encounter.aircraft` and `encounter.control`.
     overwrite : bool
         Replace the flights of another experiment.
     processes : int
@@ -133,7 +143,7 @@ def fly(
     Raises
     ------
     InputError
-        Bad input, or a folder of anything else.
+        Bad input, a folder of anything else, a replay of another experiment.
 
     Examples
     --------
@@ -153,6 +163,7 @@ def fly(
                 lidar=lidar,
                 aircraft=aircraft,
                 controller=controller,
+                replay=replay,
                 overwrite=overwrite,
                 processes=processes,
                 notice=shown,
@@ -161,13 +172,22 @@ def fly(
         experiment = load_experiment(experiment)
     encounter_of(experiment)
     experiment = on_its_device(experiment)
+    recorded = None
+    if replay is not None:
+        if lidar is not None:
+            raise InputError("lidar: not allowed with replay, which has a lidar; expected one")
+        if folder is not None and Path(folder).resolve() == Path(replay).resolve():
+            raise InputError(f"{folder}: is the flight to be replayed; expected another folder")
+        recorded = recorded_flight(replay, experiment)
+        lidar = recorded_lidar(recorded, experiment)
     log = Log(notice)
     for text in geometry(experiment, aircraft() if aircraft else None):
         log.remark(text)
     simulate = partial(
-        simulate_flights,
+        _simulated,
+        recorded,
         experiment,
-        log.bar,
+        notice=log.bar,
         lidar=lidar,
         aircraft=aircraft,
         controller=controller,
@@ -195,6 +215,12 @@ def fly(
                 if not isinstance(error, InputError):
                     error.add_note(f"traceback in {log.path}")
             raise
+
+
+def _simulated(recorded: FlightData | None, experiment: Experiment, **how: Any) -> FlightData:
+    """The flights; of a replay with images and errors of the recorded one."""
+    data = simulate_flights(experiment, **how)
+    return data if recorded is None else with_recorded(data, recorded)
 
 
 def _into(

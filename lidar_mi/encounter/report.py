@@ -6,7 +6,12 @@ import numpy as np
 
 from lidar_mi.assessment.figures.encounter import draw_all
 from lidar_mi.assessment.figures.encounter_film import MOST_FRAMES, film
-from lidar_mi.assessment.metrics.encounter import CONTROLLER, judged_in_flight, measured_in_flight
+from lidar_mi.assessment.metrics.encounter import (
+    CONTROLLER,
+    MET,
+    judged_in_flight,
+    measured_in_flight,
+)
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, read_requirements
 from lidar_mi.assessment.report.answer import verdict
 from lidar_mi.assessment.report.encounter import encounter_answer, encounter_chapter
@@ -39,6 +44,7 @@ def write_report(
         drawn,
         _film(folder, data, span, log),
         data.series.attrs.get(CONTROLLER, ""),
+        data.series.attrs.get(MET, "wake"),
     )
     found = answer(experiment, data, metrics)
     html = page(
@@ -57,7 +63,11 @@ def write_report(
 def answer(experiment: Experiment, data: FlightData, metrics: Mapping[str, float]) -> list[str]:
     """The main results, and the verdict on the lidar's wind, in sentences."""
     verdicts = [verdict(table, rows) for table, rows in judged(experiment, data)]
-    return [*encounter_answer(metrics, data.series.attrs.get(CONTROLLER, "")), *verdicts]
+    about = data.series.attrs
+    return [
+        *encounter_answer(metrics, about.get(CONTROLLER, ""), about.get(MET, "wake")),
+        *verdicts,
+    ]
 
 
 def judged(

@@ -24,6 +24,12 @@ QUANTITIES = tuple(
 
 SOURCES = ("estimate", "track", "truth")
 
+ESTIMATED = ("estimated", "estimate_parameters", "estimate_covariance", "estimate_reasons")
+"""Of the track's data set: the fits as they were delivered, from which a flight is replayed."""
+
+MEASURED = ("error_v_los", "error_u", "error_v", "error_w", "vectors")
+"""Of the track's data set: what is known of the wind of each slab."""
+
 _STATES: dict[str, tuple[str, str]] = {
     "x": ("m", "place along the path"),
     "y": ("m", "place to the left of the path"),
@@ -38,12 +44,12 @@ _STATES: dict[str, tuple[str, str]] = {
     "departed": ("1", "1 from the moment at which the aircraft is upset"),
 }
 _LOADS = {
-    "force_x": ("N", "force of the wake forward"),
-    "force_y": ("N", "force of the wake to the left"),
-    "force_z": ("N", "force of the wake upwards"),
-    "roll_moment": ("N m", "rolling moment of the wake, port wing up"),
-    "pitch_moment": ("N m", "pitching moment of the wake, nose down"),
-    "yaw_moment": ("N m", "yawing moment of the wake, nose to port"),
+    "force_x": ("N", "force of the wind forward"),
+    "force_y": ("N", "force of the wind to the left"),
+    "force_z": ("N", "force of the wind upwards"),
+    "roll_moment": ("N m", "rolling moment of the wind, port wing up"),
+    "pitch_moment": ("N m", "pitching moment of the wind, nose down"),
+    "yaw_moment": ("N m", "yawing moment of the wind, nose to port"),
 }
 _COMMANDS = {name: ("rad", f"{name} asked for") for name in ("aileron", "elevator", "rudder")}
 _DEFLECTION = ("rad", "aileron as deflected")
@@ -119,7 +125,7 @@ def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
     -------
     xr.Dataset, dims (slab) and (source, slab)
         The quantities `QUANTITIES`, with their standard errors, for `SOURCES`; NaN where there is
-        none.
+        none. `ESTIMATED` has the fits as they were delivered.
     """
     rows = [_row(slab, wake) for slab in slabs]
     found = xr.Dataset(
@@ -137,7 +143,33 @@ def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
             values = np.array([[row[source, name + suffix] for row in rows] for source in SOURCES])
             about = {"units": units, "long_name": f"standard error of {text}" if suffix else text}
             found[name + suffix] = (("source", "slab"), values.reshape(len(SOURCES), -1), about)
-    return found
+    fits = _fits([slab.estimate.pair for slab in slabs])
+    return found.merge(fits).assign_attrs(fits.attrs)
+
+
+def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
+    """The variables `ESTIMATED`; NaN where there is no fit."""
+    count = len(PARAMETERS)
+    there = [pair is not None for pair in pairs]
+    parameters = np.full((len(pairs), count), np.nan)
+    covariance = np.full((len(pairs), count, count), np.nan)
+    for number, pair in enumerate(pairs):
+        if pair is not None:
+            parameters[number], covariance[number] = pair.parameters, pair.covariance
+    reasons = ["; ".join(pair.reasons) if pair is not None else "" for pair in pairs]
+    about = {"long_name": "m2 s-1, log of m, m, m of port and starboard; mean v and w in m s-1"}
+    found = xr.Dataset(
+        {
+            "estimated": ("slab", np.array(there, float), {"units": "1", "long_name": "1: a fit"}),
+            "estimate_parameters": (("slab", "parameter"), parameters, about),
+            "estimate_covariance": (("slab", "parameter", "parameter_2"), covariance, about),
+            "estimate_reasons": ("slab", np.array(reasons, dtype=object)),
+        },
+        {"parameter": list(PARAMETERS), "parameter_2": list(PARAMETERS)},
+    )
+    profiles = [pair.profile for pair in pairs if pair is not None]
+    # one flight has one profile
+    return found.assign_attrs({"profile": profiles[0]} if profiles else {})
 
 
 _PER_SLAB = {

@@ -11,6 +11,7 @@ from lidar_mi.atmosphere.texture import PeriodicTexture, periodic_texture
 from lidar_mi.atmosphere.wake import check_nodes
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
+from lidar_mi.encounter.air import air_along_path
 from lidar_mi.encounter.pointing import check_reported
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
@@ -153,7 +154,7 @@ Places = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Air:
-    """Aerosol along the flight path, advected by the wake's wind.
+    """Aerosol along the flight path, advected by the wind of all air.
 
     The texture of a slab is that of the scan that has it in the farther gate. Until the scan that
     has it in the nearer gate, it is advected by all three components of the wind.
@@ -226,12 +227,11 @@ class Air:
         at_x[advected], at_y[advected], at_z[advected] = self._origins(
             (at_x[advected], at_y[advected], at_z[advected]), now, step, y[1] - y[0], z[1] - z[0]
         )
-        mean: np.ndarray | float = self.background
-        if isinstance(self.wake, VolumeAlongPath):
-            # exhaust is advected as the texture is: that of the place and time of origin
-            times = np.full(len(x), now)
-            times[advected] -= gates.period
-            mean = self.wake.extinction(at_x, at_y, at_z, times[:, None, None])
+        # exhaust is advected as the texture is: that of the place and time of origin
+        times = np.full(len(x), now)
+        times[advected] -= gates.period
+        found = self.wake.extinction(at_x, at_y, at_z, times[:, None, None])
+        mean = self.background if found is None else found
         values = mean * self.texture.at(at_x, at_y, at_z) + self.molecules
         field = xr.DataArray(values, {"x": x, "y": y, "z": z}, ("x", "y", "z"))
         field["x"].attrs["cell_width"] = step
@@ -280,8 +280,8 @@ def air_of(experiment: Experiment, gates: Gates) -> Air:
     InputError
         A texture finer than its nodes.
     """
-    along_path, wake = wake_along_path(experiment), experiment.wake
-    assert wake is not None  # `wake_along_path` refuses its absence
+    along_path, wake = air_along_path(experiment), experiment.wake
+    assert wake is not None  # `air_along_path` refuses its absence
     reach = beam_reach(experiment.lidar, gates.look_ahead + 2 * gates.depth)
     spacing = float(gates.y[1] - gates.y[0])
     margin = (reach + spacing, reach + spacing)

@@ -55,7 +55,7 @@ def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Contr
     if not _takes(made, 2):
         raise InputError(f"{called}: what it returned takes other arguments; {_CONTROLLER}")
 
-    def controller(preview: Preview | None, state: AircraftState) -> Commands:
+    def controller(preview: Preview, state: AircraftState) -> Commands:
         try:
             commands = made(preview, state)
         except Exception as error:

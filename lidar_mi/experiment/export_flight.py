@@ -32,7 +32,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
     if files["series"].is_file():
         yield "flight", read_netcdf(files["series"]).set_coords(["x", "y", "z"])
     if files["track"].is_file():
-        track = read_netcdf(files["track"])
+        # parameters with their covariances are for a replay
+        track = read_netcdf(files["track"]).drop_dims(["parameter", "parameter_2"], errors="ignore")
         if placed:
             yield from ((f"vortices_{name}", _points(track, name)) for name in _sources(track))
         else:

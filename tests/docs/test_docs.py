@@ -25,8 +25,8 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
+from lidar_mi.experiment.schema import air, reading, scattering, wake
 from lidar_mi.experiment.schema import experiment as schema
-from lidar_mi.experiment.schema import reading, scattering, wake
 from lidar_mi.experiment.truth import extinction as truth
 from lidar_mi.instrument import motion
 from lidar_mi.instrument.reported import Reported
@@ -52,7 +52,8 @@ GUIDE = tuple(
 )
 THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))
 ACCURACY = tuple(f"docs/{name}.md" for name in ACCURACY_PAGES)
-PAGES = ("README.md", *THEORY, *ACCURACY, *GUIDE, "docs/plugins.md", *EXPERIMENTS)
+CONTROL = "docs/flight_control.md"
+PAGES = ("README.md", *THEORY, *ACCURACY, *GUIDE, CONTROL, "docs/plugins.md", *EXPERIMENTS)
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
 OPTIONAL = (
@@ -64,10 +65,18 @@ OPTIONAL = (
     motion.Sinusoid,
     motion.Attitude,
     Reported,
+    air.Air,
+    air.Turbulence,
+    air.AirVolume,
+    air.Gust,
+    air.LinearShear,
+    air.LogarithmicShear,
+    air.Microburst,
 )
 # what they need
 REQUIRED = {
     scattering.Part: {"phase": "rayleigh", "fraction": 1.0},
+    air.AirVolume: {"file": "air.nc"},
     ScanTiming: {"duration": 0.1},
     motion.Sinusoid: {"axis": "y", "amplitude": 1.0, "frequency": 1.0},
     motion.Attitude: {"rms": 0, "bandwidth": 1.0},
@@ -182,6 +191,7 @@ def _unit(field):
             (units.Extinction, "1/m"),
             (units.Circulation, "m²/s"),
             (units.Frequency, "Hz"),
+            (units.Shear, "1/s"),
             (units.SpectralRadiance, "W/m³/sr"),
             (units.Backscatter, "1/m/sr"),
             (units.Area, "m²"),

@@ -1,7 +1,8 @@
 """Steering with a perfect preview: what a linear aircraft still feels.
 
 Detects a wrong sign or size of the commands, a command beyond the limits, a controller that does
-not start early, a plan that is far from the best possible, levelling that differs between modes.
+not start early, a plan that is far from the best possible, an aileron that jumps when the preview
+is lost.
 """
 
 import numpy as np
@@ -10,8 +11,14 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
-from lidar_mi.encounter.aircraft import Commands, loads_in_wind
-from lidar_mi.encounter.control import cancelling, feedforward, no_loads, wings_level
+from lidar_mi.encounter.aircraft import AircraftState, Commands, loads_in_wind
+from lidar_mi.encounter.control import (
+    bumpless_transfer,
+    cancelling,
+    feedforward,
+    no_loads,
+    wings_level,
+)
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.experiment.schema.encounter import Aircraft, Path
@@ -56,9 +63,9 @@ def test_cancelling_leaves_nothing_with_an_unlimited_aileron():
     assert np.abs(steered[0]).max() < 1e-4 * np.abs(off[0]).max()
 
 
-@pytest.mark.parametrize("law", [cancelling, feedforward])
+@pytest.mark.parametrize("law", [lambda model: cancelling(model, 3.0), feedforward])
 def test_commands_stay_within_the_limits(law):
-    aileron = simulated(lambda model: law(model, 3.0), wake(350))[2]
+    aileron = simulated(law, wake(350))[2]
     assert np.abs(aileron).max() <= np.radians(20) * (1 + 1e-9)
     assert np.abs(np.diff(aileron)).max() <= np.radians(50) * STEP * (1 + 1e-9)
 
@@ -105,7 +112,7 @@ def test_the_plan_is_near_the_best_possible():
         np.abs(simulated(law, wind)[0]).max()
         for law in (
             lambda model: wings_level(model, 3.0),
-            lambda model: feedforward(model, 3.0),
+            lambda model: feedforward(model),
             lambda model: cancelling(model, 3.0),
         )
     )
@@ -117,7 +124,7 @@ def test_the_plan_is_near_the_best_possible():
 def test_a_plan_without_loads_levels_the_wings():
     """An autopilot: from 10 degrees of bank to below 1 in 3 s, without going beyond."""
     model = RollModel(Aircraft(), Path())
-    controller = feedforward(model, 3.0)
+    controller = feedforward(model)
     while model.state.roll < np.radians(10):
         model.step(STEP, Loads(np.zeros(3), np.array([3e5, 0.0, 0.0])), Commands())
     for _ in range(90):
@@ -153,12 +160,72 @@ def test_levelling_decays_with_its_time():
     controller = wings_level(model, 20.0)
     model.step(0.5, Loads(np.zeros(3), np.array([2e5, 0.0, 0.0])), Commands())
     nothing = no_loads(0.0)
-    rolls = [model.step(STEP, nothing, controller(None, model.state)).roll for _ in range(300)]
+    rolls = [model.step(STEP, nothing, controller(no_loads, model.state)).roll for _ in range(300)]
     assert np.log(rolls[149] / rolls[299]) == pytest.approx(150 * STEP / 20, rel=0.05)
 
 
-def test_without_a_preview_every_mode_is_the_same():
-    model = RollModel(Aircraft(), Path())
-    state = model.step(0.5, Loads(np.zeros(3), np.array([2e5, 0.0, 0.0])), Commands())
-    assert feedforward(model, 3.0)(None, state) == wings_level(model, 3.0)(None, state)
-    assert wings_level(model, None)(None, state) == Commands()
+def test_nothing_steers_without_a_time():
+    assert wings_level(RollModel(Aircraft(), Path()), None)(no_loads, AircraftState(roll=0.3)) == (
+        Commands()
+    )
+
+
+# --- a preview that is lost -------------------------------------------------------------------
+
+
+def constant(moment):
+    """A preview of one rolling moment at all times."""
+
+    def preview(time):
+        rolling = np.full((*np.shape(time), 3), [moment, 0.0, 0.0])
+        return Loads(2 * rolling, rolling)
+
+    return preview
+
+
+def test_a_lost_preview_fades():
+    """Linearly over the horizon; before the first one there are no loads; a new one is itself."""
+    transfer, times = bumpless_transfer(), np.array([3.0, 3.5])
+
+    def loads(preview, time):
+        return transfer(preview, AircraftState(time=time))(times)
+
+    assert not loads(None, 0.0).moment.any()
+    assert transfer(no_loads, AircraftState()) is no_loads
+    np.testing.assert_allclose(loads(constant(8.0), 1.0).moment[:, 0], 8.0)
+    for time, expected in ((1.5, 6.0), (2.0, 4.0), (2.9, 0.4), (3.0, 0.0), (9.0, 0.0)):
+        found = loads(None, time)
+        np.testing.assert_allclose(found.moment, [[expected, 0, 0]] * 2, atol=1e-12)
+        np.testing.assert_allclose(found.force, 2 * found.moment)
+    again = constant(5.0)
+    assert transfer(again, AircraftState(time=3.1)) is again
+
+
+def test_an_aileron_that_holds_does_not_let_go():
+    """A moment is held in balance, and the preview is lost: the command follows without a jump.
+
+    In a step the command changes by less than the actuator can move; with the loads gone at once
+    it jumps by the way of an interval of the plan.
+    """
+    moment = np.radians(12) * RollModel(Aircraft(), Path()).control_moments[0, 0]
+    dt, jumps, rolls = 0.01, {}, {}
+    for name in ("at once", "bumpless"):
+        model = RollModel(Aircraft(), Path())
+        controller, transfer = feedforward(model), bumpless_transfer()
+        commands, bank = [], []
+        for step in range(600):
+            lost = step >= 300
+            preview = None if lost else constant(-moment)
+            if name == "at once":
+                chosen = no_loads if lost else constant(-moment)
+            else:
+                chosen = transfer(preview, model.state)
+            commands.append(controller(chosen, model.state))
+            model.step(dt, constant(-moment)(0.0), commands[-1])
+            bank.append(model.state.roll)
+        ailerons = [one.aileron for one in commands]
+        assert ailerons[299] == pytest.approx(np.radians(12), rel=0.02)
+        jumps[name], rolls[name] = np.abs(np.diff(ailerons[295:])).max(), np.abs(bank[300:505])
+    assert jumps["bumpless"] < model.limits.rate[0] * dt < 0.2 * jumps["at once"]
+    # while it fades
+    assert rolls["bumpless"].max() < rolls["at once"].max()

@@ -89,6 +89,30 @@ def test_what_was_seen_is_not_forgotten(experiment):
     assert not known[-1]
 
 
+def test_a_track_that_is_lost_in_the_wake():
+    """Blind before the wake is crossed: no jump of the aileron, no more bank than the autopilot's.
+
+    The command changes in a step by no more than the actuator moves when the track is lost.
+    """
+    pair = {"circulation": 350, "separation": 47, "core_radius": 3, "width": 120, "height": 80}
+    keys = encounter_keys(path={"start": "300 m", "beyond": "250 m", "crossing_angle": "10 deg"})
+    keys["wake"]["vortex_pair"] = pair
+    one = check(keys, "test")
+    limits = aircraft_of(one.encounter).limits
+    for last in (20, 24, 28):
+        blind = SyntheticLidar(wake_along_path(one), blind=lambda number, last=last: number > last)
+        series = simulate_flights(one, silent, lidar=blind).series
+        ours, autopilot = (series.sel(flight=mode) for mode in ("feedforward", "autopilot"))
+        lost = np.flatnonzero(np.isfinite(ours["predicted_roll_moment"].values))[-1]
+        moment = np.abs(ours["roll_moment"].values)
+        assert moment[lost:].max() > 0.5 * moment.max()
+        step = float(series["time"][1])
+        change = np.abs(np.diff(ours["aileron"].values[lost : lost + 10])).max()
+        assert change < limits.rate[0] * step
+        banks = [float(np.abs(flight["roll"]).max()) for flight in (ours, autopilot)]
+        assert banks[0] <= banks[1]
+
+
 def test_only_what_a_mode_needs_is_flown(experiment):
     class Unused:
         def step(self, *_):

@@ -225,5 +225,5 @@ def test_steered_through_a_core():
         return max(rolls)
 
     off = largest_roll(lambda one: wings_level(one, 3.0))
-    steered = largest_roll(lambda one: feedforward(one, 3.0))
+    steered = largest_roll(lambda one: feedforward(one))
     assert off > math.radians(20) and steered < 0.4 * off

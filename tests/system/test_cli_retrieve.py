@@ -172,6 +172,7 @@ def test_shells_complete_commands_and_experiments(here, monkeypatch):
     assert not run("enc") and options.complete_flight("") == [
         "encounter",
         "encounter_sensor",
+        "gust",
         "wake_mine.yaml",
         "sub/",
     ]

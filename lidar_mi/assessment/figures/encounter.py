@@ -10,7 +10,7 @@ from matplotlib.patches import Circle
 
 from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
-from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
 FLIGHTS = {
@@ -77,6 +77,8 @@ def draw_all(
     if "feedforward" in series["flight"]:
         plates.append(("fig34_moment", "Predicted and true rolling moment", _moment(series)))
     plates.append(("fig35_commands", "The ailerons", _commands(series)))
+    if series.attrs.get(MET) == "air":
+        plates.append(("fig36_loads", "Loads by the wind", _loads(series)))
     return save_all(folder, plates, log)
 
 
@@ -410,3 +412,19 @@ def _commands(series: xr.Dataset) -> Plate:
     axes.set(ylabel="aileron / degrees", xlabel="time of flight / s")
     axes.legend(fontsize=9)
     return figure, "Deflections, within the limits and the rate of the actuators."
+
+
+def _loads(series: xr.Dataset) -> Plate:
+    figure = Figure(figsize=(10.5, 6.4), layout="compressed")
+    force, moment = figure.subplots(2, 1, sharex=True)
+    _lines(force, series, "force_z", 1e-3)
+    _lines(moment, series, "roll_moment", 1e-3)
+    largest = 1e-3 * float(series["largest_control_roll_moment"].max())
+    moment.axhspan(-largest, largest, color="0.5", alpha=0.12, lw=0, label="within the ailerons'")
+    force.set_ylabel("vertical force / kN")
+    moment.set(ylabel="rolling moment / kN m", xlabel="time of flight / s")
+    moment.legend(fontsize=9, loc="best")
+    return figure, (
+        "Force and moment by the wind on wing and tail, without those by the aircraft's own "
+        "motion. Shaded: moments within those of the ailerons at full deflection."
+    )

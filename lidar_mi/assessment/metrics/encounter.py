@@ -16,6 +16,9 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 CONTROLLER = "controller"
 """Attribute of the time series: the name of a controller of one's own."""
 
+MET = "met"
+"""Attribute of the time series: what a flight meets, "wake" (by default) or "air"."""
+
 _NAMES = {
     "off": "without control",
     "autopilot": "autopilot",
@@ -61,6 +64,7 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
         key, roll = f"encounter.{mode}", _largest(one["roll"])
         found[f"{key}.largest_roll"] = roll
         found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
+        found[f"{key}.largest_lift"] = _largest(one["force_z"])
         found[f"{key}.residual_moment"] = residual_moment(one)
         found[f"{key}.roll_control_ratio"] = roll_control_ratio(one["roll_moment"].values, largest)
         found[f"{key}.departed"] = float(one["departed"].max())
@@ -94,8 +98,13 @@ def prediction_error(one: xr.Dataset) -> float:
 
 
 def felt_from(series: xr.Dataset) -> float:
-    """Time (s) at which the wake's rolling moment on the flight off is first felt; NaN: never."""
-    moment = np.abs(series["roll_moment"].sel(flight="off").values)
+    """Time (s) at which the wake's rolling moment is first felt without control; NaN: never.
+
+    In other air that of the wake alone, on the nominal path.
+    """
+    alone = "wake_roll_moment" in series
+    moment = series["wake_roll_moment"] if alone else series["roll_moment"].sel(flight="off")
+    moment = np.abs(moment.values)
     felt = np.flatnonzero(moment > _FELT * moment.max())
     return float(series["time"][felt[0]]) if felt.size else float("nan")
 
@@ -211,12 +220,17 @@ def _largest(values: xr.DataArray) -> float:
 
 
 def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
-    """Fraction of what perfect preview removes that the lidar removes."""
-    keys = [f"encounter.{mode}.{quantity}" for mode in ("off", "feedforward", "perfect")]
-    if not all(key in found for key in keys):
-        return {}
-    off, ours, perfect = (found[key] for key in keys)
-    # nothing is removed: the fraction would be one of rounding
-    if abs(off - perfect) <= _ROUNDING:
-        return {}
-    return {f"encounter.removed_of_perfect.{quantity}": (off - ours) / (off - perfect)}
+    """Fractions of what perfect preview removes that the lidar removes.
+
+    Of what no control leaves, and of what the autopilot leaves, which has no preview.
+    """
+    removed = {}
+    for name, baseline in (("of_perfect", "off"), ("beyond_autopilot", "autopilot")):
+        keys = [f"encounter.{mode}.{quantity}" for mode in (baseline, "feedforward", "perfect")]
+        if not all(key in found for key in keys):
+            continue
+        before, ours, perfect = (found[key] for key in keys)
+        # nothing is removed: the fraction would be one of rounding
+        if abs(before - perfect) > _ROUNDING:
+            removed[f"encounter.removed_{name}.{quantity}"] = (before - ours) / (before - perfect)
+    return removed

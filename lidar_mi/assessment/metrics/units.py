@@ -20,6 +20,7 @@ _NAMED = {
 _ENCOUNTER = {
     "largest_roll": "rad",
     "largest_roll_rate": "rad/s",
+    "largest_lift": "N",
     "lead_time": "s",
     "look_ahead": "s",
     "core_error": "m",
@@ -44,7 +45,7 @@ def unit_of(key: str) -> str:
     *_, parent, name = ("", *key.split("."))
     if name.startswith(_WIND) and name != "monte_carlo_fraction":
         return "rad" if name.endswith("_direction") else "m/s"
-    if key.startswith("encounter.") and parent != "removed_of_perfect":
+    if key.startswith("encounter.") and not parent.startswith("removed_"):
         return _ENCOUNTER.get(name, "")
     if key.startswith("vortex."):
         return _of_vortices().get(name.removesuffix("_stderr"), "")

@@ -21,8 +21,9 @@ GOAL = 0.8
 _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
     ("largest_roll_rate", "largest roll rate", "degrees/s", math.degrees(1)),
-    ("residual_moment", "rolling moment felt over the wake's (rms)", "", 1.0),
-    ("roll_control_ratio", "largest moment of the wake over the controls'", "", 1.0),
+    ("residual_moment", "rolling moment felt over the {met}'s (rms)", "", 1.0),
+    ("roll_control_ratio", "largest moment of the {met} over the controls'", "", 1.0),
+    ("largest_lift", "largest vertical force by the {met}'s wind", "kN", 1e-3),
 )
 _OF_THE_LIDAR = (
     ("lead_time", "from the first usable track to the wake", "s", 1.0),
@@ -61,16 +62,18 @@ _UPSET = "banked beyond 90 degrees, or out of control; the flight ends with this
 _NO_ROLL = math.radians(0.01)
 
 
-def encounter_summary(metrics: Mapping[str, float], controller: str = "") -> list[Table]:
-    """The main numbers for a terminal, with the name of a controller of one's own."""
+def encounter_summary(
+    metrics: Mapping[str, float], controller: str = "", met: str = "wake"
+) -> list[Table]:
+    """The main numbers for a terminal; `controller` and `met` as in `encounter_chapter`."""
     modes = [mode for mode in MODES if f"encounter.{mode}.largest_roll" in metrics]
     rows = [
         (f"{label} / {unit}" if unit else label, *_values(metrics, modes, key, factor))
-        for key, label, unit, factor in _OF_A_FLIGHT
+        for key, label, unit, factor in _of_a_flight(metrics, met)
     ]
     rows.append(("flight lost (upset)", *("yes" if _lost(metrics, m) else "no" for m in modes)))
     heads = ("", *(flight_name(mode, controller) for mode in modes))
-    tables = [Table("flights into the wake", rows, heads, f"flight lost: {_UPSET}")]
+    tables = [Table(f"flights into the {met}", rows, heads, f"flight lost: {_UPSET}")]
     lidar = [
         (f"{label} / {unit}" if unit else label, _shown(metrics.get(f"encounter.{key}"), factor))
         for key, label, unit, factor in _OF_THE_LIDAR
@@ -87,6 +90,7 @@ def encounter_chapter(
     drawn: "Sequence[Drawn]",
     film: "Film | None" = None,
     controller: str = "",
+    met: str = "wake",
 ) -> "Chapter":
     """Answer, figures and numbers of a flight.
 
@@ -100,13 +104,15 @@ def encounter_chapter(
     film : Film, optional
     controller : str
         Name of a controller of one's own.
+    met : {"wake", "air"}
+        What the flights meet.
     """
     from lidar_mi.assessment.report.page import Chapter, Tables
 
     modes = [mode for mode in MODES if f"encounter.{mode}.largest_roll" in metrics]
     flights = [
         (label, unit, _values(metrics, modes, key, factor))
-        for key, label, unit, factor in _OF_A_FLIGHT
+        for key, label, unit, factor in _of_a_flight(metrics, met)
     ]
     flights.append(
         ("flight lost (upset)", "", ["yes" if _lost(metrics, mode) else "no" for mode in modes])
@@ -121,19 +127,21 @@ def encounter_chapter(
         tables.append(("The lidar and its track", ["value"], lidar))
     numbers = Tables(
         heading="Numbers of the flight",
-        legend="All flights meet the same wake. Without control, a pilot levels the wings; "
+        legend=f"All flights meet the same {met}. Without control, a pilot levels the wings; "
         f"{_FLIGHTS_OWN.format(controller) if controller else _AUTOPILOT}, without "
-        f"information on the wake. Flight lost: {_UPSET}. Rolling moment felt: that of wake and "
+        f"information on the {met}. Flight lost: {_UPSET}. Rolling moment felt: that of {met} and "
         "ailerons together. Errors are those of the track against the truth, in the newest slab.",
         tables=tables,
     )
     return Chapter(
-        "Into the wake", [], drawn, numbers, _verdict(judged) if judged else None, film=film
+        f"Into the {met}", [], drawn, numbers, _verdict(judged) if judged else None, film=film
     )
 
 
-def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list[str]:
-    """The answer in sentences.
+def encounter_answer(
+    metrics: Mapping[str, float], controller: str = "", met: str = "wake"
+) -> list[str]:
+    """The answer in sentences; `controller` and `met` as in `encounter_chapter`.
 
     The roll of the aircraft in every flight, the time of the first detection, the limits.
     """
@@ -143,12 +151,12 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
     largest = max(angle for angle in (off, blind, ours, perfect) if angle is not None)
     if largest < _NO_ROLL:
         return [
-            f"No flight rolls by more than {three(math.degrees(_NO_ROLL))} degrees: the wake is "
-            "missed, or lies across the path, where both wings meet the same wind."
+            f"No flight rolls by more than {three(math.degrees(_NO_ROLL))} degrees: the {met} is "
+            "missed, or both wings meet the same wind, as in a wake across the path."
         ]
-    answer = f"Without control, the wake rolls the aircraft by {_degrees(off)}"
+    answer = f"Without control, the {met} rolls the aircraft by {_degrees(off)}"
     if _lost(metrics, "off"):
-        answer = "Without control, the wake upsets the aircraft"
+        answer = f"Without control, the {met} upsets the aircraft"
     if blind is not None:
         steers = controller or "the same autopilot"
         answer += f"; with {steers}, but no preview, by {_degrees(blind)}"
@@ -161,20 +169,23 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
     answer += "."
     removed = metrics.get("encounter.removed_of_perfect.largest_roll")
     if removed is not None:
-        met = "meets" if removed >= GOAL else "misses"
+        verdict = "meets" if removed >= GOAL else "misses"
         removes = f"{percent(removed)} of the roll angle that perfect preview removes"
         if removed >= 1:
             removes = "as much of the roll angle as perfect preview, or more"
-        answer += f" The lidar removes {removes}, and so {met} the goal of {percent(GOAL)}."
+        answer += f" The lidar removes {removes}, and so {verdict} the goal of {percent(GOAL)}."
+        answer += _beyond_autopilot(metrics, controller)
     best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"
     bank, ratio = (metrics[f"encounter.{best}.{k}"] for k in ("largest_roll", "roll_control_ratio"))
     verdict = "stays below" if bank <= ACCEPTED_BANK else "exceeds"
     answer += (
         f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at "
-        "which an approach is called unstable. The wake's rolling moment reaches "
-        f"{three(ratio)} times the largest of the controls; pilots rate encounters of up to "
-        f"{ACCEPTED_RATIO:g} times as uncritical."
+        f"which an approach is called unstable. The {met}'s rolling moment reaches "
+        f"{three(ratio)} times the largest of the controls"
     )
+    # the rating is of wakes
+    rated = f"; pilots rate encounters of up to {ACCEPTED_RATIO:g} times as uncritical"
+    answer += rated + "." if met == "wake" else "."
     lead = [answer]
     if "encounter.lead_time" in metrics:
         lead.append(
@@ -186,6 +197,30 @@ def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list
         )
         lead += _limits(metrics)
     return lead
+
+
+def _beyond_autopilot(metrics: Mapping[str, float], controller: str) -> str:
+    """The lidar's share of what perfect preview adds to an autopilot without one."""
+    share = metrics.get("encounter.removed_beyond_autopilot.largest_roll")
+    blind = metrics.get("encounter.autopilot.largest_roll")
+    if share is None or blind is None:
+        return ""
+    steers = f"{controller} without a preview" if controller else "the autopilot"
+    if blind <= metrics["encounter.perfect.largest_roll"]:
+        return f" Perfect preview rolls no less than {steers}."
+    found = "all" if share >= 1 else percent(share) if share > 0 else "nothing"
+    return (
+        f" Of the roll angle that {steers} leaves and perfect preview removes, it removes {found}."
+    )
+
+
+def _of_a_flight(metrics: Mapping[str, float], met: str) -> list[tuple[str, str, str, float]]:
+    """Rows of the table of flights that these metrics have."""
+    return [
+        (key, label.format(met=met), unit, factor)
+        for key, label, unit, factor in _OF_A_FLIGHT
+        if any(name.endswith(f".{key}") for name in metrics)
+    ]
 
 
 def _limits(metrics: Mapping[str, float]) -> list[str]:

@@ -371,4 +371,8 @@ def _inputs(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
     paths = table_files(experiment.scattering, search_path)
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, search_path, "wake.file")
+    air = experiment.encounter.air if experiment.encounter else None
+    if air is not None and air.volume is not None:
+        key = "encounter.air.volume.file"
+        paths[key] = find_file(air.volume.file, search_path, key)
     return paths | timing_files(experiment, search_path)

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from lidar_mi.experiment.schema.air import Air
 from lidar_mi.experiment.schema.section import Section
 from lidar_mi.units import (
     Angle,
@@ -126,7 +127,7 @@ class Control(Section):
         0.12, description="from the second scan of a slab to its estimate"
     )
     levelling_time: Annotated[Time, Within(0.1, 1000, "a pilot")] | None = Field(
-        3.0, description="in which the wings are levelled, in every mode; null: they are not"
+        3.0, description="in which the wings are levelled without control; null: they are not"
     )
 
     @field_validator("mode", mode="before")
@@ -142,6 +143,7 @@ class Encounter(Section):
     aircraft: Aircraft = Aircraft()
     path: Path = Path()
     wake: WakeInTime = WakeInTime()
+    air: Air | None = Field(None, description="beside the wake, or in its place; default: at rest")
     rate: Annotated[Frequency, Within(0.1, 1000, "slabs a second")] = 10.0
     look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
         150.0, description="range of the farther gate's start"

@@ -39,6 +39,13 @@ def test_without_a_lidar_there_is_the_flight(tmp_path):
     assert [one.path.stem for one in drawn] == ["fig30_roll", "fig35_commands"]
 
 
+def test_loads_of_the_air_are_drawn(tmp_path):
+    alone = made_up_flights().series.sel(flight=["off"]).assign_attrs(met="air")
+    drawn = draw_all(tmp_path, alone, None, None, SPAN, Log())
+    assert [one.path.stem for one in drawn] == ["fig30_roll", "fig35_commands", "fig36_loads"]
+    assert imread(drawn[-1].path).std() > 0.05
+
+
 def test_cockpit_is_the_pilots_view():
     """Port, positive y, is on the left; cores are where the data set has them."""
     found = made_up_flights()

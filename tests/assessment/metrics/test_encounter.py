@@ -32,6 +32,7 @@ def flight(roll, control, predicted=np.nan):
         "airspeed": np.full(401, 75.0),
         "departed": np.zeros(401),
         "roll_moment": wake,
+        "force_z": -0.2 * wake,
         "control_roll_moment": -control * wake,
         "predicted_roll_moment": predicted * wake,
     }
@@ -41,8 +42,9 @@ def flight(roll, control, predicted=np.nan):
 
 @pytest.fixture
 def series():
-    flights = [flight(0.5, 0.0), flight(-0.14, 0.75, 0.9), flight(0.05, 0.9)]
-    names = xr.DataArray(["off", "feedforward", "perfect"], dims="flight", name="flight")
+    flights = [flight(0.5, 0.0), flight(-0.14, 0.75, 0.9), flight(0.05, 0.9), flight(-0.2, 0.6)]
+    names = ["off", "feedforward", "perfect", "autopilot"]
+    names = xr.DataArray(names, dims="flight", name="flight")
     return xr.concat(flights, names)
 
 
@@ -85,10 +87,12 @@ def test_roll_and_moments(series):
     assert found["encounter.feedforward.largest_roll"] == pytest.approx(0.14)
     assert found["encounter.perfect.largest_roll_rate"] == pytest.approx(0.1)
     assert found["encounter.removed_of_perfect.largest_roll"] == pytest.approx(0.36 / 0.45)
+    assert found["encounter.removed_beyond_autopilot.largest_roll"] == pytest.approx(0.06 / 0.15)
+    assert found["encounter.perfect.largest_lift"] == pytest.approx(2e4)
     assert found["encounter.feedforward.residual_moment"] == pytest.approx(0.25)
     assert found["encounter.off.roll_control_ratio"] == pytest.approx(0.5)
     # 0.14 rad are 8 degrees, 0.05 rad are 3
-    assert [found[f"encounter.{m}.hazardous"] for m in series["flight"].values] == [1, 1, 0]
+    assert [found[f"encounter.{m}.hazardous"] for m in series["flight"].values] == [1, 1, 0, 1]
     assert not any("track" in key for key in found)
 
 
@@ -96,6 +100,16 @@ def test_still_air_has_no_fraction(series):
     calm = series.assign(roll_moment=0 * series["roll_moment"])
     assert np.isnan(residual_moment(calm.isel(flight=0))) and np.isnan(felt_from(calm))
     assert "encounter.off.residual_moment" not in encounter_metrics(calm, None)
+
+
+def test_a_wake_in_turbulence_is_felt_by_its_own_moment(series):
+    """Turbulence of a tenth of the wake's moment from the beginning on; the wake comes at 2.5 s."""
+    rough = series.assign(
+        roll_moment=series["roll_moment"] + 2e4,
+        wake_roll_moment=("time", np.where(TIME >= 2.5, 1e5, 0.0)),
+    )
+    assert felt_from(rough) == pytest.approx(2.5)
+    assert felt_from(rough.drop_vars("wake_roll_moment")) == 0
 
 
 def test_the_lidar_in_flight(series, track):

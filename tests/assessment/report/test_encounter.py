@@ -32,15 +32,43 @@ def numbers(**rolls):
 def test_answer_comes_first():
     metrics = numbers(off=25, autopilot=7, feedforward=9, perfect=2)
     metrics["encounter.removed_of_perfect.largest_roll"] = 16 / 23
+    metrics["encounter.removed_beyond_autopilot.largest_roll"] = -2 / 5
     answer, *_ = encounter_answer(metrics)
     for words in (
         "Without control, the wake rolls the aircraft by 25 degrees; with the same autopilot, but "
         "no preview, by 7 degrees; with the lidar by 9 degrees; with perfect preview by 2 degrees.",
         "removes 70 % of the roll angle that perfect preview removes, and so misses the goal of "
-        "80 %",
+        "80 %. Of the roll angle that the autopilot leaves and perfect preview removes, it removes "
+        "nothing.",
         "The flight with the lidar exceeds the 7 degrees of bank",
     ):
         assert words in answer
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "share", "words"),
+    [
+        (7, 0.6, "Of the roll angle that the autopilot leaves and perfect preview removes, it "),
+        (2, 1.5, "Perfect preview rolls no less than the autopilot."),
+    ],
+)
+def test_share_beyond_the_autopilot(autopilot, share, words):
+    metrics = numbers(off=25, autopilot=autopilot, feedforward=4, perfect=2)
+    metrics["encounter.removed_of_perfect.largest_roll"] = 21 / 23
+    metrics["encounter.removed_beyond_autopilot.largest_roll"] = share
+    answer, *_ = encounter_answer(metrics)
+    assert words in answer and ("60 %" in answer) == (share == 0.6)
+
+
+def test_flights_through_air_are_called_so():
+    metrics = numbers(off=25, perfect=2)
+    answer, *_ = encounter_answer(metrics, met="air")
+    assert answer.startswith("Without control, the air rolls") and "wake" not in answer
+    assert "The air's rolling moment reaches 1.5 times" in answer
+    chapter = encounter_chapter(metrics, [], [], met="air")
+    assert chapter.title == "Into the air"
+    table, *_ = encounter_summary(metrics, met="air")
+    assert ("largest moment of the air over the controls'", "1.50", "1.50") in table.rows
 
 
 def test_an_upset_is_told():

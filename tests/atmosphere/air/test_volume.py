@@ -1,0 +1,81 @@
+"""Air of a simulation. Unit and physics tier.
+
+Detects: a volume that is shifted, turned or keeps its mean wind, divergence that is accepted, or
+refused where there is none, places outside that count as inside.
+"""
+
+import numpy as np
+import pytest
+
+from lidar_mi.atmosphere.air.turbulence import turbulence
+from lidar_mi.atmosphere.air.volume import AirVolume, divergence_fraction
+from lidar_mi.errors import InputError
+from tests.support.air_volumes import sampled
+
+FIELD = turbulence(1.5, 100.0, 3, shortest=10.0)
+
+
+@pytest.fixture(scope="module")
+def flow():
+    """The field in a wind of 8 and -3 m/s that grows by 0.02 / s with the height."""
+    return sampled(FIELD, wind=(8.0, -3.0), shear=0.02)
+
+
+def test_it_is_the_field_in_its_mean_wind(flow):
+    """To 2 % of the rms; the shear is relative to that at the height."""
+    volume = AirVolume(flow, start=100.0, centre=0.0, height=60.0)
+    random = np.random.default_rng(1)
+    x, y, z = random.uniform([20, -30, 35], [100, 30, 85], (400, 3)).T
+    found = np.stack(volume.velocity(x, y, z, 5.0))
+    true = np.stack(FIELD.velocity(x + 100, y, z, 0.0))
+    true[0] += 0.02 * (z - 60)
+    # of a few long waves in the volume, the mean is not the shear's alone
+    difference = found - true
+    offset = difference.mean(axis=1)
+    assert np.abs(difference - offset[:, None]).max() < 0.05 * 1.5
+    level = flow.sel(z=60.0, method="nearest").mean(("x", "y"))
+    expected = [8.0 - float(level["u"]), -3.0 - float(level["v"]), 0.0]
+    np.testing.assert_allclose(offset, expected, atol=0.02)
+
+
+def test_mean_wind_at_the_height(flow):
+    volume = AirVolume(flow, 100.0, 0.0, 60.0)
+    level = flow.sel(z=60.0).mean(("x", "y"))
+    assert volume.mean_wind == pytest.approx((float(level["u"]), float(level["v"])))
+    above = AirVolume(flow, 100.0, 0.0, 5000.0)
+    top = flow.isel(z=-1).mean(("x", "y"))
+    assert above.mean_wind == pytest.approx((float(top["u"]), float(top["v"])))
+
+
+def test_divergence_of_solenoidal_air_and_of_noise(flow):
+    random = np.random.default_rng(2)
+    noise = flow.copy(data={n: random.normal(size=flow[n].shape) for n in "uvw"})
+    assert divergence_fraction(flow) < 0.05
+    assert divergence_fraction(noise) == pytest.approx(1 / np.sqrt(3), abs=0.02)
+    assert divergence_fraction(0 * flow) == 0
+    with pytest.raises(InputError, match=r"rms divergence is 0\.5\d times .* at most 0\.2"):
+        AirVolume(noise, 0.0, 0.0, 60.0)
+    # one component of another field
+    wrong = flow.assign(w=flow["u"] * 1.0)
+    with pytest.raises(InputError, match="expected air without divergence"):
+        AirVolume(wrong, 0.0, 0.0, 60.0)
+
+
+def test_what_it_covers(flow):
+    volume = AirVolume(flow, start=100.0, centre=0.0, height=60.0)
+    assert volume.missing([0.0, 100.0], [-40.0, 40.0], [31.0, 90.0]) == {}
+    missing = volume.missing([0.0, 180.0], [0.0], [20.0])
+    assert set(missing) == {"x", "z"}
+    assert missing["x"] == pytest.approx((100.0, 220.0, 100.0, 280.0))
+
+
+def test_a_plane_is_no_volume(flow):
+    with pytest.raises(InputError, match=r"1 nodes along x are not allowed; expected 4 or more"):
+        AirVolume(flow.isel(x=[0]), 0.0, 0.0, 60.0)
+
+
+def test_order_of_dimensions_does_not_matter(flow):
+    first = AirVolume(flow, 100.0, 0.0, 60.0)
+    second = AirVolume(flow.transpose("z", "x", "y"), 100.0, 0.0, 60.0)
+    at = (30.0, 10.0, 50.0, 0.0)
+    np.testing.assert_allclose(first.velocity(*at), second.velocity(*at))
