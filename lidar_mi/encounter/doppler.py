@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy
 import xarray as xr
+from scipy.spatial.transform import Rotation
 
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.pose import AircraftPose
@@ -99,7 +99,7 @@ class DopplerScans:
         x: float,
         time: float,
         midway: Midway,
-        misalignment: scipy.spatial.transform.Rotation | None = None,
+        misalignment: Rotation | None = None,
     ) -> LineFrames:
         """Frames of all lines of sight of a slab.
 

@@ -51,10 +51,25 @@ cuda_ad_spectral
 
 
 def has_cuda() -> bool:
-    """Whether ``cuda_*`` variants can run here: an NVIDIA GPU, and a driver that Dr.Jit takes."""
+    """Whether ``cuda_*`` variants can run here: an NVIDIA GPU, and a driver that is new enough.
+
+    The variant in force stays.
+    """
     import drjit as dr
 
-    return bool(dr.has_backend(dr.JitBackend.CUDA))
+    # without Mitsuba, where there is none
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        return False
+    import mitsuba as mi
+
+    before = mi.variant()
+    try:
+        mi.set_variant("cuda_ad_mono")
+    except ImportError:
+        return False
+    if before is not None:
+        mi.set_variant(before)
+    return True
 
 
 def check_variant(name: str) -> None:

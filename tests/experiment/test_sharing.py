@@ -26,6 +26,8 @@ DOPPLER = {
 # other values of every key, or of one in every section, that images do not depend on
 BEHIND = {
     "name": "another",
+    # but for rounding, where it has another variant
+    "device": "cpu",
     "lidar.pulse_energy": "7.3 mJ",
     "detector": {"sky_radiance": "0.1 W/m^2/sr/nm", "quantum_efficiency": 0.3},
     "render.max_samples": 2e6,
@@ -36,6 +38,7 @@ BEHIND = {
 }
 BEHIND_RINGS = {
     "name": "another",
+    "device": "cpu",
     "wake": small()["wake"],
     "platform": {"speed": "70 m/s"},
     "lidar": {"pulse_energy": "2 mJ"},

@@ -1,12 +1,13 @@
 """Choosing Mitsuba's variant. Detects an error that is no single clear line."""
 
+import drjit as dr
 import mitsuba as mi
 import pytest
 
 import lidar_mi as lm
 from lidar_mi.errors import InputError
 from lidar_mi.rendering.settings import VARIANTS
-from lidar_mi.rendering.variant import use_variant
+from lidar_mi.rendering.variant import has_cuda, use_variant
 
 
 @pytest.mark.parametrize("name", [v for v in VARIANTS if v.startswith("llvm")])
@@ -52,3 +53,22 @@ def test_mitsuba_itself_reports_it_and_takes_the_next(variant):
         assert mi.variant() == "llvm_ad_rgb"
     else:
         assert mi.variant() == "cuda_ad_rgb"
+
+
+@pytest.mark.parametrize(("there", "serves"), [(False, False), (True, False), (True, True)])
+def test_a_gpu_is_one_that_serves(monkeypatch, there, serves):
+    """Dr.Jit has it, and Mitsuba's variant can be set; the variant in force stays."""
+    mi.set_variant("llvm_ad_rgb")
+    tried, set_variant = [], mi.set_variant
+
+    def pretended(name):
+        tried.append(name)
+        if name.startswith("cuda") and not serves:
+            raise ImportError("no OptiX")
+        if name.startswith("llvm"):
+            set_variant(name)
+
+    monkeypatch.setattr(dr, "has_backend", lambda backend: there and "CUDA" in str(backend))
+    monkeypatch.setattr(mi, "set_variant", pretended)
+    assert has_cuda() == serves
+    assert mi.variant() == "llvm_ad_rgb" and bool(tried) == there

@@ -209,6 +209,16 @@ def bad(*arguments, says):
         ),
         bad("info", "none", says=["none", "no such file"]),
         bad("info", "tiny.yaml", says=["tiny.yaml", "expected lidar-mi check tiny.yaml"]),
+        bad(
+            "run", "tiny.yaml", "--device", "gpu", says=["--device: gpu is not", "auto, cpu, cuda"]
+        ),
+        bad(
+            "run",
+            "tiny.yaml",
+            "--set",
+            "device=gpu",
+            says=["device: 'gpu' is not", "'auto', 'cpu'"],
+        ),
         bad("info", "slab.xml", says=["slab.xml", "expected .exr, .nc, .txt", "run folder"]),
         bad(
             "check",

@@ -36,6 +36,20 @@ def test_run_writes_into_the_given_folder_and_prints_it(there, lidar_mi, quick):
     assert not (there / "outputs").exists()
 
 
+def test_a_device_turns_variants_and_is_in_the_log(there, lidar_mi, quick):
+    """Of a file that asks for CUDA, which need not be there."""
+    cuda = ("--set", "render.variant=cuda_ad_mono_polarized")
+    code, _, err = lidar_mi("run", "tiny.yaml", "--device", "cpu", "-o", "here", *cuda)
+    assert code == 0, err
+    said = "rendering in llvm_ad_mono_polarized, retrieval on cpu"
+    assert said in err and said in (there / "here" / "log.txt").read_text()
+    scan = read_scan(there / "here" / "image_t1.exr")
+    assert scan.attrs["variant"] == "llvm_ad_mono_polarized"
+    # an experiment that was run on its device is resumed
+    code, _, err = lidar_mi("run", "tiny.yaml", "--device", "cpu", "-o", "here", *cuda)
+    assert code == 0 and "using 2 of 2 images" in err
+
+
 @pytest.mark.slow
 def test_run_folder_is_named_after_the_experiment(there, lidar_mi, quick):
     assert lidar_mi("run", "tiny.yaml")[0] == 0

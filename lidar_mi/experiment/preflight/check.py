@@ -165,6 +165,8 @@ def _samples(asked: Experiment, chosen: Samples | None) -> str:
     number: object = asked.render.samples_per_beam
     if chosen:
         number = samples_text(asked.render, chosen)
+    elif number == "auto" and asked.detector:
+        number = "auto (how many: --forecast)"
     elif asked.detector is None:
         number = asked.render.without_detector(asked.scan.gate_count)
     return f"{number}, orders 1 to {asked.render.max_order}"
