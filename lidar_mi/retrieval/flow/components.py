@@ -241,7 +241,7 @@ def _drawn(
     return kinds
 
 
-def without_texture(stack: torch.Tensor, template: int) -> torch.Tensor:
+def without_texture(images: Images, template: int) -> torch.Tensor:
     """Where images in a plane have less than two independent structures in a template.
 
     A displacement has two components, so that one structure does not tell it: its error is that of
@@ -254,8 +254,8 @@ def without_texture(stack: torch.Tensor, template: int) -> torch.Tensor:
 
     Parameters
     ----------
-    stack : torch.Tensor, shape (images, z, y)
-        Not filtered: after the filter the least rounding may be as large as the texture.
+    images : Images
+        Used as they are: after their filter the least rounding may be as large as the texture.
     template : int
         px, twice the standard deviation of the Gaussian mean of the tensor.
 
@@ -263,8 +263,8 @@ def without_texture(stack: torch.Tensor, template: int) -> torch.Tensor:
     -------
     torch.Tensor of bool, shape (z, y)
     """
-    valid = stack.isfinite().all(0)
-    slopes = torch.gradient(finite(working(stack)), dim=(1, 2))
+    valid = images.usable.all(0)
+    slopes = torch.gradient(finite(working(images.stack)), dim=(1, 2))
     # structure tensor, in the mean of the images
     zz, zy, yy = (
         averaged((one * other).mean(0), valid, 0.5 * template)

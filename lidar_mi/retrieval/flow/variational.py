@@ -213,7 +213,7 @@ def variational_and_flow(
     result = result._replace(covariance=covariance)
     if windows.dims > 2:
         return result, None
-    bare = without_texture(images.stack, windows.template).to(like)
+    bare = without_texture(images, windows.template).to(like)
     bare = interpolated(bare, pixels, centres) > 0.5
     flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * bare).short()
     result = result._replace(flag=flag)

@@ -9,12 +9,20 @@ import pytest
 import torch
 
 from lidar_mi.retrieval.flow.components import _RATIO_OF_TWO, without_texture
+from lidar_mi.retrieval.flow.likelihood import prepared
+from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.quality import Flag
 from tests.support.flows import origin, plane_waves, texture
 
 SHAPE = 100, 120
 TEMPLATE = 8
+SETTINGS = VariationalSettings()
+
+
+def bare(stack):
+    """Where images (images, z, y) count as without texture."""
+    return without_texture(prepared(list(torch.tensor(stack)), None, 0.0, SETTINGS), TEMPLATE)
 
 
 def places():
@@ -70,16 +78,16 @@ def test_texture_is_texture(length, noise):
         texture(plane_waves(2, length), y - t, z) + noise * random.standard_normal(SHAPE)
         for t in (0.0, 1.0)
     ]
-    assert not without_texture(torch.tensor(np.stack(stack)), TEMPLATE).any()
+    assert not bare(np.stack(stack)).any()
 
 
 def test_half_of_an_image_has_texture():
     y, z = places()
     waves = texture(plane_waves(3, 3.0), y, z) - 1
-    image = torch.tensor(waves * (y > 50) + 0.01 * z)
-    bare = without_texture(image[None], TEMPLATE)
-    assert bool(bare[:, :35].all())
-    assert not bool(bare[:, 65:].any())
+    image = waves * (y > 50) + 0.01 * z
+    found = bare(image[None])
+    assert bool(found[:, :35].all())
+    assert not bool(found[:, 65:].any())
 
 
 def test_one_structure_and_two():
@@ -88,3 +96,11 @@ def test_one_structure_and_two():
     weak, strong = np.linalg.eigvalsh(slopes @ slopes.transpose(0, 2, 1)).T
     share = np.mean(weak / strong < _RATIO_OF_TWO)
     assert share == pytest.approx(0.5, abs=4 * 0.5 / 20_000**0.5)
+
+
+def test_pixels_that_are_masked_are_no_structure():
+    """Smoke of one brightness with sharp rims, of which some are masked."""
+    y, z = places()
+    image = ((y - 60) ** 2 + (z - 50) ** 2 < 900).astype(float)
+    masked = np.random.default_rng(6).random(SHAPE) < 0.01
+    assert bool(bare(np.where(masked, np.nan, image)[None]).all())
