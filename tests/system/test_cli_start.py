@@ -67,6 +67,12 @@ def test_a_new_file_is_what_it_was_made_of(there, lidar_mi, shipped):
     assert f"lidar-mi {'fly' if shipped in flights() else 'run'} mine.yaml" in text
 
 
+def test_a_new_file_finds_the_tables_that_it_names(there, lidar_mi):
+    lidar_mi("new", "mine", "--from", "eye_safe")
+    code, out, _ = lidar_mi("check", "mine.yaml")
+    assert code == 0 and "all checks passed" in out
+
+
 def test_a_new_file_can_be_checked_and_edited(there, lidar_mi):
     assert lidar_mi("new", "mine.yaml")[0] == 0
     text = (there / "mine.yaml").read_text()
