@@ -11,9 +11,9 @@ from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
 
 EXAMPLES = (
-    "Examples: `lidar-mi aerosol dust --wavelength '1064 nm'` - "
-    "`lidar-mi aerosol spheres --name smoke --index 1.6+0.02i --radius '0.1 um' --sigma 1.6 "
-    "-o smoke.txt`. In an experiment: `scattering: {phase: table, table: smoke.txt}`"
+    "lidar-mi aerosol dust --wavelength '1064 nm'",
+    "lidar-mi aerosol spheres --name smoke --index 1.6+0.02i --radius '0.1 um' --sigma 1.6 "
+    "-o smoke.txt",
 )
 
 
@@ -81,7 +81,8 @@ def aerosol(
     The table holds the six elements of the scattering matrix over angle (T-matrix method for
     spheroids, Lorenz-Mie theory for spheres), averaged over sizes and orientations, and the
     extinction cross-section and albedo. A table of spheroids takes half a minute, of spheres a
-    few seconds. Needs the library scatrs: `pip install 'lidar-mi[particles]'`.
+    few seconds. In an experiment: `scattering: {phase: table,
+    table: smoke.txt}`. Needs the library scatrs: `pip install 'lidar-mi[particles]'`.
     """
     from lidar_mi.atmosphere.aerosols import changed
     from lidar_mi.atmosphere.particle_scattering import make_table

@@ -10,16 +10,20 @@ from lidar_mi.cli import (
     campaign,
     check,
     doctor,
+    explain,
     export,
     fly,
     info,
+    new,
     render,
     retrieve,
     rings,
     run,
     v_los,
 )
+from lidar_mi.cli import list as listing
 from lidar_mi.cli.exit_codes import exit_by
+from lidar_mi.cli.options import examples
 
 app = typer.Typer(
     name="lidar-mi",
@@ -41,19 +45,22 @@ def _top(
         raise typer.Exit
 
 
-app.command(epilog=run.EXAMPLES)(run.run)
-app.command(epilog=fly.EXAMPLES)(fly.fly)
-app.command(epilog=check.EXAMPLES)(check.check)
-app.command(epilog=render.EXAMPLES)(render.render)
-app.command(epilog=retrieve.EXAMPLES)(retrieve.retrieve)
-app.command(epilog=info.EXAMPLES)(info.info)
-app.command(epilog=export.EXAMPLES)(export.export)
-app.command(epilog=aerosol.EXAMPLES)(aerosol.aerosol)
-app.command(epilog=rings.EXAMPLES)(rings.rings)
-app.command(epilog=calibrate.EXAMPLES)(calibrate.calibrate)
+app.command("list", epilog=examples(*listing.EXAMPLES))(listing.list_shipped)
+app.command(epilog=examples(*new.EXAMPLES))(new.new)
+app.command(epilog=examples(*explain.EXAMPLES))(explain.explain)
+app.command(epilog=examples(*run.EXAMPLES))(run.run)
+app.command(epilog=examples(*fly.EXAMPLES))(fly.fly)
+app.command(epilog=examples(*check.EXAMPLES))(check.check)
+app.command(epilog=examples(*render.EXAMPLES))(render.render)
+app.command(epilog=examples(*retrieve.EXAMPLES))(retrieve.retrieve)
+app.command(epilog=examples(*info.EXAMPLES))(info.info)
+app.command(epilog=examples(*export.EXAMPLES))(export.export)
+app.command(epilog=examples(*aerosol.EXAMPLES))(aerosol.aerosol)
+app.command(epilog=examples(*rings.EXAMPLES))(rings.rings)
+app.command(epilog=examples(*calibrate.EXAMPLES))(calibrate.calibrate)
 app.add_typer(campaign.app, name="campaign")
-app.command("v_los", epilog=v_los.EXAMPLES)(v_los.v_los)
-app.command(epilog=doctor.EXAMPLES)(doctor.doctor)
+app.command("v_los", epilog=examples(*v_los.EXAMPLES))(v_los.v_los)
+app.command(epilog=examples(*doctor.EXAMPLES))(doctor.doctor)
 
 
 def main() -> None:

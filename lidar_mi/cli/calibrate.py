@@ -10,9 +10,9 @@ from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.errors import InputError
 
 EXAMPLES = (
-    "Examples: `lidar-mi calibrate laser_*.tif --instrument my_etalon.yaml -o etalon.nc` - "
-    "`lidar-mi calibrate laser.tif --line '404.7708 nm=lamp.tif' --gap-tolerance '20 um'` - "
-    "`lidar-mi calibrate laser.fits --flat white.fits --set doppler.camera.pixel='5.5 um'`"
+    "lidar-mi calibrate laser_*.tif --instrument my_etalon.yaml -o etalon.nc",
+    "lidar-mi calibrate laser.tif --line '404.7708 nm=lamp.tif' --gap-tolerance '20 um'",
+    "lidar-mi calibrate laser.fits --flat white.fits --set doppler.camera.pixel='5.5 um'",
 )
 
 

@@ -12,7 +12,7 @@ import typer
 from rich.live import Live
 from rich.table import Table as RichTable
 
-from lidar_mi.cli.options import Device, complete_campaign, quantity
+from lidar_mi.cli.options import Device, complete_campaign, examples, quantity
 from lidar_mi.cli.terminal import errors, output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from lidar_mi.campaign.folder import CampaignFolder
 
 EXAMPLES = (
-    "Examples: `lidar-mi campaign run design_map --quick` - "
-    "`lidar-mi campaign run my.yaml -o outputs/mine --workers 8` - "
-    "`lidar-mi campaign run my.yaml --scheduler tcp://host:8786` - "
-    "`lidar-mi campaign status outputs/mine`"
+    "lidar-mi campaign run design_map --quick",
+    "lidar-mi campaign run my.yaml -o outputs/mine --workers 8",
+    "lidar-mi campaign run my.yaml --scheduler tcp://host:8786",
+    "lidar-mi campaign status outputs/mine",
 )
 
 LINE_EVERY = 10.0
@@ -35,13 +35,13 @@ app = typer.Typer(
     help="Run many experiments, on this machine or on many, and map their results.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    epilog=EXAMPLES,
+    epilog=examples(*EXAMPLES),
 )
 
 Folder = Annotated[Path, typer.Argument(help="Folder of the campaign.")]
 
 
-@app.command(epilog=EXAMPLES)
+@app.command(epilog=examples(*EXAMPLES))
 def run(
     campaign: Annotated[
         str,

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from lidar_mi.experiment.schema.experiment import Experiment
 
 EXAMPLES = (
-    "Examples: `lidar-mi check wake_sensor` - `lidar-mi check wake_sensor --forecast` - "
-    "`lidar-mi check my_wake.yaml --set scan.range='200 m'`"
+    "lidar-mi check wake_sensor",
+    "lidar-mi check wake_sensor --forecast",
+    "lidar-mi check my_wake.yaml --set scan.range='200 m'",
 )
 
 

@@ -5,11 +5,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-EXAMPLES = "Example: `lidar-mi doctor` (exit code 0: all requirements are met)"
+EXAMPLES = ("lidar-mi doctor",)
 
 
 def doctor() -> None:
-    """Check what this machine can run, and list what to install for the rest."""
+    """Check what this machine can run, and list what to install for the rest.
+
+    Exit code 0: all requirements are met.
+    """
     from lidar_mi.system.doctor import doctor as examine
 
     console = Console()

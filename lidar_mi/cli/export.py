@@ -9,8 +9,8 @@ from lidar_mi.cli.options import starting
 from lidar_mi.cli.terminal import output
 
 EXAMPLES = (
-    "Examples: `lidar-mi export outputs/wake_sensor` - "
-    "`lidar-mi export outputs/wake_sensor --format csv -o tables`"
+    "lidar-mi export outputs/wake_sensor",
+    "lidar-mi export outputs/wake_sensor --format csv -o tables",
 )
 
 

@@ -14,9 +14,10 @@ from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
 
 EXAMPLES = (
-    "Examples: `lidar-mi fly encounter` - `lidar-mi fly encounter --mode perfect` - "
-    "`lidar-mi fly --replay outputs/encounter --set encounter.aircraft.aileron_rate='20 deg/s'` - "
-    "`lidar-mi fly my.yaml -o outputs/mine --set encounter.path.crossing_angle='30 deg'`"
+    "lidar-mi fly encounter",
+    "lidar-mi fly encounter --mode perfect",
+    "lidar-mi fly --replay outputs/encounter --set encounter.aircraft.aileron_rate='20 deg/s'",
+    "lidar-mi fly my.yaml -o outputs/mine --set encounter.path.crossing_angle='30 deg'",
 )
 
 

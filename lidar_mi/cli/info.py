@@ -21,9 +21,10 @@ COLLECTED = "campaign.nc"
 """Its data set."""
 
 EXAMPLES = (
-    "Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr` - "
-    "`lidar-mi info spheroids` - `lidar-mi info molecules --wavelength '355 nm' "
-    "--altitude '8500 m'`"
+    "lidar-mi info outputs/wake_backscatter",
+    "lidar-mi info image_t1.exr",
+    "lidar-mi info spheroids",
+    "lidar-mi info molecules --wavelength '355 nm' --altitude '8500 m'",
 )
 
 

@@ -67,6 +67,38 @@ def complete_method(incomplete: str) -> list[str]:
     return starting(incomplete, (method.value for method in ImageMethod))
 
 
+def complete_shipped(incomplete: str) -> list[str]:
+    """Experiments of the package."""
+    from lidar_mi.experiment.shipped import experiments
+
+    return starting(incomplete, experiments())
+
+
+def complete_key(incomplete: str) -> list[str]:
+    """Keys and sections of an experiment file."""
+    from lidar_mi.experiment.schema.keys import OF_A_FILE, names
+
+    return starting(incomplete, [*names(), *OF_A_FILE])
+
+
+def complete_change(incomplete: str) -> list[str]:
+    """``KEY=`` of every key of an experiment file; after it, the words that the key may be."""
+    from lidar_mi.experiment.schema.keys import explain, settable
+
+    keys = settable()
+    key, equals, _ = incomplete.partition("=")
+    if not equals:
+        return starting(incomplete, [f"{name}=" for name in keys])
+    words = explain(key).words if key in keys else ()
+    return starting(incomplete, [f"{key}={word}" for word in words])
+
+
+def examples(*commands: str) -> str:
+    """The end of a command's help: command lines, each as an item of a list (Markdown)."""
+    title = "Examples:" if commands[1:] else "Example:"
+    return "\n\n".join([title, *(f"- `{command}`" for command in commands)])
+
+
 _HELP = "Experiment file, or the name of a shipped one."
 ExperimentName = Annotated[str, typer.Argument(help=_HELP, autocompletion=_complete_experiment)]
 RunName = Annotated[str, typer.Argument(help=_HELP, autocompletion=complete_run)]
@@ -81,7 +113,9 @@ Changes = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Change a key of the file, as often as needed: --set scan.range='400 m'.",
+        help="Change a key of the file, as often as needed: --set scan.range='400 m'. See "
+        "`lidar-mi explain`.",
+        autocompletion=complete_change,
     ),
 ]
 Variant = Annotated[

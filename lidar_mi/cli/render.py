@@ -10,7 +10,7 @@ from lidar_mi.cli.terminal import output
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
 
-EXAMPLES = "Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`"
+EXAMPLES = ("lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr",)
 
 
 def render(

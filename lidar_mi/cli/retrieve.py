@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 EXAMPLES = (
-    "Examples: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc` - "
-    "`lidar-mi retrieve frame_*.tif --dt 0.1 --spacing 0.5 --pairs all` - "
-    "`lidar-mi retrieve stack.tif --frame 3,4 --dt 0.1 --spacing 0.5 -o wind.csv`"
+    "lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc",
+    "lidar-mi retrieve frame_*.tif --dt 0.1 --spacing 0.5 --pairs all",
+    "lidar-mi retrieve stack.tif --frame 3,4 --dt 0.1 --spacing 0.5 -o wind.csv",
 )
 
 _SAME = 1e-3

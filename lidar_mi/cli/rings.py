@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     import numpy as np
 
 EXAMPLES = (
-    "Examples: `lidar-mi rings fringes.png` - `lidar-mi rings frame.exr --layer Y "
-    "--centre 479.5 389.5 -o frame_rings.png` - `lidar-mi rings cube.fits --all -o series.csv` - "
-    '`lidar-mi rings lamp.tif --wavelength "487.986 nm" "487.873 nm" --gap "0.9 mm" "0.1 mm"`'
+    "lidar-mi rings fringes.png",
+    "lidar-mi rings frame.exr --layer Y --centre 479.5 389.5 -o frame_rings.png",
+    "lidar-mi rings cube.fits --all -o series.csv",
+    'lidar-mi rings lamp.tif --wavelength "487.986 nm" "487.873 nm" --gap "0.9 mm" "0.1 mm"',
 )
 
 

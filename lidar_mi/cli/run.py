@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from lidar_mi.experiment.schema.experiment import Experiment
 
 EXAMPLES = (
-    "Examples: `lidar-mi run wake_backscatter.yaml` (a shipped experiment) - "
-    "`lidar-mi run my.yaml -o outputs/calm --set wake.texture.rms=0 --set seed=7`"
+    "lidar-mi run wake_backscatter",
+    "lidar-mi run my.yaml -o outputs/calm --set wake.texture.rms=0 --set seed=7",
 )
 
 

@@ -11,8 +11,9 @@ from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.errors import InputError
 
 EXAMPLES = (
-    "Examples: `lidar-mi v_los air_*.tif --reference laser.tif --calibration etalon.nc "
-    "--instrument my_etalon.yaml` - `lidar-mi v_los air.fits --calibration etalon.nc -o v.nc`"
+    "lidar-mi v_los air_*.tif --reference laser.tif --calibration etalon.nc "
+    "--instrument my_etalon.yaml",
+    "lidar-mi v_los air.fits --calibration etalon.nc -o v.nc",
 )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lidar_mi.errors import InputError
+from lidar_mi.io.text import read_text
 from lidar_mi.io.yaml import read_yaml
 
 
@@ -49,6 +50,32 @@ def flights() -> list[str]:
     }:
         found |= more
     return sorted(found)
+
+
+def described(name: str) -> tuple[str, str]:
+    """The question of a shipped experiment or campaign, and what it needs.
+
+    They are the first two lines of its file, ``# QUESTION`` and ``# Needs NEEDS.``.
+
+    Raises
+    ------
+    InputError
+        There is none of this name.
+    """
+    path = _found_shipped(name, [_EXPERIMENT, _CAMPAIGN])
+    question, needs = read_text(path, "an experiment file").splitlines()[:2]
+    return question.removeprefix("# "), needs.removeprefix("# Needs ").removesuffix(".")
+
+
+def shipped_file(name: str) -> Path:
+    """The file of a shipped experiment, whatever the working folder holds.
+
+    Raises
+    ------
+    InputError
+        There is none of this name; the message lists them.
+    """
+    return _found_shipped(name, [_EXPERIMENT])
 
 
 def scenes() -> list[str]:
@@ -127,6 +154,11 @@ def _found(name: str | Path, kinds: Sequence[_Kind]) -> Path:
             return path
     except OSError as error:  # a name that is too long
         raise InputError(f"{name}: {error.strerror}; expected {kinds[0].called}") from None
+    return _found_shipped(name, kinds)
+
+
+def _found_shipped(name: str | Path, kinds: Sequence[_Kind]) -> Path:
+    path = Path(name)
     for kind in kinds:
         file = path.name if path.suffix == kind.suffix else f"{path.name}{kind.suffix}"
         shipped = _folder(kind) / file

@@ -95,7 +95,9 @@ class DopplerLidar(Description):
         description="of the backscattered photons",
         validation_alias=AliasChoices("aerosol_fraction", "aerosol_share"),  # its former name
     )
-    line_shape: Literal["rayleigh", "rayleigh_brillouin"] = "rayleigh_brillouin"
+    line_shape: Literal["rayleigh", "rayleigh_brillouin"] = Field(
+        "rayleigh_brillouin", description="spectral line of the molecular backscatter"
+    )
     sky_radiance: Annotated[SpectralRadiance, Within(0, 1e14, "the disc of the sun has 3e13")] = (
         Field(quantity("0.18 W/m^2/sr/nm"), description="background")
     )

@@ -45,7 +45,9 @@ class DopplerScan(Description):
     )
     azimuth_half: HalfAngle = Field(quantity("21.5 deg"), description="of the outermost directions")
     elevation_half: HalfAngle = Field(quantity("14 deg"), description="of the outermost directions")
-    gates: Literal["planar", "spherical"] = "planar"
+    gates: Literal["planar", "spherical"] = Field(
+        "planar", description="middles of the range bins in a plane, or at the same distance"
+    )
 
     def directions(self) -> np.ndarray:
         """Unit vectors, (rows * columns, 3), row by row from the top left."""

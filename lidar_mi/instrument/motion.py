@@ -32,12 +32,14 @@ TrueFrequency = Annotated[
 class Sinusoid(Description):
     """A vibration of one axis: amplitude times sin(2 pi frequency t + phase)."""
 
-    axis: Literal["x", "y", "z", "roll", "pitch", "yaw"]
+    axis: Literal["x", "y", "z", "roll", "pitch", "yaw"] = Field(description="what vibrates")
     amplitude: Annotated[float, Within(0, 1000, "larger ones are no vibration")] = Field(
         description="m, or an angle with its unit"
     )
-    frequency: TrueFrequency
-    phase: Annotated[Angle, Within(-1000, 1000, "a turn is enough")] = Field(0.0)
+    frequency: TrueFrequency = Field(description="of the vibration")
+    phase: Annotated[Angle, Within(-1000, 1000, "a turn is enough")] = Field(
+        0.0, description="of the sine at the first scan"
+    )
 
     @field_validator("amplitude", mode="before")
     @classmethod

@@ -27,34 +27,34 @@ _TurnRms = Annotated[Angle, Within(0, 0.3, "larger errors are no errors of an at
 class Offset(Description):
     """Constant errors."""
 
-    x: _Place = 0.0
-    y: _Place = 0.0
-    z: _Place = 0.0
-    roll: _Turn = 0.0
-    pitch: _Turn = 0.0
-    yaw: _Turn = 0.0
+    x: _Place = Field(0.0, description="constant error")
+    y: _Place = Field(0.0, description="constant error")
+    z: _Place = Field(0.0, description="constant error")
+    roll: _Turn = Field(0.0, description="constant error")
+    pitch: _Turn = Field(0.0, description="constant error")
+    yaw: _Turn = Field(0.0, description="constant error")
 
 
 class Drift(Description):
     """Errors that grow with time, from 0 at the first scan."""
 
-    x: _PlaceRate = 0.0
-    y: _PlaceRate = 0.0
-    z: _PlaceRate = 0.0
-    roll: _TurnRate = 0.0
-    pitch: _TurnRate = 0.0
-    yaw: _TurnRate = 0.0
+    x: _PlaceRate = Field(0.0, description="error per second since the first scan")
+    y: _PlaceRate = Field(0.0, description="error per second since the first scan")
+    z: _PlaceRate = Field(0.0, description="error per second since the first scan")
+    roll: _TurnRate = Field(0.0, description="error per second since the first scan")
+    pitch: _TurnRate = Field(0.0, description="error per second since the first scan")
+    yaw: _TurnRate = Field(0.0, description="error per second since the first scan")
 
 
 class Noise(Description):
     """Rms of random errors."""
 
-    x: _PlaceRms = 0.0
-    y: _PlaceRms = 0.0
-    z: _PlaceRms = 0.0
-    roll: _TurnRms = 0.0
-    pitch: _TurnRms = 0.0
-    yaw: _TurnRms = 0.0
+    x: _PlaceRms = Field(0.0, description="rms of the random error")
+    y: _PlaceRms = Field(0.0, description="rms of the random error")
+    z: _PlaceRms = Field(0.0, description="rms of the random error")
+    roll: _TurnRms = Field(0.0, description="rms of the random error")
+    pitch: _TurnRms = Field(0.0, description="rms of the random error")
+    yaw: _TurnRms = Field(0.0, description="rms of the random error")
 
 
 class Reported(Description):

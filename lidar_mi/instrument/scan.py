@@ -36,15 +36,21 @@ class Scan(Description):
     0.3 m/s at the image's corners.
     """
 
-    aim: Literal["grid", "angles"] = "grid"
+    aim: Literal["grid", "angles"] = Field(
+        "grid", description="beams through the nodes of the wake's grid, or at equidistant angles"
+    )
     range: Annotated[
         Length, Within(0.1, 100000, "from a wind tunnel to the top of the atmosphere")
     ] = Field(500.0, description="distance of the first gate's start at t1")
     thickness: Annotated[
         Length, Within(0.001, 100000, "from a pulse of 7 ps to all of the atmosphere")
     ] = Field(2.5, description="depth of all gates together")
-    gates: Literal["planar", "spherical"] = "planar"
-    gate_count: Annotated[int, Within(1, 10000, "10 m each through all of the atmosphere")] = 1
+    gates: Literal["planar", "spherical"] = Field(
+        "planar", description="shape of the gates: planes across x, or shells of equal range"
+    )
+    gate_count: Annotated[int, Within(1, 10000, "10 m each through all of the atmosphere")] = Field(
+        1, description="number of equal gates in the thickness; image pairs are of the first one"
+    )
     follow: Annotated[Speed, Within(-1000, 1000, "the fastest jets")] = Field(
         0.0, description="wind along x with which the gates go along from scan to scan"
     )
@@ -57,8 +63,14 @@ class Scan(Description):
     rows: Annotated[int, Within(1, 10**7, "an image has at most 1e7 beams")] = Field(
         139, description="beams up, with aim: angles"
     )
-    azimuth_half: tuple[HalfAngle, HalfAngle] = (quantity("6.2 deg"), quantity("6.4 deg"))
-    elevation_half: tuple[HalfAngle, HalfAngle] = (quantity("3.9 deg"), quantity("4.1 deg"))
+    azimuth_half: tuple[HalfAngle, HalfAngle] = Field(
+        (quantity("6.2 deg"), quantity("6.4 deg")),
+        description="half angle in azimuth of the first and the second scan, with aim: angles",
+    )
+    elevation_half: tuple[HalfAngle, HalfAngle] = Field(
+        (quantity("3.9 deg"), quantity("4.1 deg")),
+        description="half angle in elevation of the first and the second scan, with aim: angles",
+    )
     timing: ScanTiming | None = Field(
         None, description="when each beam is sent; default: all at once"
     )

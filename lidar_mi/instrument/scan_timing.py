@@ -85,7 +85,9 @@ class ScanTiming(Description):
     in a scan, over the largest circle in the field. ``table``: times and directions of a file.
     """
 
-    pattern: Literal["raster", "serpentine", "lissajous", "risley", "table"] = "serpentine"
+    pattern: Literal["raster", "serpentine", "lissajous", "risley", "table"] = Field(
+        "serpentine", description="order of the beams"
+    )
     duration: Annotated[Time, Within(0, 10000, "the life of a wake")] | None = Field(
         None, description="of a scan, with its turns; 0: all beams at once"
     )

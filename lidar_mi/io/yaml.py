@@ -113,6 +113,12 @@ def read_yaml(path: str | Path, expected: str) -> Any:
     return parse_yaml(read_text(path, expected, LONGEST), str(path))
 
 
+def to_yaml_line(value: Any) -> str:
+    """A plain value as YAML text in one line: ``[cc, ws]``, ``500 m``, ``{}``."""
+    text = yaml.dump(value, Dumper=_DUMPER, sort_keys=False, default_flow_style=True, width=10**6)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
 def to_yaml(data: Any) -> str:
     """Plain data as YAML text, keys in the order in which they are."""
     try:

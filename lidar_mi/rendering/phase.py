@@ -1,6 +1,7 @@
 """Mitsuba phase function and albedo for the scattering of an experiment."""
 
 import math
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -14,6 +15,8 @@ from lidar_mi.io.scattering_table import aerosol_table, is_complete, read_table
 
 Keys: TypeAlias = Any
 """Keys of the section ``scattering``, or of one of its parts; their schema is in a room above."""
+
+_SHIPPED = Path(str(files("lidar_mi.scenes")))
 
 
 class Scatterer(NamedTuple):
@@ -134,20 +137,28 @@ def backscatter_phase_function(air: Scatterer) -> float:
 def table_files(scattering: Keys, folder: str | Path = ".") -> dict[str, Path]:
     """The table files that an experiment names, by the field that names them.
 
+    They are searched in the folder, then among those of the package.
+
     Raises
     ------
     InputError
         One of them does not exist.
     """
     named = {f"scattering.parts.{k}.table": part for k, part in enumerate(scattering.parts or ())}
-    files = {}
+    found = {}
     for field, part in ({"scattering.table": scattering} | named).items():
         if part.table is not None:
-            path = Path(folder) / part.table
-            if not path.is_file():
-                raise InputError(f"{field}: {path} not found; expected a scattering-matrix file")
-            files[field] = path.resolve()
-    return files
+            found[field] = _table_file(part.table, folder, field).resolve()
+    return found
+
+
+def _table_file(name: str, folder: str | Path, field: str) -> Path:
+    """A table in a folder, or else among those of the package."""
+    path = Path(folder) / name
+    for candidate in (path, _SHIPPED / name):
+        if candidate.is_file():
+            return candidate
+    raise InputError(f"{field}: {path} not found; expected a scattering-matrix file")
 
 
 def _table(
@@ -162,7 +173,7 @@ def _table(
             return molecular_table(wavelength, band=part.band)
         case "aerosol":
             return aerosol_table(part.aerosol, wavelength, notice)
-    path = Path(folder) / part.table
+    path = _table_file(part.table, folder, f"{field}.table")
     table = read_table(path)
     if not math.isclose(table.wavelength, wavelength, rel_tol=1e-6):
         raise InputError(

@@ -34,7 +34,9 @@ SAMPLES_PER_GATE = 64
 class RenderSettings(Description):
     """Settings of the light transport."""
 
-    variant: Variant = "llvm_ad_mono_polarized"
+    variant: Variant = Field(
+        "llvm_ad_mono_polarized", description="Mitsuba variant: device and what a ray carries"
+    )
     samples_per_beam: (
         Literal["auto"]
         | Annotated[int, Within(2, 2**31 - 1, "a standard error needs two; counted in 31 bits")]
@@ -48,7 +50,11 @@ class RenderSettings(Description):
     max_order: Annotated[int, Within(1, 64, "higher orders are below single precision")] = Field(
         4, description="scattering orders; 1 = single scattering"
     )
-    estimator: Literal["gated", "analog"] = "gated"
+    estimator: Literal["gated", "analog"] = Field(
+        "gated",
+        description="forced collisions in the gates, or analog sampling, which needs a thousand "
+        "times as many samples or more for the same noise",
+    )
     samples_per_pass: _PerPass = Field(
         1 << 22,
         description="traced at once, fewer if memory does not hold them; by default on a GPU as "
@@ -80,7 +86,9 @@ class RenderSettings(Description):
 class FringeSettings(Description):
     """Settings of the rendering of a fringe camera's rings."""
 
-    variant: Variant = "llvm_ad_mono_polarized"
+    variant: Variant = Field(
+        "llvm_ad_mono_polarized", description="Mitsuba variant: device and what a ray carries"
+    )
     samples_per_pixel: Annotated[
         int, Within(2, 2**20 - 1, "a standard error needs two; it is then 0.1 %")
     ] = Field(16, description="light paths, on average")
@@ -90,7 +98,9 @@ class FringeSettings(Description):
     line_shape: Literal["folded", "sampled"] = Field(
         "folded", description="mean over the line in closed form; a frequency for every path"
     )
-    lens: Literal["ideal", "singlet"] = "ideal"
+    lens: Literal["ideal", "singlet"] = Field(
+        "ideal", description="ideal, or a singlet of two surfaces with its aberrations"
+    )
     stop_radius: Annotated[Length, Within(1e-6, 1, "from a pinhole to the largest lens")] = Field(
         5e-3, description="of the light into the lens"
     )

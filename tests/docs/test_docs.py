@@ -25,6 +25,7 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
+from lidar_mi.experiment import shipped
 from lidar_mi.experiment.schema import air, reading, scattering, wake
 from lidar_mi.experiment.schema import experiment as schema
 from lidar_mi.experiment.truth import extinction as truth
@@ -265,6 +266,13 @@ def _value(name, model, *given):
     for part in name.split("."):
         found = getattr(found, part)
     return found
+
+
+@pytest.mark.parametrize("name", [*shipped.experiments(), *shipped.campaigns()])
+def test_an_experiment_has_the_question_of_its_file(name):
+    question = shipped.described(name)[0]
+    row = f"| [{name}]({name}.md) | {question[0].lower()}{question[1:]} |"
+    assert row in (DOCS / "experiments" / "index.md").read_text().splitlines()
 
 
 def test_variants_are_documented():

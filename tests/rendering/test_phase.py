@@ -10,7 +10,7 @@ import pytest
 from lidar_mi.atmosphere.molecules import molecular_scattering
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.scattering import Scattering
-from lidar_mi.io.scattering_table import aerosol_table, write_table
+from lidar_mi.io.scattering_table import aerosol_table, is_complete, write_table
 from lidar_mi.rendering.phase import backscatter_phase_function, loadable, scatterer, table_files
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -42,6 +42,16 @@ def test_table_is_found_beside_the_experiment(tmp_path):
     found = scatterer(Scattering(phase="table", table="table.txt"), tmp_path)
     assert found.albedo == 1  # the file says nothing of it
     assert backscatter_phase_function(found) == pytest.approx(1 / (4 * np.pi), rel=1e-3)
+
+
+def test_table_is_found_among_those_shipped(tmp_path):
+    """One of the same name in the folder comes first."""
+    name = "aerosol_dust_532nm.txt"
+    asked = Scattering(phase="table", table=name)
+    path = table_files(asked, tmp_path)["scattering.table"]
+    assert path.name == name and path.parent != tmp_path.resolve() and is_complete(path)
+    (tmp_path / name).write_text("mine")
+    assert table_files(asked, tmp_path)["scattering.table"] == (tmp_path / name).resolve()
 
 
 def test_missing_table_is_named(tmp_path):

@@ -10,6 +10,11 @@ from lidar_mi.cli import app as cli
 from lidar_mi.system.doctor import Check, Checkup
 from tests.support.command_line import TINY, shell, words_of
 
+COMMANDS = (
+    *("list", "new", "explain", "run", "fly", "check", "render", "retrieve", "export", "info"),
+    *("aerosol", "rings", "calibrate", "v_los", "campaign", "doctor"),
+)
+
 
 def test_the_command_is_installed():
     (script,) = [s for s in entry_points(group="console_scripts") if s.name == "lidar-mi"]
@@ -25,13 +30,11 @@ def test_version_in_a_fresh_process():
 def test_help_names_every_command(lidar_mi):
     code, out, _ = lidar_mi("--help")
     assert code == 0
-    for command in ("run", "check", "render", "retrieve", "export", "info", "aerosol", "doctor"):
+    for command in COMMANDS:
         assert re.search(rf"^│ {command} ", out, re.MULTILINE)
 
 
-@pytest.mark.parametrize(
-    "command", ["run", "check", "render", "retrieve", "export", "info", "aerosol", "doctor"]
-)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_teaches_by_example(lidar_mi, command):
     code, out, _ = lidar_mi(command, "--help")
     assert code == 0
@@ -48,7 +51,7 @@ def test_examples_of_the_help_can_be_typed(there, lidar_mi, quick):
     _, out, _ = lidar_mi("run", "--help")
     assert "run my.yaml -o outputs/calm --set wake.texture.rms=0 --set seed=7" in words_of(out)
     _, out, _ = lidar_mi("render", "--help")
-    typed = re.search(r"Example: lidar-mi (render .*?\.exr)", words_of(out))[1]
+    typed = re.search(r"Example: • lidar-mi (render .*?\.exr)", words_of(out))[1]
     assert lidar_mi(*typed.split())[0] == 0
     assert (there / "slab.exr").is_file()
 

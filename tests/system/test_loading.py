@@ -68,6 +68,26 @@ def test_check(name):
     assert ("h5py" in loaded) == name.startswith("wake")
 
 
+def test_list():
+    """The files' first lines alone, and YAML for what is flown."""
+    assert not modules_of_command("list") & (COMPUTING | READING | DESCRIBING)
+
+
+# a wavelength is shown in nm by pint, which loads what it finds of two others
+@pytest.mark.parametrize(
+    ("arguments", "rare"),
+    [
+        (("explain", "scan.gates"), set()),
+        (("explain", "lidar"), {"pint", "dask", "jinja2"}),
+        (("explain", "scan.gate"), set()),
+        (("new", "mine"), set()),
+    ],
+)
+def test_keys(tmp_path, arguments, rare):
+    loaded = modules_of_command(*arguments, cwd=tmp_path)
+    assert not loaded & (COMPUTING | READING - rare) and "pydantic" in loaded
+
+
 @pytest.mark.parametrize("what", ["spheroids", "molecules"])
 def test_info_of_a_scatterer(what):
     loaded = modules_of_command("info", what)

@@ -13,11 +13,13 @@ _Place = Annotated[Length, Within(-1e5, 1e5, "an encounter")]
 class Turbulence(Section):
     """Isotropic turbulence; rms and length of a standard, or one's own."""
 
-    spectrum: Literal["von_karman", "kolmogorov"] = "von_karman"
+    spectrum: Literal["von_karman", "kolmogorov"] = Field(
+        "von_karman", description="energy spectrum; both have the same rms and inertial range"
+    )
     standard: Literal["mil_f_8785c", "cs_25"] = Field(
         "mil_f_8785c", description="of rms and length; cs_25 has a length alone"
     )
-    level: Literal["light", "moderate", "severe"] = "moderate"
+    level: Literal["light", "moderate", "severe"] = Field("moderate", description="of mil_f_8785c")
     sigma: Annotated[Speed, Within(0, 30, "severe storms have 9 m/s")] | None = Field(
         None, description="rms of one component; default: that of the standard at this level"
     )
@@ -52,7 +54,7 @@ class Turbulence(Section):
 class Gust(Section):
     """A discrete 1-cosine gust of CS 25.341."""
 
-    direction: Literal["up", "down", "left", "right"] = "up"
+    direction: Literal["up", "down", "left", "right"] = Field("up", description="in which it blows")
     gradient: Annotated[Length, Within(1, 1000, "CS 25.341 has 9 to 107 m")] = Field(
         50.0, description="half of its length"
     )

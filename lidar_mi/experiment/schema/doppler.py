@@ -22,8 +22,13 @@ class RingRetrieval(Section):
     methods: tuple[RingMethod, ...] = Field(
         (RingMethod.ANNULAR, RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG),
         min_length=1,
+        description="of the ring analysis",
     )
-    centre: tuple[RingCentre, ...] = Field((RingCentre.FREE, RingCentre.KNOWN), min_length=1)
+    centre: tuple[RingCentre, ...] = Field(
+        (RingCentre.FREE, RingCentre.KNOWN),
+        min_length=1,
+        description="of the rings: retrieved from each image, or known",
+    )
     averaged: tuple[Annotated[int, Within(1, 10000, "100 s of pulses at 100 Hz")], ...] = Field(
         (1, 5, 20), min_length=1, description="numbers of images averaged before the retrieval"
     )

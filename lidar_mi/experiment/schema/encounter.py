@@ -71,7 +71,9 @@ class Path(Section):
 class Crow(Section):
     """Sinusoidal deformation of both vortices, in planes inclined by 45 degrees (Crow 1970)."""
 
-    amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = 0.0
+    amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = Field(
+        0.0, description="of the deformation"
+    )
     wavelength: Annotated[Length, Within(1, 100000, "8.6 separations")] | None = Field(
         None, description="default: 8.6 separations"
     )
@@ -98,14 +100,22 @@ class Aircraft(Section):
     model: str = Field(
         "roll", description="roll: rigid, rolls only; else an aircraft of JSBSim, such as 737"
     )
-    span: Annotated[Length, Within(1, 200, "aircraft")] = 28.9
-    wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = 108.8
-    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = 8.0e5
+    span: Annotated[Length, Within(1, 200, "aircraft")] = Field(28.9, description="of the wing")
+    wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = Field(
+        108.8, description="of the aircraft"
+    )
+    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = Field(
+        8.0e5, description="moment of inertia about the roll axis"
+    )
     lift_slope: Annotated[Number, Within(1, 6.2832, "thin wings, per rad")] = Field(
         5.3, description="of the wing's sections"
     )
-    largest_aileron: Annotated[Angle, Within(0.001, 1, "aircraft")] = Field(quantity("20 deg"))
-    aileron_rate: Annotated[AngularRate, Within(0.001, 100, "actuators")] = quantity("50 deg/s")
+    largest_aileron: Annotated[Angle, Within(0.001, 1, "aircraft")] = Field(
+        quantity("20 deg"), description="largest deflection"
+    )
+    aileron_rate: Annotated[AngularRate, Within(0.001, 100, "actuators")] = Field(
+        quantity("50 deg/s"), description="largest rate of all controls"
+    )
     aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
         0.1, description="rolling moment coefficient per rad of deflection"
     )
@@ -144,7 +154,9 @@ class Encounter(Section):
     path: Path = Path()
     wake: WakeInTime = WakeInTime()
     air: Air | None = Field(None, description="beside the wake, or in its place; default: at rest")
-    rate: Annotated[Frequency, Within(0.1, 1000, "slabs a second")] = 10.0
+    rate: Annotated[Frequency, Within(0.1, 1000, "slabs a second")] = Field(
+        10.0, description="scans per second"
+    )
     look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
         150.0, description="range of the farther gate's start"
     )

@@ -37,8 +37,10 @@ NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
 class Experiment(Tabular, Section):
     """One experiment: a wake for the backscatter lidar, a Doppler lidar, or both."""
 
-    name: str = Field(pattern=f"^{NAME}$")
-    seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] = 1
+    name: str = Field(pattern=f"^{NAME}$", description="of the run and of its folder")
+    seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] = Field(
+        1, description="of the texture and of the Monte Carlo samples"
+    )
     device: Literal["auto", "cpu", "cuda"] | None = Field(
         None,
         description="that renders and retrieves; default: rendering by the variants, retrieval on "

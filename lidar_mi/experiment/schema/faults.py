@@ -6,7 +6,11 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from lidar_mi.experiment.schema.section import section_in
 from lidar_mi.units import Unit, Within, to_si
+
+A_NAME = "at most 100 letters, digits, _, . and -, a letter or digit first"
+"""What the only pattern allows, that of names."""
 
 
 def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
@@ -60,7 +64,7 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     elif fault["type"].startswith("model_"):
         expected = f"a section with keys out of {', '.join(_keys_at(model, fault['loc']))}"
     elif fault["type"] == "string_pattern_mismatch":
-        expected = "at most 100 letters, digits, _, . and -, a letter or digit first"
+        expected = A_NAME
     elif fault["type"] in ("tuple_type", "list_type"):
         count = _length_at(model, fault["loc"])
         example = ", ".join([str(value)] * count) if isinstance(value, str | int | float) else ""
@@ -84,7 +88,7 @@ def _metadata_at(model: Any, location: tuple[int | str, ...], kind: type) -> Any
     for part in location:
         if model and part in model.model_fields:
             field = model.model_fields[part]
-            model = _section(field.annotation)
+            model = section_in(field.annotation)
     pending = [field.annotation, *field.metadata] if field else []
     while pending:
         part = pending.pop()
@@ -100,7 +104,7 @@ def _length_at(model: Any, location: tuple[int | str, ...]) -> int:
     for part in location:
         if model and part in model.model_fields:
             annotation = model.model_fields[part].annotation
-            model = _section(annotation)
+            model = section_in(annotation)
     for one in (annotation, *get_args(annotation)):
         if get_origin(one) is tuple and Ellipsis not in get_args(one):
             return len(get_args(one))
@@ -110,12 +114,5 @@ def _length_at(model: Any, location: tuple[int | str, ...]) -> int:
 def _keys_at(model: Any, location: tuple[int | str, ...]) -> list[str]:
     for part in location:
         if model and part in model.model_fields:
-            model = _section(model.model_fields[part].annotation)
+            model = section_in(model.model_fields[part].annotation)
     return list(model.model_fields)
-
-
-def _section(annotation: Any) -> type[BaseModel] | None:
-    """The model in an annotation such as ``tuple[Model, ...] | None``."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next(filter(None, map(_section, get_args(annotation))), None)

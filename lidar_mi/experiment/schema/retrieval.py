@@ -36,14 +36,29 @@ class Retrieval(Section):
     """How winds are retrieved from the image pair."""
 
     methods: tuple[ImageMethod, ...] = Field(
-        (ImageMethod.VARIATIONAL, ImageMethod.CC), min_length=1
+        (ImageMethod.VARIATIONAL, ImageMethod.CC),
+        min_length=1,
+        description="cross-correlation, weight shift, multi-pass correlation, a smooth flow or a "
+        "vortex pair fitted to the whole images",
     )
-    template: Annotated[int, Within(2, 4096, "wider than any image")] = 8
-    search: Annotated[int, Within(4, 8192, "wider than any image")] = 16
-    stride: Annotated[int, Within(1, 8192, "wider than any image")] = 1
-    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = 0.5
-    min_texture: Annotated[Number, Within(0, 1000, "noise without signal has about 1")] = 0.01
-    min_isotropy: Annotated[Number, Within(0, 1, "definition of a ratio")] = 0.2
+    template: Annotated[int, Within(2, 4096, "wider than any image")] = Field(
+        8, description="side of the template, pixels"
+    )
+    search: Annotated[int, Within(4, 8192, "wider than any image")] = Field(
+        16, description="side of the search region, pixels; at least template + 2"
+    )
+    stride: Annotated[int, Within(1, 8192, "wider than any image")] = Field(
+        1, description="distance between vectors, pixels"
+    )
+    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = Field(
+        0.5, description="vectors of lower correlation are flagged (not of ws)"
+    )
+    min_texture: Annotated[Number, Within(0, 1000, "noise without signal has about 1")] = Field(
+        0.01, description="templates of lower relative gradient are flagged, 1/px"
+    )
+    min_isotropy: Annotated[Number, Within(0, 1, "definition of a ratio")] = Field(
+        0.2, description="templates with structure in one direction only are flagged"
+    )
     blur: Literal["beam"] | Annotated[Length, Within(0, 1000, "the widest beam")] = Field(
         0.0, description="standard deviation of the beam's blur, corrected by variational"
     )

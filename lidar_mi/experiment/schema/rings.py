@@ -48,15 +48,36 @@ class Reference(Section):
 class Assumed(Section):
     """What the retrieval takes for the instrument's, where that is not the true value."""
 
-    focal_length: Annotated[Length, Within(0.001, 100, "as of the camera")] | None = None
-    reflectivity: Annotated[Number, Within(1e-9, 0.999999, "as of the etalon")] | None = None
-    surface_rms: Annotated[Length, Within(0, 1e-6, "as of the etalon")] | None = None
-    order_fraction: Annotated[Number, Within(0, 1, "as of the etalon", "[)")] | None = None
-    bow: Annotated[Length, Within(0, 1e-4, "as of the etalon")] | None = None
-    illumination_radius: Annotated[Length, Within(1e-6, 1000, "1000 m is even light")] | None = None
-    tilt: tuple[_Tilt, _Tilt] | None = None
-    distortion: Annotated[Number, Within(-0.05, 0.05, "as of the camera")] | None = None
-    defocus: Annotated[Length, Within(0, 0.01, "as of the camera")] | None = None
+    focal_length: Annotated[Length, Within(0.001, 100, "as of the camera")] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
+    reflectivity: Annotated[Number, Within(1e-9, 0.999999, "as of the etalon")] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
+    surface_rms: Annotated[Length, Within(0, 1e-6, "as of the etalon")] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
+    order_fraction: Annotated[Number, Within(0, 1, "as of the etalon", "[)")] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
+    bow: Annotated[Length, Within(0, 1e-4, "as of the etalon")] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
+    illumination_radius: Annotated[Length, Within(1e-6, 1000, "1000 m is even light")] | None = (
+        Field(
+            None,
+            description="taken by the retrieval in place of the true one; default: the true one",
+        )
+    )
+    tilt: tuple[_Tilt, _Tilt] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
+    distortion: Annotated[Number, Within(-0.05, 0.05, "as of the camera")] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
+    defocus: Annotated[Length, Within(0, 0.01, "as of the camera")] | None = Field(
+        None, description="taken by the retrieval in place of the true one; default: the true one"
+    )
 
     def of(self, described: _Part) -> _Part:
         """A part of the instrument with the assumed values in place of its own."""

@@ -37,7 +37,9 @@ class _Scatterer(Section):
 class Part(_Scatterer):
     """One kind of scatterer in a mixture."""
 
-    phase: Literal["rayleigh", "molecules", "aerosol", "table"]
+    phase: Literal["rayleigh", "molecules", "aerosol", "table"] = Field(
+        description="kind of scatterer"
+    )
     fraction: Annotated[Number, Within(1e-9, 1e9, "only ratios count")] = Field(
         description="of the extinction, relative to the other parts",
         validation_alias=AliasChoices("fraction", "share"),  # its former name
@@ -49,7 +51,7 @@ class Scattering(_Scatterer):
 
     phase: Literal[
         "rayleigh", "molecules", "isotropic", "henyey_greenstein", "aerosol", "table", "mixture"
-    ] = "aerosol"
+    ] = Field("aerosol", description="phase function of slab and environment")
     asymmetry: Annotated[
         Number, Within(-0.999, 0.999, "at 0.999 the forward peak is 0.06 degrees wide")
     ] = Field(0.0, description="of Henyey-Greenstein")

@@ -13,14 +13,24 @@ class Volume(Section):
     """Wind in three dimensions, from all gates of both scans as two volumes."""
 
     methods: tuple[VolumeMethod, ...] = Field(
-        (VolumeMethod.CORRELATION, VolumeMethod.VARIATIONAL), min_length=1
+        (VolumeMethod.CORRELATION, VolumeMethod.VARIATIONAL),
+        min_length=1,
+        description="cross-correlation of separate windows, or a smooth flow fitted to the volumes",
     )
     template: Annotated[int, Within(4, 1024, "wider than any volume")] = Field(
         8, description="voxels along each side of a window"
     )
-    search: Annotated[int, Within(6, 2048, "wider than any volume")] = 16
-    stride: Annotated[int, Within(1, 2048, "wider than any volume")] = 4
-    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = 0.5
+    search: Annotated[int, Within(6, 2048, "wider than any volume")] = Field(
+        16,
+        description="side of the search region, voxels; the largest displacement is half of "
+        "search - template",
+    )
+    stride: Annotated[int, Within(1, 2048, "wider than any volume")] = Field(
+        4, description="distance between vectors, voxels"
+    )
+    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = Field(
+        0.5, description="vectors of lower correlation are flagged"
+    )
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:

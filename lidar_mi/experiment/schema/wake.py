@@ -27,16 +27,18 @@ _Moment = Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")
 class VortexPair(Section):
     """An analytic vortex pair in place of a simulation."""
 
-    model: Literal["lamb_oseen", "burnham_hallock"] = "lamb_oseen"
+    model: Literal["lamb_oseen", "burnham_hallock"] = Field(
+        "lamb_oseen", description="swirl profile"
+    )
     circulation: Annotated[
         Circulation, Within(1e-6, 10000, "the largest aircraft have 1000 m^2/s")
-    ] = 458.0
+    ] = Field(458.0, description="of each vortex")
     separation: Annotated[
         Length, Within(0.01, 1000, "from models in a tunnel to ten times the widest wing")
-    ] = 47.1
+    ] = Field(47.1, description="distance between the vortices")
     core_radius: Annotated[
         Length, Within(0.001, 100, "from models in a tunnel to wider than any wake's core")
-    ] = 3.0
+    ] = Field(3.0, description="radius of the largest tangential speed")
     width: _Extent = Field(109.0, description="extent of the domain in y")
     height: _Extent = Field(69.0, description="extent of the domain in z")
 
@@ -81,7 +83,9 @@ class Turbine(Section):
 class ExtinctionMapping(Section):
     """From tracers (or from the wind's speed) to the extinction coefficient."""
 
-    source: Literal["tracer", "speed"] = "tracer"
+    source: Literal["tracer", "speed"] = Field(
+        "tracer", description="extinction from tracer and aerosol, or from (v^2 + w^2)^(1/2)"
+    )
     tracer: str | None = Field("tracer", description="exhaust tracer, or null for none")
     aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
     background: Annotated[Extinction, Within(0, 10, "visibility is 0.3 m in the densest smoke")] = (
@@ -89,7 +93,10 @@ class ExtinctionMapping(Section):
     )
     maximum: Annotated[
         Extinction, Within(1e-12, 10, "from the thermosphere to the densest smoke")
-    ] = quantity("1.8 / km")
+    ] = Field(
+        quantity("1.8 / km"),
+        description="at the largest tracer concentration (or speed); above the background",
+    )
     molecules: Annotated[Extinction, Within(0, 0.1, "air at the ground has 0.03 / m at 100 nm")] = (
         Field(
             0.0, description="on top of it, in slab and environment: by air, which has no texture"
@@ -103,10 +110,12 @@ class ExtinctionMapping(Section):
 class Texture(Section):
     """Sub-grid aerosol texture, not resolved by a simulation's grid; rms 0: none."""
 
-    rms: Annotated[Number, Within(0, 2, "a log-normal field of 2 consists of few peaks")] = 0.1
+    rms: Annotated[Number, Within(0, 2, "a log-normal field of 2 consists of few peaks")] = Field(
+        0.1, description="of the relative texture of the extinction; 0: none"
+    )
     outer_scale: Annotated[
         Length, Within(0.001, 10000, "from the smallest eddies to the depth of the troposphere")
-    ] = 10.0
+    ] = Field(10.0, description="largest scale of the texture; at least two cells")
 
 
 class Wake(Section):
@@ -128,7 +137,7 @@ class Wake(Section):
     )
     spacing: Annotated[
         Length, Within(0.001, 1000, "from the smallest eddies to models of a region")
-    ] = 0.5
+    ] = Field(0.5, description="of the nodes in y and z; also in x where air moves along x")
     names: dict[str, str] = Field({}, description="our dimension or variable names: the file's")
     extinction: ExtinctionMapping = ExtinctionMapping()
     texture: Texture = Texture()

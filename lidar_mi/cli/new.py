@@ -1,0 +1,55 @@
+"""``lidar-mi new``: an experiment file of one's own."""
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.options import complete_shipped
+from lidar_mi.cli.terminal import output
+from lidar_mi.errors import InputError
+
+EXAMPLES = (
+    "lidar-mi new my_wake",
+    "lidar-mi new my_sensor --from wake_sensor",
+    "lidar-mi new my_flight --from encounter",
+)
+
+
+def new(
+    name: Annotated[
+        str, typer.Argument(help="Name of the experiment, whose file will be NAME.yaml.")
+    ],
+    shipped: Annotated[
+        str,
+        typer.Option(
+            "--from",
+            help="Shipped experiment to start from, see `lidar-mi list`.",
+            autocompletion=complete_shipped,
+        ),
+    ] = "wake_backscatter",
+) -> None:
+    """Write an experiment file to edit, with the keys of a shipped one and what each does.
+
+    A file that is there is not replaced.
+    """
+    from lidar_mi.experiment.schema.experiment import NAME
+    from lidar_mi.experiment.schema.faults import A_NAME
+    from lidar_mi.experiment.schema.new_file import new_file
+    from lidar_mi.experiment.shipped import experiments, flights, shipped_file
+    from lidar_mi.io.text import write_text
+
+    path = Path(name if name.endswith(".yaml") else f"{name}.yaml")
+    own = path.stem
+    if not re.fullmatch(NAME, own):
+        raise InputError(f"{name}: not allowed; expected {A_NAME}")
+    if own in experiments():
+        raise InputError(f"{name}: a shipped experiment has this name; expected another one")
+    source = shipped_file(shipped)
+    if path.exists():
+        raise InputError(f"{path}: is there already; expected a new name")
+    command = "fly" if source.stem in flights() else "run"
+    write_text(path, new_file(own, source.stem, source, command))
+    output.print(f"file     {path}", soft_wrap=True)
+    output.print(f"next     lidar-mi check {path}", soft_wrap=True)
