@@ -32,7 +32,7 @@ class Turbulence(Section):
     evolution: Literal["frozen", "turnover", "sweeping"] = Field(
         "frozen", description="in time, where the mean wind is at rest"
     )
-    seed: Annotated[int, Field(ge=0)] | None = Field(
+    seed: Annotated[int, Within(0, 2**31 - 1, "as of the experiment's seed")] | None = Field(
         None, description="of the turbulence; default: that of the experiment"
     )
 

@@ -359,6 +359,10 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
                 "parts": [{"phase": "rayleigh", "fraction": 1}],
             }
             data["scattering"]["parts"][0][key] = value
+        if name.startswith("encounter.air.gusts"):
+            data["encounter"] = {"air": {"gusts": [{key: value}]}}
+        if name.startswith("encounter.air.volume"):
+            data["encounter"]["air"]["volume"]["file"] = "air.nc"
         if name.startswith("platform.motion.sinusoids"):
             vibration = {"axis": "y", "amplitude": 1, "frequency": 1}
             data["platform"] = {"motion": {"sinusoids": [vibration | {key: value}]}}
@@ -368,9 +372,9 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
             innermost[key] = [1, value, 0, 0]
         with pytest.raises(InputError) as error:
             check(data, "file")
-        assert re.split(r"\.parts|\.sinusoids", name)[0] in str(error.value) and "\n" not in str(
+        assert re.split(r"\.parts|\.sinusoids|\.gusts", name)[0] in str(
             error.value
-        )
+        ) and "\n" not in str(error.value)
         if within:
             assert within.words(unit).split(" (")[0] in str(error.value) or number != number
 
