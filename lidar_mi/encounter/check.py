@@ -42,7 +42,8 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     ------
     InputError
         A near gate behind the aircraft, a look-ahead shorter than the latency allows, an aircraft
-        that JSBSim does not have or that does not trim, a wake that is not known along its axis.
+        that JSBSim does not have, that is no aeroplane or that does not trim, a wake that is not
+        known along its axis.
     """
     encounter, gates = encounter_of(experiment), gates_of(experiment)
     if encounter.control.mode == "feedforward":

@@ -6,35 +6,24 @@ aircraft's own aerodynamics see air at rest. Its axes are x forward, y to starbo
 """
 
 import math
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from difflib import get_close_matches
-from functools import cache, partial
-from pathlib import Path as FilePath
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.constants import foot, inch, lbf, slug
 
 from lidar_mi.encounter.aircraft import LARGEST_ROLL, AircraftState, Commands, Limits, deflected
+from lidar_mi.encounter.jsbsim_trim import FLAPS, STEP, check_aeroplane, such_as, trimmed
 from lidar_mi.encounter.strips import Loads, Strips, fin_strips, in_downwash, joined, wing_strips
 from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.schema.encounter import Aircraft, Path
 from lidar_mi.instrument.motion import attitude
-from lidar_mi.io.jsbsim_files import AXES, shipped_aircraft, write_aircraft_in_wake
+from lidar_mi.io.jsbsim_files import AXES
 
 if TYPE_CHECKING:
-    from jsbsim import FGFDMExec, FGLogger
-
-STEP = 1 / 120
-"""Largest step of JSBSim, s."""
-
-FLAPS = (0.0, 0.25, 0.5, 0.75, 1.0)
-LARGEST_INCIDENCE = math.radians(6)
-"""The least flaps are set with which the aircraft trims at this angle of attack or a smaller one;
-with flaps the gear is down."""
+    from jsbsim import FGFDMExec
 
 TAIL_ASPECT_RATIO, FIN_ASPECT_RATIO = 4.0, 1.6
 """Usual for transport aircraft (Raymer 2018, table 4.3); JSBSim knows areas and arms alone."""
@@ -45,7 +34,6 @@ _CONTROLS = ("aileron", "elevator", "rudder")
 _POSITIONS = ("fcs/left-aileron-pos-rad", "fcs/elevator-pos-rad", "fcs/rudder-pos-rad")
 _TRIMS = ("fcs/roll-trim-cmd-norm", "fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
 _NOMINAL = math.radians(20)  # full deflection of a control that states no angle
-_LARGE = ("737", "787-8", "B747", "MD11")  # named in place of one that does not work
 _SETTLED = 30  # steps in which a control reaches a small command
 
 
@@ -66,8 +54,8 @@ class JSBSimAircraft:
     Raises
     ------
     InputError
-        There is no JSBSim, or it has no such aircraft, or cannot load or start it, or it does not
-        trim on this path.
+        There is no JSBSim, or it has no such aircraft, or cannot load or start it; it is no
+        aeroplane with an engine (`jsbsim_trim.check_aeroplane`), or does not trim on this path.
     """
 
     def __init__(self, aircraft: Aircraft, path: Path) -> None:
@@ -77,16 +65,17 @@ class JSBSimAircraft:
             reason = one_line(error, 100).rstrip(".") or type(error).__name__
             raise InputError(
                 f"encounter.aircraft.model: JSBSim does not fly {aircraft.model!r} ({reason}); "
-                f"expected another aircraft, {_such_as(aircraft.model)}"
+                f"expected another aircraft, {such_as(aircraft.model)}"
             ) from None
 
     def _start(self, aircraft: Aircraft, path: Path) -> None:
         self._climb = path.climb_angle
-        self._fdm = _trimmed(aircraft.model, path, FLAPS)
+        check_aeroplane(aircraft.model, path)
+        self._fdm = trimmed(aircraft.model, path, FLAPS)
         self.density = self._fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
         self.strips = _strips(self._fdm, aircraft.lift_slope)
         # derivatives take aircraft of their own, with the flaps of this one
-        again = partial(_trimmed, aircraft.model, path, [self._fdm["fcs/flap-cmd-norm"]])
+        again = partial(trimmed, aircraft.model, path, [self._fdm["fcs/flap-cmd-norm"]])
         self.control_moments, self._per_command = _control_moments(again)
         self._at_trim = _commands(self._fdm)
         trims = self._at_trim + [self._fdm[name] for name in _TRIMS]
@@ -173,86 +162,6 @@ class JSBSimAircraft:
             airspeed=fdm["velocities/vt-fps"] * foot,
             departed=bool(abs(roll) > LARGEST_ROLL or fdm["position/h-agl-ft"] <= 0),
         )
-
-
-def _loaded(name: str) -> "FGFDMExec":
-    try:
-        import jsbsim
-    except ImportError:
-        raise InputError(
-            f"encounter.aircraft.model: {name!r} needs JSBSim, which is not installed "
-            "(pip install 'lidar-mi[flight]'); roll needs nothing"
-        ) from None
-    root = FilePath(jsbsim.__file__).parent
-    names = shipped_aircraft(root)
-    if name not in names:
-        similar = get_close_matches(name, names, n=4, cutoff=0.5)
-        raise InputError(
-            f"encounter.aircraft.model: {name!r} is not known; expected roll or one of the "
-            f"{len(names)} aircraft of JSBSim, such as {', '.join(similar or _LARGE)}"
-        )
-    jsbsim.set_logger(_silent_logger(jsbsim))
-    fdm = jsbsim.FGFDMExec(str(root))
-    fdm.set_debug_level(0)
-    # JSBSim has read the files when the model is loaded: the folder can go
-    with tempfile.TemporaryDirectory() as folder:
-        write_aircraft_in_wake(root, name, FilePath(folder))
-        fdm.set_aircraft_path(folder)
-        fdm.set_engine_path(str(root / "engine"))
-        fdm.set_systems_path(str(root / "systems"))
-        if not fdm.load_model(name):
-            raise RuntimeError("it does not load")
-    fdm.set_dt(STEP)
-    return fdm
-
-
-@cache
-def _silent_logger(jsbsim: ModuleType) -> "FGLogger":
-    """In place of JSBSim's own, which writes to the terminal whatever it also raises."""
-
-    def ignore(self: object, *arguments: Any) -> None:
-        pass
-
-    names = ("set_level", "file_location", "message", "format", "flush")
-    return type("Silent", (jsbsim.FGLogger,), dict.fromkeys(names, ignore))()
-
-
-def _such_as(name: str) -> str:
-    return f"such as {next(one for one in _LARGE if one != name)}"
-
-
-def _trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec":
-    """JSBSim on the path, in equilibrium."""
-    best = None
-    for flaps in flap_settings:
-        fdm = _loaded(name)
-        fdm["ic/h-sl-ft"] = path.altitude / foot
-        fdm["ic/vt-fps"] = path.speed / foot
-        fdm["ic/gamma-rad"] = path.climb_angle
-        for part, value in (("gear/gear", float(flaps > 0)), ("fcs/flap", flaps)):
-            fdm[f"{part}-cmd-norm"] = value
-            fdm[f"{part}-pos-norm"] = value
-        # all engines
-        fdm["propulsion/set-running"] = -1
-        if not fdm.run_ic():
-            continue
-        try:
-            fdm["simulation/do_simple_trim"] = 1
-        except RuntimeError as error:
-            # no equilibrium with these flaps: with more there may be one
-            if type(error).__name__ != "TrimFailureError":
-                raise
-            continue
-        best = fdm
-        if fdm["aero/alpha-rad"] <= LARGEST_INCIDENCE:
-            break
-    if best is None:
-        raise InputError(
-            f"encounter.path: {name} does not trim at {path.speed:g} m/s and "
-            f"{math.degrees(path.climb_angle):g} deg at {path.altitude:g} m; expected a speed and "
-            f"climb angle at which it flies, or another aircraft, {_such_as(name)}"
-        )
-    return best
 
 
 def _place(fdm: "FGFDMExec") -> np.ndarray:
