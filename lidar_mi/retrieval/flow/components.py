@@ -249,13 +249,14 @@ def without_texture(images: Images, template: int) -> torch.Tensor:
     the ratio t of the structure tensor's eigenvalues has the distribution of the two-dimensional
     Wishart matrix (Muirhead 1982, Aspects of Multivariate Statistical Theory, 3.2): of two slopes
     P(t) = 2 t^(1/2) / (1 + t), with the median (2 - 3^(1/2))^2. Counted are places where the ratio
-    is below that in most of two templates about them, and all where that holds of most: what the
-    flow is elsewhere depends on the prior.
+    is below that in most of what stands out of noise within two templates, and all where that holds
+    of most: what the flow is elsewhere depends on the prior.
 
     Parameters
     ----------
     images : Images
-        Used as they are: after their filter the least rounding may be as large as the texture.
+        As prepared, with the noise as given or estimated. Not filtered: after the filter the least
+        rounding may be as large as the texture.
     template : int
         px, twice the standard deviation of the Gaussian mean of the tensor.
 
@@ -271,12 +272,16 @@ def without_texture(images: Images, template: int) -> torch.Tensor:
         for one, other in combinations_with_replacement(slopes, 2)
     )
     radius = ((zz - yy).square() / 4 + zy.square()).sqrt()
-    strong, weak = (zz + yy) / 2 + radius, (zz + yy) / 2 - radius
-    # what is less than the least motion of the mean slope is no structure
-    none = strong < _LEAST_MOTION**2 * strong[valid].mean()
-    single = working(none | (weak < _RATIO_OF_TWO * strong))
-    bare = averaged(single, valid, 2 * template) > 0.5
-    return bare | (bare[valid].double().mean() > 0.5)
+    # slopes of white noise by central differences have half of its variance
+    noisy = images.noise**2 / 2 / working(images.weight)
+    mean = (zz + yy) / 2 - noisy
+    strong, weak = mean + radius, mean - radius
+    # where the slopes are of noise nothing is said, and next to none is none
+    told = strong > (2 * noisy).clamp(min=_LEAST_MOTION**2 * float(strong[valid].mean()))
+    single = told & (weak < _RATIO_OF_TWO * strong)
+    share = [averaged(working(part), valid, 2 * template) for part in (single, told)]
+    bare = share[0] > 0.5 * share[1]
+    return bare | (single[valid].sum() > 0.5 * told[valid].sum())
 
 
 def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:

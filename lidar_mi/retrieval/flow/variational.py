@@ -162,7 +162,7 @@ def variational_and_flow(
         image_pair(stack[0], image, (2, 3))
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
-    images = prepared(stack, noise, blur, settings)
+    images = given = prepared(stack, noise, blur, settings)
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.smooth, windows, Grid(windows.shape, 0.0, like))
@@ -213,7 +213,7 @@ def variational_and_flow(
     result = result._replace(covariance=covariance)
     if windows.dims > 2:
         return result, None
-    bare = without_texture(images, windows.template).to(like)
+    bare = without_texture(given, windows.template).to(like)
     bare = interpolated(bare, pixels, centres) > 0.5
     flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * bare).short()
     result = result._replace(flag=flag)
