@@ -30,8 +30,8 @@ BENDING = 1.0
 PITCH_TIME = 0.5
 """A pitch rate (rad/s) counts as this time (s) of it: 10 degrees/s as 0.09 g."""
 
-PATH_TIME = 4.0
-"""s: slow against a gust, so that it is not met by holding the path; an autopilot returns to it."""
+PATH_TIME = 2.0
+"""s: a climb ends slowly against a gust, which is not to be met by holding the path."""
 
 _EFFORT = 1e-2  # of a deflection in rad against a load factor
 
