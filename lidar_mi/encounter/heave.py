@@ -149,8 +149,8 @@ def derivatives_of(aircraft: Aircraft, speed: float, density: float) -> np.ndarr
     Wing and tail are lifting surfaces at x_w and x_t. By the aircraft's motion the air moves along
     the wing's normal with u_w = V alpha - q x_w, along the tail's with V alpha - q x_t less the
     downwash epsilon u_w, epsilon = 2 a / (pi A), that left the wing by (x_w - x_t) / V before. To
-    first order in this delay the derivatives are those of Etkin and Reid 1996, section 5.3 (pitch
-    rate) and 5.4 (rate of the angle of attack). Lift is quasi-steady.
+    first order in this delay the derivatives are those of Etkin and Reid 1996, chapter 5 (pitch
+    rate, rate of the angle of attack). Lift is quasi-steady.
 
     Parameters
     ----------
