@@ -112,8 +112,8 @@ def test_loads_in_words():
         metrics[f"encounter.{mode}.largest_load_increment"] = load
         metrics[f"encounter.{mode}.largest_bending_increment"] = 1e6 * load
     assert encounter_answer(metrics)[1] == (
-        "The load factor changes by up to 0.75 without control, 0.78 with the autopilot (4 % more), "
-        "0.3 with perfect preview (60 % less)."
+        "The load factor changes by up to 0.75 without control, 0.78 with the autopilot "
+        "(4 % more), 0.3 with perfect preview (60 % less)."
     )
     (table, *_) = encounter_summary(metrics, met="air")
     rows = {row[0]: row[1:] for row in table.rows}
