@@ -6,7 +6,7 @@ Detects a wrong block, shift or derivative.
 import torch
 
 from lidar_mi.retrieval.flow.band import Band, form, spread
-from lidar_mi.retrieval.flow.band_cholesky import cholesky, solved_near, spread_half
+from lidar_mi.retrieval.flow.band_cholesky import cholesky, solved_near
 from lidar_mi.retrieval.flow.block_banded import factor
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
 
@@ -73,7 +73,11 @@ def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
     torch.testing.assert_close(
         alone.solve(some).flatten(), torch.linalg.solve(dense, some.flatten())
     )
-    of_band = spread_half(alone.covariance(), few)
+    several = torch.stack([some, some.flip(-1), 2 * some])
+    torch.testing.assert_close(
+        alone.solve(several).flatten(1), torch.linalg.solve(dense, several.flatten(1).T).T
+    )
+    of_band = spread(alone.covariance(), few)
     for a in (0, 1):
         for b in (0, 1):
             expected = (at @ inverse[a, :, b] @ at.T).diagonal().reshape(3, 4)
