@@ -45,7 +45,7 @@ def form(
 
 
 def spread(band: torch.Tensor, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
-    """Covariance (2, 2, *mesh.shape) of the components, from `Band.covariance`.
+    """Covariance (2, 2, *mesh.shape) of the components, as a factor gives it.
 
     Of a band of the knots of some cells along z (see `form`) at the nodes in these cells.
     """
@@ -134,13 +134,9 @@ class Band:
         return columns.flatten(-2).flatten(-4, -2)
 
     def solve(self, root: Factor, right: torch.Tensor) -> torch.Tensor:
-        """Coefficients that solve the systems, from the right hand sides (..., 2, Z, Y)."""
-        found = root.solve(right.movedim(-1, 0).flatten(-2))
-        return found.unflatten(-1, (2, self.rows)).movedim(0, -1)
-
-    def covariance(self, root: Factor) -> torch.Tensor:
-        """The inverse within the band, as a form is held: (..., 2, 2, 7, Z, 4, Y)."""
-        return self.form_of(root.inverse())
+        """Coefficients that solve the systems, of some right hand sides (n, ..., 2, Z, Y) each."""
+        found = root.solve(right.movedim((0, -1), (-1, 0)).flatten(-3, -2))
+        return found.unflatten(-2, (2, self.rows)).movedim((0, -1), (-1, 0))
 
     def form_of(self, columns: torch.Tensor) -> torch.Tensor:
         """The transpose of `columns_of`: a form from its blocks."""
@@ -157,17 +153,17 @@ class Band:
         return band
 
     def apply(self, band: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-        """The form's matrix times coefficients (2, Z, Y)."""
+        """The form's matrix times coefficients (..., 2, Z, Y)."""
         reach = REACH
         padded = pad(coefficients, (reach,) * 4)
-        _, rows, columns = coefficients.shape
+        rows, columns = coefficients.shape[-2:]
         total = torch.zeros_like(padded)
         here = slice(reach, reach + rows), slice(reach, reach + columns)
         for i in range(2 * reach + 1):
             for j in range(reach + 1):
                 there = slice(i, i + rows), slice(reach + j, reach + j + columns)
                 part = band[:, :, i, :, j]
-                total[:, *here] += (part * padded[None, :, *there]).sum(1)
+                total[..., *here] += (part * padded[..., None, :, *there]).sum(-3)
                 if j:
-                    total[:, *there] += (part * coefficients[:, None]).sum(0)
-        return total[:, *here]
+                    total[..., *there] += (part * coefficients[..., None, :, :]).sum(-4)
+        return total[..., *here]

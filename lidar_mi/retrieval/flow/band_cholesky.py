@@ -2,7 +2,7 @@
 
 With the coefficients in the order (knot along y, knot along z, component) a form (see `band.Band`)
 is a band matrix. Its factor takes a third of the operations of that of blocks
-(`block_banded.factor`), which serves many forms at once, and any device.
+(`block_banded.factor`). Other devices have `cyclic_reduction`.
 """
 
 from dataclasses import dataclass
@@ -57,9 +57,10 @@ class BandCholesky:
 
     @cached_property
     def _blocks(self) -> tuple[np.ndarray, np.ndarray]:
-        """By blocks of size n, one for every knot along y: `Factor`, its ratios transposed.
+        """A = (I + G) D (I + G)^T by blocks of size n, one for every knot along y.
 
-        Roots (blocks, n, n) and ratios (blocks, n, 3 n).
+        The inverse of the Cholesky factor of each block of D, (blocks, n, n), and the transposed
+        blocks of G below each diagonal one, (blocks, n, 3 n).
         """
         n, below = 2 * self.rows, len(self.lower) - 1
         # in memory an element of the matrix is followed by that below it, and that to its right
@@ -96,8 +97,9 @@ class BandCholesky:
     def _inverse(self) -> np.ndarray:
         """The inverse's blocks on and below the diagonal, (blocks, n, 4 n), transposed.
 
-        See `Factor.inverse`. The inverse of the blocks behind is held in a ring: each block takes
-        the place of the one that is no longer needed.
+        From the last block upwards (Takahashi et al. 1973, Proc. 8th PICA Conf., 63-69). The
+        inverse of the blocks behind is held in a ring: each takes the place of the one that is no
+        longer needed.
         """
         roots, ratios = self._blocks
         n = roots.shape[-1]

@@ -60,7 +60,7 @@ class Posterior(NamedTuple):
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow."""
-        after = _covariance_near(self.root, self.whole)
+        after = covariance_near(self.root, self.whole)
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
         # at the largest evidence the two are equal (MacKay's fixed point)
         return variances(self.before.covariance() - after, self.prior), energy
@@ -91,7 +91,7 @@ def factored(forms: torch.Tensor) -> Sequence[Root]:
     return cyclic_reduction.factored(working(forms))
 
 
-def _covariance_near(root: Root, form: torch.Tensor) -> torch.Tensor:
+def covariance_near(root: Root, form: torch.Tensor) -> torch.Tensor:
     """That of a form's factor to `_INVERSE`, where it is, in single precision."""
     if isinstance(root, BandCholesky):
         found = root.single().covariance().to(form)
