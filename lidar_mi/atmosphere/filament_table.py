@@ -12,13 +12,13 @@ import scipy
 from lidar_mi.atmosphere.filaments import Filaments
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 
-# The fine grid reaches so many core radii beyond the lines, in l and n; the coarse one so many
-# periods.
-_MARGIN = 6.0
+# The fine grid reaches so many core radii beyond the lines, in l and n: five nodes of the coarse one,
+# in which what its splines miss of the cores falls to 1e-3. The coarse one reaches so many periods.
+_MARGIN = 8.0
 _WIDE = 0.4
 # Spacing across the axis in core radii, of the fine and the coarse grid; along it twice as much in
 # the fine one, as lines are steep to the axis by less than that, but for rings.
-_FINE, _COARSE = 0.4, 2.0
+_FINE, _COARSE = 0.4, 1.6
 # Nodes beyond the period's ends that a cubic spline needs.
 _BEYOND = 3
 
@@ -56,7 +56,7 @@ class _Grid:
 class FilamentTable:
     """Velocity of filaments (circulation 1 m^2/s) by interpolation of two grids.
 
-    Cubic splines of nodes 0.4 core radii apart about the lines, and two core radii apart
+    Cubic splines of nodes 0.4 core radii apart about the lines, and 1.6 core radii apart
     farther away; beyond that, the flow of the straight pair. Both grids are computed for a quarter
     of a period: the filaments are symmetric to the plane between both vortices, and about their
     crests.

@@ -140,7 +140,7 @@ def test_linking():
     ("amplitude", "model"), [(10.0, "lamb_oseen"), (10.0, "burnham_hallock"), (40.0, "lamb_oseen")]
 )
 def test_table_against_the_sum(amplitude, model):
-    """Within 1 % of the largest swirl anywhere, 0.1 % rms; also periods away."""
+    """Within 1 % of the largest swirl anywhere, 0.2 % rms; also periods away."""
     phase, core = 0.7, 5.0
     filaments = lines(amplitude, model, phase, core)
     table = FilamentTable(filaments, (0.25 - phase / (2 * np.pi)) * WAVE)
@@ -153,7 +153,7 @@ def test_table_against_the_sum(amplitude, model):
     ):
         error = table.velocity(places.T).T - filaments.velocity(places)
         assert np.abs(error).max() < 0.01 * fastest
-        assert np.sqrt((error**2).mean()) < 0.001 * fastest
+        assert np.sqrt((error**2).mean()) < 0.002 * fastest
 
 
 @pytest.mark.parametrize(
