@@ -12,8 +12,9 @@ import scipy
 from lidar_mi.atmosphere.filaments import Filaments
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 
-# The fine grid reaches so many core radii beyond the lines, in l and n: five nodes of the coarse one,
-# in which what its splines miss of the cores falls to 1e-3. The coarse one reaches so many periods.
+# The fine grid reaches so many core radii beyond the lines, in l and n: five nodes of the coarse
+# one, in which what its splines miss of the cores falls to 1e-3. The coarse one reaches so many
+# periods.
 _MARGIN = 8.0
 _WIDE = 0.4
 # Spacing across the axis in core radii, of the fine and the coarse grid; along it twice as much in
