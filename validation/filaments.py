@@ -126,7 +126,9 @@ def wakes(effort):
         Row("A343, separation", "the paper", 47.1, found.separation, 0, 0.5, "m"),
         Row("A343, lift over g", "Kutta and Joukowski", 190e3, lift, 0, 1.0, "kg"),
     )
-    text = "The simulation is that of the shipped wakes, in stratified air; Sarpkaya's law has none."
+    text = (
+        "The simulation is that of the shipped wakes, in stratified air; Sarpkaya's law has none."
+    )
     return Check("Decay and aircraft", text, rows)
 
 
