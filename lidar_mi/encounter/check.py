@@ -10,7 +10,7 @@ from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
 from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
-from lidar_mi.encounter.wake import encounter_of, vortices_in_plane
+from lidar_mi.encounter.wake import described_wake, encounter_of, vortices_in_plane
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import silent
@@ -110,6 +110,7 @@ def sections(
             f"{_strongest(experiment, aircraft_of(encounter)):.0%} of the ailerons'",
         ),
     ]
+    rows += described_wake(experiment)
     if encounter.air is not None:
         rows += described(encounter.air, path)
     has_wake = encounter.air is None or encounter.air.wake
