@@ -46,7 +46,7 @@ class EncounterFolder:
         self.figures, self.log = self.path / FIGURES, self.path / LOG
         self.record = new_record(experiment, experiment.folder)
         # trajectories depend on the version of JSBSim, where it is used
-        if encounter_of(experiment).aircraft.model != "roll":
+        if encounter_of(experiment).aircraft.model not in ("roll", "heave"):
             self.record["versions"]["jsbsim"] = version("jsbsim")
         self.made_by = made_by(self.record)
         self.scans = ScanStore(self.path / SCANS, self.made_by)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from lidar_mi.experiment.schema.air import Air
+from lidar_mi.experiment.schema.heave import HeaveKeys
 from lidar_mi.experiment.schema.section import Section
 from lidar_mi.units import (
     Angle,
@@ -127,7 +128,8 @@ class Aircraft(Section):
     """
 
     model: str = Field(
-        "roll", description="roll: rigid, rolls only; else an aircraft of JSBSim, such as 737"
+        "roll",
+        description="roll: rolls only; heave: rises and pitches, too; else of JSBSim, such as 737",
     )
     span: Annotated[Length, Within(1, 200, "aircraft")] = Field(28.9, description="of the wing")
     wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = Field(
@@ -148,6 +150,7 @@ class Aircraft(Section):
     aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
         0.1, description="rolling moment coefficient per rad of deflection"
     )
+    heave: HeaveKeys = HeaveKeys()
 
     @field_validator("model", mode="before")
     @classmethod

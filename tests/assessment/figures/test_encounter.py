@@ -46,6 +46,21 @@ def test_loads_of_the_air_are_drawn(tmp_path):
     assert imread(drawn[-1].path).std() > 0.05
 
 
+def test_loads_of_an_aircraft_that_rises_are_drawn(tmp_path):
+    alone = made_up_flights().series.sel(flight=["off"])
+    changed = {
+        name: alone["roll"] * factor
+        for name, factor in (
+            ("load_factor", 2.0),
+            ("port_bending", 1e5),
+            ("starboard_bending", 1e5),
+        )
+    }
+    drawn = draw_all(tmp_path, alone.assign(changed), None, None, SPAN, Log())
+    assert [one.path.stem for one in drawn] == ["fig30_roll", "fig35_commands", "fig37_load_factor"]
+    assert imread(drawn[-1].path).std() > 0.05
+
+
 def test_cockpit_is_the_pilots_view():
     """Port, positive y, is on the left; cores are where the data set has them."""
     found = made_up_flights()

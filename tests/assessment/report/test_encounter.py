@@ -104,3 +104,17 @@ def test_flights_without_a_lidar_have_no_verdict(mode):
 def test_a_flight_that_is_not_rolled_has_no_ratio_of_rounding():
     (answer,) = encounter_answer(numbers(off=1e-15, autopilot=1e-12, feedforward=0, perfect=1e-12))
     assert answer.startswith("No flight rolls by more than 0.01 degrees")
+
+
+def test_loads_in_words():
+    metrics = numbers(off=2, perfect=1)
+    for mode, load in (("off", 0.75), ("autopilot", 0.78), ("perfect", 0.3)):
+        metrics[f"encounter.{mode}.largest_load_increment"] = load
+        metrics[f"encounter.{mode}.largest_bending_increment"] = 1e6 * load
+    assert encounter_answer(metrics)[1] == (
+        "The load factor changes by up to 0.75 without control, 0.78 with the autopilot "
+        "(4 % more), 0.3 with perfect preview (60 % less)."
+    )
+    (table, *_) = encounter_summary(metrics, met="air")
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert rows["largest change of a wing root's bending / kN m"][0] == "750"
