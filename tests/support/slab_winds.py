@@ -58,7 +58,9 @@ class Slabs:
         step = WINDOW / _POINTS
         pad = int(np.ceil(3 * self.resolution / step))
         axes = [step * (np.arange(n * _POINTS + 2 * pad) - pad) for n in (self.nz, self.ny)]
-        axes = [a - step * (n * _POINTS - 1) / 2 for a, n in zip(axes, (self.nz, self.ny))]
+        axes = [
+            a - step * (n * _POINTS - 1) / 2 for a, n in zip(axes, (self.nz, self.ny), strict=True)
+        ]
         z, y = np.meshgrid(*axes, indexing="ij")
         fine = np.stack(self.air(x, y, z, time)[1:])
         if self.resolution:

@@ -15,14 +15,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from lidar_mi.retrieval.along_path.statistics import Statistics, error_correlation
 from lidar_mi.retrieval.along_path.vectors import ACROSS, SlabVectors
-from lidar_mi.retrieval.along_path.von_karman import covariance
+from lidar_mi.retrieval.along_path.von_karman import covariance, lattice_covariance
 
 # Principal components of less variance than this, over the largest, are not known.
 _LEAST = 1e-6
 # Variance of vectors without error, m^2/s^2.
 _ROUNDING = 1e-12
 # Times from slab to arrival are taken alike within such steps, s.
-_TIME_STEP = 0.2
+_TIME_STEP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,8 @@ class Basis:
     component : {"v", "w"}
     length, resolution : float
         Of `Statistics`, m.
-    nodes : ndarray, shape (nodes, 2)
-        y and z of the lattice, m.
+    axes : two ndarrays, shapes (ny,) and (nz,)
+        y and z of the lattice's nodes, m.
     weights : ndarray, shape (nodes, states)
         From covariances with the nodes to values per state.
     variance, reach : ndarray, shape (states,)
@@ -45,7 +45,7 @@ class Basis:
     component: str
     length: float
     resolution: float
-    nodes: np.ndarray
+    axes: tuple[np.ndarray, np.ndarray]
     weights: np.ndarray
     variance: np.ndarray
     reach: np.ndarray
@@ -62,8 +62,9 @@ class Basis:
         return self._with_nodes(places, self.resolution**2, swept)
 
     def _with_nodes(self, places: np.ndarray, across: float, swept: float) -> np.ndarray:
-        y, z = (places[:, None] - self.nodes).T.swapaxes(1, 2)
-        return covariance(self.component, 0.0, y, z, self.length, across, swept) @ self.weights
+        y, z = (place[:, None] - axis for place, axis in zip(places.T, self.axes, strict=True))
+        found = lattice_covariance(self.component, y, z, self.length, across, swept)
+        return found.reshape(len(places), -1) @ self.weights
 
 
 @dataclass(frozen=True)
@@ -87,15 +88,15 @@ class Lattice:
     z: float = 0.0
 
     @property
-    def nodes(self) -> np.ndarray:
-        """y and z of all, (n, 2), m."""
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """y and z of the nodes, m."""
         axes = []
         for half, start in ((self.half_width, self.y), (self.half_height, self.z)):
             count = np.ceil((half + abs(start)) / self.spacing)
             nodes = start + self.spacing * np.arange(-count, count + 1)
             # one node beyond the reach on either side: those farther are not needed
             axes.append(nodes[np.abs(nodes) < half + self.spacing])
-        return np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+        return axes[0], axes[1]
 
     def through(self, vectors: SlabVectors) -> "Lattice":
         """The lattice on the places of vectors, to a quarter of its spacing."""
@@ -112,8 +113,8 @@ def basis(
     component: str, length: float, resolution: float, stride: float, lattice: Lattice
 ) -> Basis:
     """The principal components on a lattice; each has its correlation over the `stride` (m)."""
-    nodes = lattice.nodes
-    y, z = (nodes[:, None] - nodes).T
+    axes = lattice.axes
+    y, z = (np.subtract.outer(a.ravel(), a.ravel()) for a in np.meshgrid(*axes))
     across = 2 * resolution**2
     here, there = (covariance(component, lag, y, z, length, across) for lag in (0.0, stride))
     variance, vectors = np.linalg.eigh(here)
@@ -121,7 +122,7 @@ def basis(
     variance, vectors = variance[some], vectors[:, some]
     decay = np.einsum("nm,nk,km->m", vectors, there, vectors) / variance
     reach = -stride / np.log(np.clip(decay, 1e-3, 1 - 1e-9))
-    return Basis(component, length, resolution, nodes, vectors / variance, variance, reach)
+    return Basis(component, length, resolution, axes, vectors / variance, variance, reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +159,7 @@ def observation(
     """
     number = ACROSS.index(one.component)
     y, z = np.meshgrid(vectors.y, vectors.z)
-    reach = np.abs(one.nodes).max(0) + vectors.window / 4
+    reach = [np.abs(axis).max() + vectors.window / 4 for axis in one.axes]
     used = vectors.valid & (np.abs(y) <= reach[0]) & (np.abs(z) <= reach[1])
     if not used.any():
         states = len(one.variance)
@@ -231,13 +232,14 @@ class PathField:
         fraction = np.clip(to_left / span, 0.0, 1.0)
         seen = (1 - fraction) * self.time[left] + fraction * self.time[right]
         steps = np.rint(np.abs(time - seen) / _TIME_STEP).astype(int)
-        places = np.stack([y, z], -1)
+        # complex numbers: rows are sorted a tenth as fast
+        unlike, back = np.unique(y + 1j * z, return_inverse=True)
+        places = np.stack([unlike.real, unlike.imag], -1)
         found, stderr = np.zeros_like(x), np.zeros_like(x)
         for step in np.unique(steps):
             here = steps == step
             swept = (self.swept_speed * step * _TIME_STEP) ** 2
-            unlike, back = np.unique(places[here], axis=0, return_inverse=True)
-            value = self.basis.point(unlike, swept)[back.ravel()]
+            value = self.basis.point(places, swept)[back[here]]
             found[here] = (value * state[here]).sum(-1)
             if error:
                 stderr[here] = self._stderr(

@@ -13,6 +13,8 @@ ACROSS = ("v", "w")
 
 # Meaning of the flag of vectors whose u alone is not to be used.
 _ONLY_U = "beyond_lines"
+# Least fraction of a stated error that is the vector's own.
+_LEAST_OWN = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +52,8 @@ class SlabVectors:
         return np.isfinite(self.wind).all(0)
 
 
-def slab_vectors(wind: xr.Dataset) -> SlabVectors:
-    """The vectors of an estimate that count.
+def counting(wind: xr.Dataset) -> xr.Dataset:
+    """The vectors of an estimate that count, as a data set of the same variables.
 
     Windows that lie side by side see all pixels once: vectors between them have nearly no
     information of their own, and errors that are not independent.
@@ -61,6 +63,11 @@ def slab_vectors(wind: xr.Dataset) -> SlabVectors:
     wind : Dataset, dims (z, y)
         v, w with v_stderr, w_stderr and flag, from `retrieve_wind` or `combine`.
 
+    Returns
+    -------
+    Dataset
+        With the attribute `window`, m.
+
     Raises
     ------
     InputError
@@ -69,37 +76,32 @@ def slab_vectors(wind: xr.Dataset) -> SlabVectors:
     for name in ("v", "w", "v_stderr", "w_stderr", "flag"):
         if name not in wind:
             raise InputError(f"wind.{name}: missing; expected v, w, their errors and flag")
+    window = _window(wind)
+    some = {name: _apart(wind.variables[name].values, window) for name in ("z", "y")}
+    return wind.isel(some).assign_attrs(window=window)
+
+
+def slab_vectors(wind: xr.Dataset) -> SlabVectors:
+    """Those of `counting`, without what their errors have in common."""
     y, z = (wind.variables[axis].values.astype(float) for axis in ("y", "z"))
-    window = _window(wind, y)
-    chosen = {"y": _apart(y, window), "z": _apart(z, window)}
-    grid = np.ix_(chosen["z"], chosen["y"])
 
     def values(name: str) -> np.ndarray:
-        return wind.variables[name].transpose("z", "y").values[grid].astype(float)
+        return wind.variables[name].transpose("z", "y").values.astype(float)
 
     found = np.stack([values(name) for name in ACROSS])
     stderr = np.stack([values(f"{name}_stderr") for name in ACROSS])
     common = common_stderr(wind)
     rotation, centre = common_rotation(wind)
-    y, z = y[chosen["y"]], z[chosen["z"]]
     arms = np.stack(np.broadcast_arrays(z[:, None] - centre[1], y - centre[0]))
-    turned = np.hypot(rotation * arms, np.reshape(common, (2, 1, 1)))
-    own = np.sqrt(np.maximum(stderr**2 - turned**2, (1e-3 * stderr) ** 2))
+    shared = np.hypot(rotation * arms, np.reshape(common, (2, 1, 1)))
+    own = np.sqrt(np.maximum(stderr**2 - shared**2, (_LEAST_OWN * stderr) ** 2))
     flag = values("flag").astype(int) & ~_mask_of(wind["flag"], _ONLY_U)
     good = (flag == 0) & (np.isfinite(found) & (stderr > 0) & np.isfinite(stderr)).all(0)
-    return SlabVectors(
-        y,
-        z,
-        np.where(good, found, np.nan),
-        np.where(good, own, np.nan),
-        window,
-        common,
-        rotation,
-        centre,
-    )
+    found, own = np.where(good, found, np.nan), np.where(good, own, np.nan)
+    return SlabVectors(y, z, found, own, wind.attrs["window"], common, rotation, centre)
 
 
-def _window(wind: xr.Dataset, y: np.ndarray) -> float:
+def _window(wind: xr.Dataset) -> float:
     """Size of the windows, m."""
     if "window" in wind.attrs:
         return float(wind.attrs["window"])
@@ -109,6 +111,7 @@ def _window(wind: xr.Dataset, y: np.ndarray) -> float:
         raise InputError(
             "wind: attributes template and stride missing; expected those, or window in m"
         ) from None
+    y = wind.variables["y"].values
     return float(pixels * (y[-1] - y[0]) / (len(y) - 1))
 
 

@@ -18,6 +18,8 @@ _A = gamma(1 / 3) / (np.sqrt(np.pi) * gamma(5 / 6))
 _EXPONENT = 17 / 6
 # Logarithms of the eddies' squares: the smallest are 1e-4 lengths and hold 0.2 % of the variance.
 _SIZES = np.arange(-20.0, 3.6, 0.8)
+# Squares over that of a mean below which eddies have no part in it: 1e-6 of their variance is left.
+_LEAST = 1e-2
 
 
 @lru_cache(maxsize=256)
@@ -32,6 +34,13 @@ def _eddies(length: float) -> tuple[np.ndarray, np.ndarray]:
     weight = t**_EXPONENT * np.exp(-t) * step / gamma(_EXPONENT)
     scale = length * 55 / (36 * np.pi**2) * (_A * length) ** 4 * (2 * np.pi) ** 1.5
     return 2 * t * (_A * length) ** 2, scale * weight
+
+
+def _larger(length: float, mean: float) -> tuple[np.ndarray, np.ndarray]:
+    """The eddies that a mean, of so much variance in m^2, leaves."""
+    sizes, weights = _eddies(length)
+    some = sizes >= min(_LEAST * mean, sizes[-1])
+    return sizes[some], weights[some]
 
 
 def covariance(
@@ -70,7 +79,7 @@ def covariance(
         1 at one place, without averages.
     """
     axis = COMPONENTS.index(component)
-    sizes, weights = _eddies(length)
+    sizes, weights = _larger(length, across + swept)
     square = (sizes + swept, sizes + swept + across, sizes + swept + across)
     places = [np.asarray(a, float)[..., None] for a in (x, y, z)]
     exponent = sum(a**2 / (2 * b) for a, b in zip(places, square, strict=True))
@@ -78,3 +87,33 @@ def covariance(
     curvature = sum(1 / square[n] - places[n] ** 2 / square[n] ** 2 for n in range(3) if n != axis)
     weights = weights / np.sqrt(square[0] * square[1] * square[2])
     return (np.exp(-exponent) * curvature) @ weights
+
+
+def lattice_covariance(
+    component: str, y: np.ndarray, z: np.ndarray, length: float, across: float, swept: float
+) -> np.ndarray:
+    """`covariance` of v or w at places of one plane with the nodes of a lattice in it.
+
+    In time of the axes' lengths, not of their product: every eddy is a product.
+
+    Parameters
+    ----------
+    component : {"v", "w"}
+    y, z : ndarray, shapes (n, ny) and (n, nz)
+        From the places to the nodes, m.
+    length, across, swept
+        As in `covariance`.
+
+    Returns
+    -------
+    ndarray, shape (n, nz, ny)
+    """
+    sizes, weights = _larger(length, across + swept)
+    along, plane = sizes + swept, sizes + swept + across
+    weights = weights / (np.sqrt(along) * plane)
+    bells = [np.exp(-(a[..., None] ** 2) / (2 * plane)) for a in (y, z)]
+    # the axis of the plane at right angles to the component
+    number = 0 if component == "w" else 1
+    curved = 1 / along + 1 / plane - (y, z)[number][..., None] ** 2 / plane**2
+    bells[number] = bells[number] * curved * weights
+    return bells[1] @ bells[0].swapaxes(1, 2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import gamma, kv
 
-from lidar_mi.retrieval.along_path.von_karman import covariance
+from lidar_mi.retrieval.along_path.von_karman import covariance, lattice_covariance
 
 
 def published(r, length):
@@ -47,3 +47,12 @@ def test_means_are_those_of_points():
         expected = covariance(component, 3.0, 5.0, -2.0, length, width**2, swept**2)
         error = drawn.std() / np.sqrt(len(drawn))
         assert abs(drawn.mean() - expected) < 4 * error < 0.002
+
+
+@pytest.mark.parametrize("component", ["v", "w"])
+def test_lattice_is_as_its_nodes(component):
+    y, z = np.array([[-9.0, 0.0, 7.0]]), np.array([[-3.0, 4.0]])
+    found = lattice_covariance(component, y, z, 40.0, 9.0, 4.0)
+    at_y, at_z = np.meshgrid(y, z)
+    expected = covariance(component, 0.0, at_y, at_z, 40.0, 9.0, 4.0)
+    np.testing.assert_allclose(found[0], expected, rtol=1e-12)
