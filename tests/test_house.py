@@ -67,7 +67,7 @@ FLOORS = {
         ("images", "rings"),
         ("correlation", "channels", "lines"),
         ("flow", "defects"),
-        ("vortices",),
+        ("along_path", "vortices"),
         ("wind",),
     ),
 }

@@ -60,12 +60,14 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
             f"{strength:.1%} of the ailerons'; expected turbulence or a wake"
         )
     slabs = _slabs_in_view(experiment, gates)
-    if encounter.control.mode == "feedforward" and not has_wake:
-        found.append(
-            "encounter.air.wake: false leaves the lidar no vortices to track: its flight is that "
-            "of the autopilot; expected true, or encounter.control.mode: perfect"
-        )
-    elif encounter.control.mode == "feedforward" and slabs < _LEAST_SLABS:
+    control = encounter.control
+    if control.mode == "feedforward" and not has_wake:
+        if control.preview == "pair":
+            found.append(
+                "encounter.air.wake: false leaves the lidar no vortices to track: its flight is "
+                "that of the autopilot; expected true, or encounter.control.preview: wind"
+            )
+    elif control.mode == "feedforward" and slabs < _LEAST_SLABS:
         found.append(
             f"encounter.look_ahead: the images hold both vortices in {slabs} slabs; a track needs "
             f"{_LEAST_SLABS} (expected a wider image, wake.vortex_pair.width and height)"

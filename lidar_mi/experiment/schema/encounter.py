@@ -165,6 +165,9 @@ class Control(Section):
     mode: Literal["off", "feedforward", "perfect"] = Field(
         "feedforward", description="off: the wings are levelled; perfect: knows the truth"
     )
+    preview: Literal["pair", "wind"] = Field(
+        "pair", description="pair: the tracked vortices alone; wind: with the vectors' wind ahead"
+    )
     latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
         0.12, description="from the second scan of a slab to its estimate"
     )
