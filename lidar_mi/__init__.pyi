@@ -16,6 +16,7 @@ from .experiment.shipped import campaigns, experiments, scene_file
 from .experiment.truth.extinction import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
+from .io.lines_of_sight.read import read_lines_of_sight
 from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .rendering.variant import use_variant
@@ -66,6 +67,7 @@ __all__ = [
     "on_one_grid",
     "open_campaign",
     "read_image",
+    "read_lines_of_sight",
     "read_noise",
     "read_scan",
     "read_vortices",
