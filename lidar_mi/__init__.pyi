@@ -22,6 +22,7 @@ from .plugins import register_plugins
 from .rendering.variant import use_variant
 from .retrieval.images.common_grid import on_one_grid
 from .retrieval.images.quality import Flag
+from .retrieval.lines_of_sight.winds import fit_winds_to_lines
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
 from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines
@@ -59,6 +60,7 @@ __all__ = [
     "export",
     "fit_vortices",
     "fit_vortices_to_wind",
+    "fit_winds_to_lines",
     "fly",
     "gap_from_fractions",
     "gap_from_lines",
