@@ -60,15 +60,6 @@ def refitted(
     return velocity - design @ wind, np.sqrt(np.maximum(1 - np.where(keep, 1, -1) * leverage, 1e-3))
 
 
-def spread(left: np.ndarray, count: np.ndarray) -> float:
-    """Standard deviation of a line from residuals of several fits, robust.
-
-    Parameters
-    ----------
-    left : (n,) array
-        Residuals of all fits.
-    count : (n,) array
-        Lines of the fit of each: three of them are fitted.
-    """
-    scaled = np.abs(left) * np.sqrt(count / np.maximum(count - 3, 1))
-    return float(_NORMAL * np.median(scaled))
+def spread(left: np.ndarray) -> float:
+    """Standard deviation of residuals of several levels, robust: one may be nothing but noise."""
+    return float(_NORMAL * np.median(np.abs(left)))

@@ -305,7 +305,8 @@ def _kept(
         around[k] = near[count[near] > 0]
     keep, size = np.ones(len(velocity), bool), np.ones(len(velocity))
     for k in tried:
-        limit = LIMIT * max(spread(left[around[k]], count[around[k]]), _LEAST_SPREAD)
+        scaled = left[around[k]] * np.sqrt(count[around[k]] / (count[around[k]] - 3))
+        limit = LIMIT * max(spread(scaled), _LEAST_SPREAD)
         keep[members[k]] = np.abs(left[members[k]]) <= limit
     # the fit of three lines is poor: by the wind of all that are kept, more may be
     for _ in range(_ROUNDS):
@@ -316,8 +317,7 @@ def _kept(
             left[index], size[index] = refitted(design[index], velocity[index], before[index])
         for k in refit:
             near = around[k][before[around[k]]]
-            scale = math.sqrt(float(np.mean((left[near] / size[near]) ** 2)))
-            limit = LIMIT * max(scale, _LEAST_SPREAD)
+            limit = LIMIT * max(spread(left[near] / size[near]), _LEAST_SPREAD)
             keep[members[k]] = np.abs(left[members[k]]) <= limit * size[members[k]]
         if (keep == before).all():
             break

@@ -143,7 +143,7 @@ def test_outliers_are_left_out_and_air_is_not():
     # what is uniform in +-19 m/s is within a few m/s of the truth now and then
     assert 0.65 * bad.sum() < int(winds["outliers"].sum()) < 1.02 * bad.sum() + 6
     for k, name in enumerate("uvw"):
-        # lines that are left out, and those that cannot be told, move the wind by less than its error
+        # lines that are left out, and those that cannot be told, move it by less than its error
         assert (np.abs(winds[name] - clean[name]) < winds[f"{name}_stderr"]).all()
         assert (np.abs(winds[name] - truth[:, k]) < 4 * winds[f"{name}_stderr"]).all()
     velocity[:, 3] = random.uniform(-19, 19, 60)
