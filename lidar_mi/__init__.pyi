@@ -2,6 +2,7 @@
 
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
+from .encounter.export_control import export_control
 from .encounter.fly import Flights, fly
 from .encounter.pose import AircraftPose
 from .encounter.virtual_lidar import VirtualLidar
@@ -58,6 +59,7 @@ __all__ = [
     "doctor",
     "experiments",
     "export",
+    "export_control",
     "fit_vortices",
     "fit_vortices_to_wind",
     "fit_winds_to_lines",
