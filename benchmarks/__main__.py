@@ -12,6 +12,7 @@ from .measure import fresh_process
 
 COMPARISONS = (
     "estimators",
+    "candidates",
     "dense",
     "transient",
     "velocimetry",

@@ -65,9 +65,9 @@ FLOORS = {
     "experiment": (("schema",), ("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (
         ("images", "rings"),
-        ("correlation", "channels", "lines"),
+        ("correlation", "channels", "lines", "lines_of_sight"),
         ("flow", "defects"),
-        ("vortices",),
+        ("along_path", "vortices"),
         ("wind",),
     ),
 }

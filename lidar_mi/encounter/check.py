@@ -10,7 +10,7 @@ from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
 from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
-from lidar_mi.encounter.wake import encounter_of, vortices_in_plane
+from lidar_mi.encounter.wake import described_wake, encounter_of, vortices_in_plane
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import silent
@@ -60,12 +60,14 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
             f"{strength:.1%} of the ailerons'; expected turbulence or a wake"
         )
     slabs = _slabs_in_view(experiment, gates)
-    if encounter.control.mode == "feedforward" and not has_wake:
-        found.append(
-            "encounter.air.wake: false leaves the lidar no vortices to track: its flight is that "
-            "of the autopilot; expected true, or encounter.control.mode: perfect"
-        )
-    elif encounter.control.mode == "feedforward" and slabs < _LEAST_SLABS:
+    control = encounter.control
+    if control.mode == "feedforward" and not has_wake:
+        if control.preview == "pair":
+            found.append(
+                "encounter.air.wake: false leaves the lidar no vortices to track: its flight is "
+                "that of the autopilot; expected true, or encounter.control.preview: wind"
+            )
+    elif control.mode == "feedforward" and slabs < _LEAST_SLABS:
         found.append(
             f"encounter.look_ahead: the images hold both vortices in {slabs} slabs; a track needs "
             f"{_LEAST_SLABS} (expected a wider image, wake.vortex_pair.width and height)"
@@ -110,6 +112,7 @@ def sections(
             f"{_strongest(experiment, aircraft_of(encounter)):.0%} of the ailerons'",
         ),
     ]
+    rows += described_wake(experiment)
     if encounter.air is not None:
         rows += described(encounter.air, path)
     has_wake = encounter.air is None or encounter.air.wake

@@ -117,9 +117,11 @@ def simulate_flights(
     processes, scans
         As `VirtualLidar` takes them.
     """
+    from lidar_mi.encounter.arrivals import arrivals_dataset
     from lidar_mi.encounter.preview import WakeTracker, preview_in
     from lidar_mi.encounter.series import flights_dataset, track_dataset
     from lidar_mi.encounter.slab_recorder import SlabRecorder
+    from lidar_mi.encounter.wind_ahead import WindAhead
 
     encounter = encounter_of(experiment)
     wake = air_along_path(experiment)
@@ -144,8 +146,12 @@ def simulate_flights(
             period = 1 / encounter.rate
             stride = period * encounter.path.speed
             tracker = WakeTracker(instrument, period, stride, _last_scan(encounter), recorder.add)
+            if encounter.control.preview == "wind":
+                span = 2 * float(np.abs(model.strips.places[:, 1]).max())
+                tracker.ahead = WindAhead(stride, span)
             found[mode] = fly(steering, preview_at=partial(tracker.preview, model))
             track, slabs = track_dataset(tracker.slabs, wake), recorder.dataset()
+            track = track.merge(arrivals_dataset(tracker.arrivals, wake))
     # from no help to all help; simulated in another order, so that the slow one comes last
     order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in found]
     series = flights_dataset({mode: found[mode] for mode in order})

@@ -1,10 +1,11 @@
-"""From the lidar's estimates to the loads of the wake ahead.
+"""From the lidar's estimates to the loads of the wind ahead.
 
 The wind expected in a plane is that of the track there, predicted to the time of arrival. A lost
-track remains valid for its slabs that are still ahead of the aircraft.
+track remains valid for its slabs that are still ahead of the aircraft. With a `WindAhead` the wind
+of the air about the vortices is that of the slabs' vectors.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol, runtime_checkable
@@ -14,12 +15,17 @@ import torch
 from numpy.typing import ArrayLike
 
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Wind, loads_in_wind
+from lidar_mi.encounter.arrivals import Arrival, wing_places
 from lidar_mi.encounter.control import Preview
 from lidar_mi.encounter.estimate import Estimate
+from lidar_mi.encounter.planning import HORIZON
 from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.encounter.wind_ahead import WindAhead
+from lidar_mi.retrieval.vortices.model import widened
 from lidar_mi.retrieval.vortices.model import wind as pair_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.track import Track, first_track, updated
+from lidar_mi.retrieval.vortices.track_motion import MEAN_WIND
 
 # Slabs beyond the newest one that a track still predicts: as many as it may miss before it is lost.
 _SLABS_BEYOND = 5
@@ -59,8 +65,13 @@ class WakeTracker:
         Time of the last scan, s.
     on_estimate : callable, optional
         Called with the lidar's estimate after every scan.
+    ahead : WindAhead, optional
+        Learns the wind about the vortices from the vectors; without it the wind is that of the
+        track alone.
     slabs : list of Slab
         Those that were delivered, in their order.
+    arrivals : list of Arrival
+        With `ahead`: the wind expected on the wing as it reached each slab.
     """
 
     lidar: Lidar
@@ -68,7 +79,9 @@ class WakeTracker:
     stride: float
     latest: float = np.inf
     on_estimate: Callable[[Estimate], None] | None = None
+    ahead: WindAhead | None = None
     slabs: list[Slab] = field(default_factory=list)
+    arrivals: list[Arrival] = field(default_factory=list)
     _undelivered: list[Estimate] = field(default_factory=list)
     _usable: list[Track] = field(default_factory=list)
     _scans: int = 0
@@ -91,7 +104,8 @@ class WakeTracker:
                 self.on_estimate(estimate)
         # latency: what the lidar has not delivered is not known yet
         while self._undelivered and self._undelivered[0].delivered <= state.time + 1e-9:
-            self._track(self._undelivered.pop(0))
+            self._track(self._undelivered.pop(0), state.x)
+        self._arrive(state)
 
     @property
     def track(self) -> Track | None:
@@ -109,27 +123,38 @@ class WakeTracker:
         """Expected u, v, w (m/s) at places (m, path frame) and times (s); u is not tracked.
 
         Places and times broadcast. The wind of each place is that of the usable track with the slab
-        nearest to it.
+        nearest to it. With `ahead` it is that of its vortices, and of the air about them; beyond
+        the track it fades over the `HORIZON` of control, as a lost preview does.
         """
         x, y, z, time = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
-        away = [np.abs(x[..., None] - [one.x for one in t.slabs]).min(-1) for t in self._usable]
-        nearest = np.argmin(away, axis=0)
         # u stays 0: the pair of two images has no wind along the path
-        u, v, w = found = np.zeros((3, *x.shape))
-        for k, track in enumerate(self._usable):
-            here = nearest == k
-            theta = torch.as_tensor(track.parameters_at(x[here], time[here]))
-            at_y, at_z = (torch.as_tensor(a[here]) for a in (y, z))
-            found[1:, here] = pair_wind(theta, at_y, at_z, track.profile).numpy()
+        found = np.zeros((3, *x.shape))
+        if self.ahead is None:
+            found[1:] = _tracked(self._usable, x, y, z, time)
+        else:
+            if self._usable:
+                found[1:] = self._vortices(x, y, z, time)
+            if self.ahead:
+                found[1:] += self.ahead.at(x, y, z, time, error=False)[0]
+        u, v, w = found
         return u, v, w
 
+    def _vortices(
+        self, x: np.ndarray, y: np.ndarray, z: np.ndarray, time: np.ndarray, width: float = 0.0
+    ) -> np.ndarray:
+        """Those of the usable tracks alone, without mean wind; see `wind_ahead.Vortices`."""
+        end = self._usable[-1].x + _SLABS_BEYOND * self.stride
+        fraction = np.clip(1 - (x - end) / (HORIZON * self.stride / self.period), 0.0, 1.0)
+        return fraction * _tracked(self._usable, x, y, z, time, vortices=width)
+
     def preview(self, aircraft: AircraftModel, state: AircraftState) -> Preview | None:
-        """The loads expected by the track from a state on; None while there is none.
+        """The loads expected from a state on; None while nothing is known.
 
         Calls `update` first.
         """
         self.update(state)
-        return preview_in(self.wind, aircraft, state) if self.covers(state.x) else None
+        known = self.covers(state.x) or bool(self.ahead)
+        return preview_in(self.wind, aircraft, state) if known else None
 
     def _expected(self) -> VortexPairFit | None:
         """The pair that the track expects in the slab that the next scan completes."""
@@ -139,7 +164,19 @@ class WakeTracker:
         x, time = self._last_slab
         return track.pair_at(x + self.stride, time + self.period)
 
-    def _track(self, estimate: Estimate) -> None:
+    def _arrive(self, state: AircraftState) -> None:
+        """Record the wind expected on the wing in the slabs that it has reached."""
+        while self.ahead and len(self.arrivals) < len(self.slabs):
+            slab = self.slabs[len(self.arrivals)].estimate
+            if slab.x > state.x:
+                break
+            y = state.y + wing_places(self.ahead.span)
+            x, z, time = (np.full_like(y, a) for a in (slab.x, state.z, state.time))
+            _, stderr = self.ahead.at(x, y, z, time)
+            found = np.stack(self.wind(x, y, z, time)[1:])
+            self.arrivals.append(Arrival(slab.x, state.time, y, state.z, found, stderr))
+
+    def _track(self, estimate: Estimate, place: float) -> None:
         before, pair, found = self.track, estimate.pair, None
         if before is not None:
             found = updated(before, pair, estimate.x, estimate.time)
@@ -152,6 +189,35 @@ class WakeTracker:
             last = self._usable[-1].x if self._usable else None
             continued = any(slab.x == last for slab in found.slabs)
             self._usable[len(self._usable) - continued :] = [found]
+        if self.ahead is not None and estimate.wind is not None:
+            vortices = self._vortices if self._usable else None
+            self.ahead.add(estimate.x, estimate.time, estimate.wind, vortices, place)
+
+
+def _tracked(
+    tracks: Sequence[Track],
+    x: np.ndarray,
+    y: np.ndarray,
+    z: np.ndarray,
+    time: np.ndarray,
+    vortices: float | None = None,
+) -> np.ndarray:
+    """v and w (2, ...) of the track with the slab nearest to each place.
+
+    With `vortices` those of the vortices alone, in a Gaussian mean of this standard deviation, m.
+    """
+    away = [np.abs(x[..., None] - [one.x for one in t.slabs]).min(-1) for t in tracks]
+    nearest = np.argmin(away, axis=0)
+    found = np.zeros((2, *x.shape))
+    for k, track in enumerate(tracks):
+        here = nearest == k
+        theta = torch.as_tensor(track.parameters_at(x[here], time[here]))
+        if vortices is not None:
+            theta[MEAN_WIND] = 0.0
+            theta = widened(theta, vortices)
+        at_y, at_z = (torch.as_tensor(a[here]) for a in (y, z))
+        found[:, here] = pair_wind(theta, at_y, at_z, track.profile).numpy()
+    return found
 
 
 def preview_in(wind: Wind, aircraft: AircraftModel, state: AircraftState) -> Preview:

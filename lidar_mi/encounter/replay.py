@@ -16,6 +16,7 @@ from lidar_mi.encounter.estimate import Estimate
 from lidar_mi.encounter.flight import FEEDFORWARD, FlightData
 from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.series import ESTIMATED, MEASURED
+from lidar_mi.encounter.vector_record import wind_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import value_at
@@ -67,7 +68,8 @@ class RecordedLidar:
         one = self.track.isel(slab=number)
         flags = tuple(text for text in str(one["flags"].values).split("; ") if text)
         seconds = {"total": float(one["seconds"])}
-        return Estimate(valid, delivered, float(one["x"]), None, _pair(one), flags, seconds)
+        wind = wind_of(self.track, number)
+        return Estimate(valid, delivered, float(one["x"]), wind, _pair(one), flags, seconds)
 
 
 def _pair(one: xr.Dataset) -> VortexPairFit | None:

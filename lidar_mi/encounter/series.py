@@ -11,6 +11,7 @@ from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftState, Commands
 from lidar_mi.encounter.preview import Slab
 from lidar_mi.encounter.strips import Loads
+from lidar_mi.encounter.vector_record import recorded_vectors
 from lidar_mi.encounter.wake import vortices_in_plane
 from lidar_mi.retrieval.vortices.model import PARAMETERS
 from lidar_mi.retrieval.vortices.pair import MEANING, VortexPairFit
@@ -135,7 +136,8 @@ def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
     -------
     xr.Dataset, dims (slab) and (source, slab)
         The quantities `QUANTITIES`, with their standard errors, for `SOURCES`; NaN where there is
-        none. `ESTIMATED` has the fits as they were delivered.
+        none. `ESTIMATED` has the fits as they were delivered; the vectors are those of
+        `recorded_vectors`.
     """
     rows = [_row(slab, wake) for slab in slabs]
     found = xr.Dataset(
@@ -154,7 +156,8 @@ def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
             about = {"units": units, "long_name": f"standard error of {text}" if suffix else text}
             found[name + suffix] = (("source", "slab"), values.reshape(len(SOURCES), -1), about)
     fits = _fits([slab.estimate.pair for slab in slabs])
-    return found.merge(fits).assign_attrs(fits.attrs)
+    vectors = recorded_vectors([slab.estimate for slab in slabs])
+    return found.merge(fits).merge(vectors).assign_attrs(fits.attrs | vectors.attrs)
 
 
 def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:

@@ -12,6 +12,7 @@ FLIGHT_FILES = {"series": "flight.nc", "track": "track.nc", "slabs": "slabs.nc"}
 """Of the time series of flights, of the lidar's track, of images and wind vectors of its slabs."""
 
 _SIDES = ("port", "starboard")
+_FOR_A_REPLAY = ["parameter", "parameter_2", "vector_row", "vector_column", "arrival"]
 
 
 def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Dataset]]:
@@ -32,8 +33,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
     if files["series"].is_file():
         yield "flight", read_netcdf(files["series"]).set_coords(["x", "y", "z"])
     if files["track"].is_file():
-        # parameters with their covariances are for a replay
-        track = read_netcdf(files["track"]).drop_dims(["parameter", "parameter_2"], errors="ignore")
+        # parameters with their covariances, and vectors, are for a replay
+        track = read_netcdf(files["track"]).drop_dims(_FOR_A_REPLAY, errors="ignore")
         if placed:
             yield from ((f"vortices_{name}", _points(track, name)) for name in _sources(track))
         else:

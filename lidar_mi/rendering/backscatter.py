@@ -264,6 +264,7 @@ def scene_dict(
             "covariance": mi.is_polarized,
             "shares": True,
             "estimator": settings.estimator,
+            "candidates": settings.candidates,
             "samples_per_pass": samples_at_once(
                 settings.given_per_pass, settings.memory, mi.variant()
             ),

@@ -29,6 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import __main__ as command
 from benchmarks import (
+    candidates,
     cases,
     estimators,
     fringes,
@@ -218,6 +219,13 @@ def test_fraction_of_contributing_analog_samples_is_the_optical_depth_of_the_gat
     ]
     assert parts[2].other == pytest.approx(parts[0].other * parts[1].other, rel=0.5)
     assert len({name for name, _ in found}) == 4
+
+
+def test_candidates_lower_the_variance(variant):
+    found = lines(candidates.compare(2, 64, 15, 9))
+    for order in (1, 4):
+        case = f"orders up to {order}, 64 samples per beam"
+        assert found[case, "relative variance of a pixel"].ratio > 1.5
 
 
 @pytest.mark.slow

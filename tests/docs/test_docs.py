@@ -192,6 +192,8 @@ def _unit(field):
             (units.Energy, "J"),
             (units.Extinction, "1/m"),
             (units.Circulation, "m²/s"),
+            (units.DissipationRate, "m²/s³"),
+            (units.Mass, "kg"),
             (units.Frequency, "Hz"),
             (units.Shear, "1/s"),
             (units.SpectralRadiance, "W/m³/sr"),

@@ -13,6 +13,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.encounter_hazard import is_hazardous, roll_control_ratio
 from lidar_mi.assessment.metrics.load_increments import INCREMENTS, load_increments
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
+from lidar_mi.assessment.metrics.wind_ahead import wind_ahead_metrics
 
 CONTROLLER = "controller"
 """Attribute of the time series: the name of a controller of one's own."""
@@ -74,7 +75,8 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
     for quantity in ("largest_roll", "largest_roll_rate", *INCREMENTS):
         found |= _removed(found, quantity)
     if track is not None:
-        found |= {f"encounter.{k}": v for k, v in _tracking(series, track).items()}
+        more = _tracking(series, track) | wind_ahead_metrics(track)
+        found |= {f"encounter.{k}": v for k, v in more.items()}
     return {key: value for key, value in found.items() if np.isfinite(value)}
 
 

@@ -48,6 +48,11 @@ _OF_THE_LIDAR = (
     ("tracked.core_error", "largest error of a core from then on", "m", 1.0),
     ("tracked.within_2_sigma", "parameters within 2 stated errors from then on", "%", 100.0),
     ("normalised_innovation", "normalised innovation (1 = as stated)", "", 1.0),
+    ("wind_ahead.w_error", "error of w expected on the wing (rms)", "m/s", 1.0),
+    ("wind_ahead.w_rms", "w on the wing (rms)", "m/s", 1.0),
+    ("wind_ahead.v_error", "error of v expected on the wing (rms)", "m/s", 1.0),
+    ("wind_ahead.within_1_sigma", "winds within 1 stated error", "%", 100.0),
+    ("wind_ahead.within_2_sigma", "winds within 2 stated errors", "%", 100.0),
 )
 
 _FLIGHT = {

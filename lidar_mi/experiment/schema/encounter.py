@@ -12,6 +12,7 @@ from lidar_mi.units import (
     Angle,
     AngularRate,
     Area,
+    DissipationRate,
     Frequency,
     Inertia,
     Length,
@@ -70,23 +71,51 @@ class Path(Section):
 
 
 class Crow(Section):
-    """Sinusoidal deformation of both vortices, in planes inclined by 45 degrees (Crow 1970)."""
+    """Sinusoidal deformation of both vortices (Crow 1970)."""
 
+    model: Literal["tangents", "filaments"] = Field(
+        "tangents",
+        description="tangents: the flow of straight lines that touch the bent ones, which do not "
+        "grow; filaments: Biot-Savart's law, growth with the wake's age, rings once linked",
+    )
     amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = Field(
-        0.0, description="of the deformation"
+        0.0, description="of the deformation; of filaments that at age 0"
     )
     wavelength: Annotated[Length, Within(1, 100000, "8.6 separations")] | None = Field(
         None, description="default: 8.6 separations"
+    )
+    phase: Annotated[Angle, Within(-6.2832, 6.2832, "one wave")] = Field(
+        0.0, description="of the sine at the wake's centre, along its axis"
     )
 
 
 class WakeInTime(Section):
     """How the wake changes in time and along its axis, in addition to its drift."""
 
+    age: Annotated[Time, Within(0, 1e5, "a wake's life")] = Field(
+        0.0, description="of the wake at the start of the flight"
+    )
     decay_time: Annotated[Time, Within(1, 1e9, "a wake's life")] | None = Field(
         None, description="in which circulation falls to 1/e; default: it stays"
     )
+    dissipation_rate: (
+        Annotated[DissipationRate, Within(0, 1, "from calm air to a thunderstorm")] | None
+    ) = Field(None, description="of turbulence, in which circulation decays (Sarpkaya 2000)")
     crow: Crow = Crow()
+    ends: Literal["mirror", "blend", "refuse"] = Field(
+        "mirror",
+        description="of a simulated volume that is not periodic: mirrored at its ends, its ends "
+        "blended into each other, or refused",
+    )
+    ends_length: Annotated[Length, Within(0.1, 10000, "part of a volume")] = Field(
+        5.0, description="over which ends are blended, or u falls to 0 at a mirror"
+    )
+
+    @model_validator(mode="after")
+    def _one_decay(self) -> "WakeInTime":
+        if self.decay_time is not None and self.dissipation_rate is not None:
+            raise ValueError("expected one of decay_time and dissipation_rate")
+        return self
 
 
 class Aircraft(Section):
@@ -135,6 +164,9 @@ class Control(Section):
 
     mode: Literal["off", "feedforward", "perfect"] = Field(
         "feedforward", description="off: the wings are levelled; perfect: knows the truth"
+    )
+    preview: Literal["pair", "wind"] = Field(
+        "pair", description="pair: the tracked vortices alone; wind: with the vectors' wind ahead"
     )
     latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
         0.12, description="from the second scan of a slab to its estimate"

@@ -80,6 +80,19 @@ def wind(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile
     return torch.stack([v, w])
 
 
+def widened(theta: torch.Tensor, width: float) -> torch.Tensor:
+    """Parameters (10, ...) of the wind's mean over a Gaussian of standard deviation `width` (m).
+
+    The vorticity of a Lamb-Oseen vortex is a Gaussian of variance r_c^2 / (2 1.2564), to which that
+    of the mean adds. That of Burnham and Hallock is widened as much, which is right far away.
+    """
+    found = theta.clone()
+    for radius in (1, 5):
+        square = (2 * theta[radius]).exp() + 2 * _LAMB_OSEEN * width**2
+        found[radius] = square.log() / 2
+    return found
+
+
 class Rotation(NamedTuple):
     """Rotation of the air at places about one vortex, tensors (...).
 

@@ -96,6 +96,14 @@ def test_page_has_frames_and_their_script():
     assert f"slabs per second</td><td {row}" in html and 'table class="many"' in html
 
 
+def test_page_has_the_video_and_the_animation_for_browsers_without():
+    shown = Film("The flight", "Frames.", [(b"one", "0.1 s")], 0.2, b"film", "approach.gif")
+    chapter = encounter_chapter(numbers(off=25), [], [], shown)
+    html = page(check(encounter_keys(), "test"), "name: x", {"lidar-mi": "0"}, {}, [chapter])
+    assert "<video controls" in html and 'src="data:video/mp4;base64,ZmlsbQ=="' in html
+    assert 'src="approach.gif"' in html and "for (const film of" not in html
+
+
 @pytest.mark.parametrize("mode", ["off", "perfect"])
 def test_flights_without_a_lidar_have_no_verdict(mode):
     assert encounter_chapter(numbers(**{mode: 3}), [], []).verdict is None

@@ -1,0 +1,27 @@
+"""The wind expected on the wing at its arrival against the wind that it meets."""
+
+import numpy as np
+import xarray as xr
+
+
+def wind_ahead_metrics(track: xr.Dataset) -> dict[str, float]:
+    """Rms errors (m/s) of v and w, rms of both, and fractions within one and two stated errors.
+
+    Parameters
+    ----------
+    track : xr.Dataset
+        With the wind expected at arrivals, dims (arrival, place); without it there are no metrics.
+    """
+    if "arrival_v" not in track:
+        return {}
+    found, normalised = {}, []
+    for name in "vw":
+        truth = track[f"arrival_{name}_true"].values
+        off = track[f"arrival_{name}"].values - truth
+        found[f"wind_ahead.{name}_error"] = float(np.sqrt(np.mean(off**2)))
+        found[f"wind_ahead.{name}_rms"] = float(np.sqrt(np.mean(truth**2)))
+        stderr = np.maximum(track[f"arrival_{name}_stderr"].values, np.finfo(float).tiny)
+        normalised.append(np.abs(off) / stderr)
+    for count in (1, 2):
+        found[f"wind_ahead.within_{count}_sigma"] = float(np.mean(np.array(normalised) <= count))
+    return found

@@ -1,0 +1,348 @@
+"""One component of the wind along a path: Kalman's filter and smoother from slab to slab.
+
+The field that the vectors are means of is known in a plane by its values at the nodes of a lattice,
+whose principal components are the state. Along the path every one of them has an exponential
+correlation, so that a recursive filter gives what the Gaussian process of all slabs at once gives
+(Hartikainen and Särkkä 2010).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from lidar_mi.retrieval.along_path.statistics import Statistics, error_correlation
+from lidar_mi.retrieval.along_path.vectors import ACROSS, SlabVectors
+from lidar_mi.retrieval.along_path.von_karman import covariance, lattice_covariance
+
+# Principal components of less variance than this, over the largest, are not known.
+_LEAST = 1e-6
+# Variance of vectors without error, m^2/s^2.
+_ROUNDING = 1e-12
+# Times from slab to arrival are taken alike within such steps, s.
+_TIME_STEP = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Principal components of a component of the wind in a plane, for turbulence of variance 1.
+
+    Attributes
+    ----------
+    component : {"v", "w"}
+    length, resolution : float
+        Of `Statistics`, m.
+    axes : two ndarrays, shapes (ny,) and (nz,)
+        y and z of the lattice's nodes, m.
+    weights : ndarray, shape (nodes, states)
+        From covariances with the nodes to values per state.
+    variance, reach : ndarray, shape (states,)
+        Of each principal component, and its correlation length along the path, m.
+    """
+
+    component: str
+    length: float
+    resolution: float
+    axes: tuple[np.ndarray, np.ndarray]
+    weights: np.ndarray
+    variance: np.ndarray
+    reach: np.ndarray
+
+    def mean(self, places: np.ndarray) -> np.ndarray:
+        """Values per state (n, states) of a mean as a vector's at y and z (n, 2), m."""
+        return self._with_nodes(places, 2 * self.resolution**2, 0.0)
+
+    def point(self, places: np.ndarray, swept: float) -> np.ndarray:
+        """Values per state (n, states) of the wind at y and z (n, 2), m, itself.
+
+        `swept` is the variance of the displacement since the slab was seen, m^2.
+        """
+        return self._with_nodes(places, self.resolution**2, swept)
+
+    def _with_nodes(self, places: np.ndarray, across: float, swept: float) -> np.ndarray:
+        y, z = (place[:, None] - axis for place, axis in zip(places.T, self.axes, strict=True))
+        found = lattice_covariance(self.component, y, z, self.length, across, swept)
+        return found.reshape(len(places), -1) @ self.weights
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Nodes in a plane about the path; as they are hashable, bases on them can be stored.
+
+    Attributes
+    ----------
+    half_width, half_height : float
+        The least reach of the nodes, m.
+    spacing : float
+        m.
+    y, z : float
+        Place of one of the nodes, m.
+    """
+
+    half_width: float
+    half_height: float
+    spacing: float
+    y: float = 0.0
+    z: float = 0.0
+
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """y and z of the nodes, m."""
+        axes = []
+        for half, start in ((self.half_width, self.y), (self.half_height, self.z)):
+            count = np.ceil((half + abs(start)) / self.spacing)
+            nodes = start + self.spacing * np.arange(-count, count + 1)
+            # one node beyond the reach on either side: those farther are not needed
+            axes.append(nodes[np.abs(nodes) < half + self.spacing])
+        return axes[0], axes[1]
+
+    def through(self, vectors: SlabVectors) -> "Lattice":
+        """The lattice on the places of vectors, to a quarter of its spacing."""
+        step = self.spacing / 4
+        y, z = (
+            float(np.rint(np.mod(axis[0], self.spacing) / step) * step) % self.spacing
+            for axis in (vectors.y, vectors.z)
+        )
+        return replace(self, y=y, z=z)
+
+
+@lru_cache(maxsize=64)
+def basis(
+    component: str, length: float, resolution: float, stride: float, lattice: Lattice
+) -> Basis:
+    """The principal components on a lattice; each has its correlation over the `stride` (m)."""
+    axes = lattice.axes
+    y, z = (np.subtract.outer(a.ravel(), a.ravel()) for a in np.meshgrid(*axes))
+    across = 2 * resolution**2
+    here, there = (covariance(component, lag, y, z, length, across) for lag in (0.0, stride))
+    variance, vectors = np.linalg.eigh(here)
+    some = variance > _LEAST * variance[-1]
+    variance, vectors = variance[some], vectors[:, some]
+    decay = np.einsum("nm,nk,km->m", vectors, there, vectors) / variance
+    reach = -stride / np.log(np.clip(decay, 1e-3, 1 - 1e-9))
+    return Basis(component, length, resolution, axes, vectors / variance, variance, reach)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """How the vectors of a slab depend on the state, and what they say of it.
+
+    Attributes
+    ----------
+    used : ndarray, shape (nz, ny)
+        Vectors over the lattice that are not rejected.
+    gain : ndarray, shape (states, used)
+        From the vectors to the information on the state, H' R^-1.
+    information : ndarray, shape (states, states)
+        H' R^-1 H.
+    """
+
+    used: np.ndarray
+    gain: np.ndarray
+    information: np.ndarray
+
+
+def observation(
+    one: Basis, statistics: Statistics, vectors: SlabVectors, extra: np.ndarray | float = 0.0
+) -> Observation:
+    """Of the vectors over the lattice.
+
+    Parameters
+    ----------
+    one : Basis
+    statistics : Statistics
+    vectors : SlabVectors
+    extra : ndarray, shape (nz, ny), or float
+        Variance of each vector beyond its stated one, m^2/s^2.
+    """
+    number = ACROSS.index(one.component)
+    y, z = np.meshgrid(vectors.y, vectors.z)
+    reach = [np.abs(axis).max() + vectors.window / 4 for axis in one.axes]
+    used = vectors.valid & (np.abs(y) <= reach[0]) & (np.abs(z) <= reach[1])
+    if not used.any():
+        states = len(one.variance)
+        return Observation(used, np.zeros((states, 0)), np.zeros((states, states)))
+    places = np.stack([y[used], z[used]], -1)
+    forward = _forward(one, places.tobytes())
+    stderr = statistics.scale * vectors.stderr[number][used]
+    errors = stderr[:, None] * error_correlation(places, one.resolution) * stderr
+    errors += vectors.common[number] ** 2
+    arm = places[:, 1 - number] - vectors.centre[1 - number]
+    errors += vectors.rotation**2 * np.outer(arm, arm)
+    # what the states do not describe
+    whole = float(covariance(one.component, 0.0, 0.0, 0.0, one.length, 2 * one.resolution**2))
+    missing = np.maximum(whole - forward**2 @ one.variance, 0.0)
+    own = statistics.sigma**2 * missing + np.broadcast_to(extra, used.shape)[used]
+    # of errors of 0 the covariance would be singular
+    errors[np.diag_indices(len(errors))] += own + _ROUNDING
+    gain = cho_solve(cho_factor(errors), forward).T
+    return Observation(used, gain, gain @ forward)
+
+
+# slabs seen from a straight path have their vectors at the same places
+@lru_cache(maxsize=128)
+def _forward(one: Basis, places: bytes) -> np.ndarray:
+    return one.mean(np.frombuffer(places).reshape(-1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class PathField:
+    """A component of the wind along the path, as known from all slabs.
+
+    Attributes
+    ----------
+    basis : Basis
+    statistics : Statistics
+    x, time : ndarray, shape (slabs,)
+        m, ascending, and s.
+    mean : ndarray, shape (slabs, states)
+    covariance : ndarray, shape (slabs, states, states)
+    cross : ndarray, shape (slabs - 1, states, states)
+        Covariance of each slab's state with that of the next one.
+    swept_speed : float
+        Rms speed at which eddies are swept past a place, m/s.
+    """
+
+    basis: Basis
+    statistics: Statistics
+    x: np.ndarray
+    time: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    cross: np.ndarray
+    swept_speed: float
+
+    def at(
+        self, x: np.ndarray, y: np.ndarray, z: np.ndarray, time: np.ndarray, *, error: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The wind expected at places (n,), m, and times (n,), s, and its standard error, m/s.
+
+        Between two slabs it depends on both, beyond the last ones it falls to zero with the
+        correlation of the turbulence. Without `error` the standard error is zero.
+        """
+        right = np.clip(np.searchsorted(self.x, x), 1, max(1, len(self.x) - 1))
+        left = right - 1 if len(self.x) > 1 else np.zeros_like(right)
+        right = np.minimum(right, len(self.x) - 1)
+        to_left, to_right = x - self.x[left], self.x[right] - x
+        one, other = self._weights(to_left, to_right, right > left)
+        state = one * self.mean[left] + other * self.mean[right]
+        span = np.where(right > left, self.x[right] - self.x[left], 1.0)
+        fraction = np.clip(to_left / span, 0.0, 1.0)
+        seen = (1 - fraction) * self.time[left] + fraction * self.time[right]
+        steps = np.rint(np.abs(time - seen) / _TIME_STEP).astype(int)
+        # complex numbers: rows are sorted a tenth as fast
+        unlike, back = np.unique(y + 1j * z, return_inverse=True)
+        places = np.stack([unlike.real, unlike.imag], -1)
+        found, stderr = np.zeros_like(x), np.zeros_like(x)
+        for step in np.unique(steps):
+            here = steps == step
+            swept = (self.swept_speed * step * _TIME_STEP) ** 2
+            value = self.basis.point(places, swept)[back[here]]
+            found[here] = (value * state[here]).sum(-1)
+            if error:
+                stderr[here] = self._stderr(
+                    value, one[here], other[here], left[here], right[here],
+                    to_left[here], to_right[here],
+                )  # fmt: skip
+        return found, stderr
+
+    def _weights(
+        self, to_left: np.ndarray, to_right: np.ndarray, two: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of the states of two slabs, (n, states): simple kriging with an exponential."""
+        reach = self.basis.reach
+        a, b = to_left[:, None] / reach, to_right[:, None] / reach
+        inside = (two & (to_left > 0) & (to_right > 0))[:, None]
+        # one slab alone, or beyond both: the nearest
+        nearer = np.where(two, to_left > 0, False)[:, None]
+        with np.errstate(over="ignore", invalid="ignore"):
+            both = np.sinh(np.where(inside, a + b, 1.0))
+            one = np.where(inside, np.sinh(b) / both, np.where(nearer, 0.0, np.exp(-np.abs(a))))
+            other = np.where(inside, np.sinh(a) / both, np.where(nearer, np.exp(-np.abs(b)), 0.0))
+        return one, other
+
+    def _stderr(
+        self,
+        value: np.ndarray,
+        one: np.ndarray,
+        other: np.ndarray,
+        left: np.ndarray,
+        right: np.ndarray,
+        to_left: np.ndarray,
+        to_right: np.ndarray,
+    ) -> np.ndarray:
+        reach, sigma = self.basis.reach, self.statistics.sigma
+        a, b = (np.exp(-np.abs(d)[:, None] / reach) for d in (to_left, to_right))
+        # of the state, given the states of the slabs without error
+        bridge = np.maximum(1 - one * a - other * b, 0.0) * self.basis.variance
+        prior = (value**2 * self.basis.variance).sum(-1)
+        variance = sigma**2 * (np.maximum(1 - prior, 0.0) + (value**2 * bridge).sum(-1))
+        from_left, from_right = value * one, value * other
+        pairs = ((from_left, left, from_left), (from_right, right, from_right))
+        for first, slab, second in pairs:
+            variance += np.einsum("nm,nmk,nk->n", first, self.covariance[slab], second)
+        if len(self.cross):
+            both = self.cross[np.minimum(left, len(self.cross) - 1)]
+            variance += 2 * np.einsum("nm,nmk,nk->n", from_left, both, from_right)
+        return np.sqrt(variance)
+
+
+def smoothed(
+    one: Basis,
+    statistics: Statistics,
+    x: Sequence[float],
+    time: Sequence[float],
+    observations: Sequence[Observation],
+    winds: Sequence[np.ndarray],
+    swept_speed: float,
+) -> PathField:
+    """The field from the vectors of slabs: Kalman filter, and smoother of Rauch et al. 1965.
+
+    Parameters
+    ----------
+    one : Basis
+    statistics : Statistics
+    x, time : sequence of float
+        Of the slabs, m, ascending, and s.
+    observations : sequence of Observation
+    winds : sequence of ndarray, shape (nz, ny)
+        The component of each slab's vectors, m/s.
+    swept_speed : float
+        As `PathField` has it.
+    """
+    prior = statistics.sigma**2 * one.variance
+    decays = [np.exp(-step / one.reach) for step in np.diff(x)]
+    filtered, spreads, precisions = [], [], []
+    state, spread = np.zeros(len(prior)), np.diag(prior)
+    for number, (seen, wind) in enumerate(zip(observations, winds, strict=True)):
+        if number:
+            decay = decays[number - 1]
+            state = decay * state
+            spread = decay[:, None] * spread * decay + np.diag(prior * (1 - decay**2))
+        precision = np.linalg.inv(spread)
+        spread = np.linalg.inv(precision + seen.information)
+        state = state + spread @ (seen.gain @ wind[seen.used] - seen.information @ state)
+        filtered.append(state)
+        spreads.append(spread)
+        precisions.append(precision)
+    mean, after = np.array(filtered), np.array(spreads)
+    cross = np.zeros((len(filtered) - 1, len(prior), len(prior)))
+    for number in range(len(filtered) - 2, -1, -1):
+        decay, later = decays[number], number + 1
+        gain = (spreads[number] * decay) @ precisions[later]
+        mean[number] += gain @ (mean[later] - decay * filtered[number])
+        cross[number] = gain @ after[later]
+        # P + G (P_s - P_p) G', with the predicted covariance P_p and the gain G = P D P_p^-1
+        after[number] += cross[number] @ gain.T - gain @ (decay[:, None] * spreads[number])
+    return PathField(
+        one,
+        statistics,
+        np.asarray(x, float),
+        np.asarray(time, float),
+        mean,
+        after,
+        cross,
+        swept_speed,
+    )

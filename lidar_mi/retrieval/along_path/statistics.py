@@ -1,0 +1,216 @@
+"""Statistics of turbulence from vectors: its strength and size, and what the vectors resolve."""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from scipy.fft import dctn
+
+from lidar_mi.retrieval.along_path.vectors import ACROSS, SlabVectors
+from lidar_mi.retrieval.along_path.von_karman import covariance
+
+LENGTHS = tuple(15.0 * 2.0 ** np.arange(7))
+"""Lengths of turbulence that are compared, m: from a wind turbine's wake to cruise."""
+
+RESOLUTIONS = (0.29, 0.4, 0.55, 0.75, 1.0, 1.4, 2.0)
+"""Standard deviations of the mean in a vector, in windows. That of a box is 1/sqrt(12) = 0.29."""
+
+RATIOS = np.geomspace(0.01, 100.0, 36)
+"""True errors of the vectors over the rms of turbulence, in units of stated errors of 1 m/s."""
+
+_SHAPE = (len(LENGTHS), len(RESOLUTIONS), len(RATIOS))
+# Stated errors are known to a factor of 2 before the vectors are compared with each other.
+_KNOWN_TO = np.log(2.0)
+# Slabs over which statistics are remembered: turbulence changes with height.
+_MEMORY = 80
+_BANDS = 10
+# Least rms of turbulence, m/s.
+_LEAST = 1e-3
+# Part of an error that is not correlated with its neighbours'.
+_OWN = 0.03
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What is known of the air and of the vectors before a slab is seen.
+
+    Attributes
+    ----------
+    sigma, length : float
+        Rms of a component (m/s) and length (m) of von Karman's turbulence.
+    resolution : float
+        Standard deviation of the Gaussian mean that a vector is, m.
+    scale : float
+        True over stated errors of the vectors.
+    """
+
+    sigma: float
+    length: float
+    resolution: float
+    scale: float = 1.0
+
+
+def error_correlation(places: np.ndarray, resolution: float) -> np.ndarray:
+    """Correlation of the errors of vectors at places (n, 2), in m: (n, n).
+
+    White noise in a Gaussian mean of standard deviation s has exp(-r^2/(4 s^2)).
+    """
+    square = ((places[:, None] - places) ** 2).sum(-1)
+    smooth = np.exp(-square / (4 * resolution**2))
+    return (1 - _OWN) * smooth + _OWN * np.eye(len(places))
+
+
+@dataclass(frozen=True, eq=False)
+class _Expected:
+    """Mean squares of the cosines of a grid, by band: of turbulence of variance 1, of errors of 1.
+
+    Shapes (lengths, resolutions, 2, bands) of a slab and of two successive ones, (resolutions,
+    bands) of the errors; `band` (nz, ny) numbers the bands.
+    """
+
+    turbulence: np.ndarray
+    lagged: np.ndarray
+    errors: np.ndarray
+    band: np.ndarray
+
+
+@lru_cache(maxsize=16)
+def _expected(shape: tuple[int, int], window: float, stride: float) -> _Expected:
+    nz, ny = shape
+    waves = np.hypot(*np.meshgrid(np.arange(nz) / nz, np.arange(ny) / ny, indexing="ij"))
+    # equally many cosines in each band, but the mean by itself
+    order = waves.ravel().argsort().argsort().reshape(shape)
+    size = max(1.0, (nz * ny - 1) / (_BANDS - 1))
+    band = np.where(order == 0, 0, 1 + ((order - 1) / size).astype(int))
+    counts = np.bincount(band.ravel())
+    lag_z, lag_y = (window * np.arange(1 - n, n) for n in shape)
+    index = [np.subtract.outer(np.arange(n), np.arange(n)) + n - 1 for n in shape]
+
+    def squares(of_lags: np.ndarray) -> np.ndarray:
+        """Mean squares by band of a field with covariances at all lags."""
+        full = of_lags[index[0][:, None, :, None], index[1][None, :, None, :]]
+        once = dctn(full, axes=(0, 1), norm="ortho")
+        both = dctn(once, axes=(2, 3), norm="ortho")
+        variance = np.einsum("zyzy->zy", both)
+        return np.bincount(band.ravel(), variance.ravel()) / counts
+
+    now, lagged = np.zeros((2, len(LENGTHS), len(RESOLUTIONS), len(ACROSS), len(counts)))
+    for (i, length), (j, part), (k, name) in product(
+        enumerate(LENGTHS), enumerate(RESOLUTIONS), enumerate(ACROSS)
+    ):
+        across = 2 * (part * window) ** 2
+        now[i, j, k] = squares(covariance(name, 0.0, lag_y, lag_z[:, None], length, across))
+        lagged[i, j, k] = squares(covariance(name, stride, lag_y, lag_z[:, None], length, across))
+    errors = np.array(
+        [
+            squares(np.exp(-(lag_z[:, None] ** 2 + lag_y**2) / (4 * (part * window) ** 2)))
+            for part in RESOLUTIONS
+        ]
+    )
+    return _Expected(now, lagged, errors, band)
+
+
+@dataclass(eq=False)
+class StatisticsEstimator:
+    """Learns `Statistics` from slab to slab by their likelihood.
+
+    Cosines of a slab are nearly independent (Whittle 1954), and each depends on the same cosine of
+    the slab before (Vecchia 1988, J. R. Stat. Soc. B 50): the likelihood is that of the Gaussian
+    conditional distributions, for every combination of `LENGTHS`, `RESOLUTIONS` and
+    `RATIOS`, each with the variance that is most likely. The prior probability of all is the same
+    but for the scale of the errors; the most probable combination is taken.
+
+    Attributes
+    ----------
+    stride : float
+        From slab to slab, m.
+    """
+
+    stride: float
+    _sums: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
+    _window: float = 0.0
+    _last: tuple[float, np.ndarray] | None = None
+    _sigma: np.ndarray = field(default_factory=lambda: np.ones(_SHAPE))
+
+    def add(self, x: float, vectors: SlabVectors) -> None:
+        """Take in a slab at x (m); a slab with many rejected vectors is not used."""
+        valid = vectors.valid
+        last, self._last = self._last, None
+        if min(valid.shape) < 3 or valid.mean() < 0.7:
+            return
+        self._window = vectors.window
+        wind = np.where(valid, vectors.wind, vectors.wind[:, valid].mean(1)[:, None, None])
+        waves = dctn(wind, axes=(1, 2), norm="ortho")
+        band = self._expected(valid.shape).band.ravel()
+        error = np.mean(vectors.stderr[:, valid] ** 2, 1)
+        common = vectors.common**2 * valid.size
+        # what is finer than this does not count: a mean is a Gaussian only nearly
+        own = _OWN * error[:, None, None]
+        self._last = x, waves
+        for sums in self._sums.values():
+            sums *= 1 - 1 / _MEMORY
+        follows = last is not None and abs(x - last[0] - self.stride) < 0.3 * self.stride
+        if last is not None and follows and last[1].shape == waves.shape:
+            products = (waves**2 + own, waves * last[1], last[1] ** 2 + own)
+        else:
+            # the first one: by itself
+            products = (waves**2 + own, np.zeros_like(waves), np.zeros_like(waves))
+            follows = False
+        sums = self._sums.setdefault(valid.shape, np.zeros((2, 6, len(ACROSS), band.max() + 1)))
+        part = sums[int(follows)]
+        for n, one in enumerate(products):
+            part[n] += [np.bincount(band, a.ravel()) for a in one]
+        part[3] += np.bincount(band)
+        part[4] += error[:, None] * np.bincount(band)
+        # pointing moves the mean of all vectors
+        part[5, :, 0] += common
+
+    def _expected(self, shape: tuple[int, int]) -> _Expected:
+        return _expected(shape, round(self._window, 6), round(self.stride, 6))
+
+    @property
+    def statistics(self) -> Statistics | None:
+        """The most probable ones; None before a slab."""
+        if not self._sums:
+            return None
+        number, logarithm, square = 0.0, np.zeros(_SHAPE), np.zeros(_SHAPE)
+        for shape, sums in self._sums.items():
+            expected = self._expected(shape)
+            for follows, part in enumerate(sums):
+                if part[3].any():
+                    more = _likelihood(expected, part, bool(follows), self._sigma)
+                    number += float(part[3].sum())
+                    logarithm += more[0]
+                    square += more[1]
+        # of a variance common to all the most probable value is known: the mean square
+        sigma = np.sqrt(np.maximum(square / number, _LEAST**2))
+        self._sigma = sigma
+        cost = logarithm + 2 * number * np.log(sigma) + square / sigma**2
+        scale = np.maximum(RATIOS * sigma, 1e-9)
+        cost += (np.log(scale) / _KNOWN_TO) ** 2
+        i, j, k = np.unravel_index(int(cost.argmin()), cost.shape)
+        resolution = RESOLUTIONS[j] * self._window
+        return Statistics(
+            float(sigma[i, j, k]), float(LENGTHS[i]), resolution, float(scale[i, j, k])
+        )
+
+
+def _likelihood(
+    expected: _Expected, sums: np.ndarray, follows: bool, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithms of the variances, and squares over them, of turbulence of variance 1.
+
+    Dims as of `_SHAPE`. Errors that are known are over the `sigma` estimated last (m/s).
+    """
+    now, product, before, count, error, common = sums
+    number = np.maximum(count, 1e-9)
+    noise = RATIOS[:, None, None] ** 2 * expected.errors[:, None, None, :] * (error / number)
+    known = (common + _OWN * error) / number / sigma[..., None, None] ** 2
+    variance = expected.turbulence[:, :, None] + noise + known
+    if not follows:
+        return (count * np.log(variance)).sum((-2, -1)), (now / variance).sum((-2, -1))
+    gain = expected.lagged[:, :, None] / variance
+    remaining = variance * (1 - gain**2)
+    square = now - 2 * gain * product + gain**2 * before
+    return (count * np.log(remaining)).sum((-2, -1)), (square / remaining).sum((-2, -1))
