@@ -19,7 +19,7 @@ from scipy.linalg import block_diag, expm
 
 from lidar_mi.encounter.aircraft import Limits
 from lidar_mi.encounter.heave import Heave
-from lidar_mi.encounter.planning import INTERVAL, KNOTS, least_squares, travel
+from lidar_mi.encounter.planning import INTERVAL, KNOTS, TRAVEL, least_squares, least_travel
 
 PEAK = 2.0
 """The largest load factor counts four times its interval: a structure is sized by the largest."""
@@ -63,7 +63,8 @@ def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
     # the last unknown is the largest load factor of the intervals
     matrix = block_diag(np.concatenate([from_controls, _EFFORT * np.eye(count)]), PEAK)
     load, one = from_controls[:KNOTS], np.ones((KNOTS, 1))
-    peak = np.block([[-load, one], [load, one]])
+    within = np.pad(np.kron(np.eye(used.size), TRAVEL), ((0, 0), (0, 1)))
+    solved = least_squares(matrix, np.block([[within], [-load, one], [load, one]]))
     # the second of the four outputs of each interval
     by_bending = np.kron([[0], [1], [0], [0]], np.eye(KNOTS)) * (BENDING / heave.level_bending)
 
@@ -80,14 +81,11 @@ def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
         # what roll leaves of the ailerons' travel and rate
         room[1] = np.minimum(room[1], limits.deflection[0] - np.abs(ailerons[1:]))
         reach[1] = np.maximum(reach[1] - np.abs(np.diff(ailerons)), 0.0)
-        ways = [travel(now[k], room[k], reach[k]) for k in used]
-        within = np.pad(block_diag(*(way[0] for way in ways)), ((0, 0), (0, 1)))
-        allowed = np.concatenate([within, peak])
-        least = np.concatenate([*(way[1] for way in ways), without[:KNOTS], -without[:KNOTS]])
+        ways = [least_travel(now[k], room[k], reach[k]) for k in used]
+        least = np.concatenate([*ways, without[:KNOTS], -without[:KNOTS]])
         target = -np.concatenate([without, np.zeros(count + 1)])
         found = np.zeros(2)
-        planned = least_squares(matrix, target, allowed, least)[:-1]
-        found[used] = planned.reshape(-1, KNOTS)[:, 0]
+        found[used] = solved(target, least)[:-1].reshape(-1, KNOTS)[:, 0]
         return np.clip(found, -largest, largest)
 
     return plan
