@@ -169,7 +169,10 @@ def log_ratios(seeds: range) -> tuple[np.ndarray, np.ndarray]:
 
 
 def calibrated(ratio: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Log odds at the nodes of the detection, of the greatest likelihood (logistic regression)."""
+    """Log odds at the nodes of the detection, of the greatest likelihood (logistic regression).
+
+    Where they would fall with the likelihood ratio they stay.
+    """
     nodes = np.array(RATIO_NODES)
     at = np.clip(np.arcsinh(ratio), nodes[0], nodes[-1])
     columns = np.stack([np.interp(at, nodes, unit) for unit in np.eye(len(nodes))], 1)
@@ -180,7 +183,7 @@ def calibrated(ratio: np.ndarray, there: np.ndarray) -> np.ndarray:
         # odds of a node without draws of one sort would be infinite: a prior of 5 at each
         normal = (columns * weight[:, None]).T @ columns + np.eye(len(nodes)) / 25
         odds += np.linalg.solve(normal, columns.T @ (there - probability) - odds / 25)
-    return odds
+    return np.maximum.accumulate(odds)
 
 
 if __name__ == "__main__":

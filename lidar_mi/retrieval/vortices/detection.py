@@ -12,7 +12,7 @@ from lidar_mi.retrieval.vortices.matched_filter import Likelihoods, matched_filt
 # likelihood ratio; constant beyond. The ratio is that of white residuals: turbulence and the
 # images' finer structure make it too decisive. `python -m validation.detections` computes them.
 RATIO_NODES = (-2.5, -1.0, 0.0, 1.0, 2.5, 4.0, 6.0)
-_LOG_ODDS = (-6.57, -0.44, 0.26, 1.1, 0.82, 2.28, 8.09)
+_LOG_ODDS = (-6.86, -0.54, 0.12, 0.67, 0.67, 2.33, 10.29)
 
 
 class Detection(NamedTuple):
