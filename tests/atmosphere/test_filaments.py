@@ -167,5 +167,5 @@ def test_what_is_no_thin_line_is_refused(change, message):
 
 
 def test_cores_too_thin_for_a_table_are_refused():
-    with pytest.raises(InputError, match="expected cores of at least 1.01 m"):
+    with pytest.raises(InputError, match=r"expected cores of at least 1\.01 m"):
         FilamentTable(lines(1.0, core=0.9), WAVE / 4)
