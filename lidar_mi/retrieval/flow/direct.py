@@ -255,6 +255,9 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
 def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None) -> torch.Tensor:
     """Variance of each kind of motion (kinds, ...) on the prior's mesh, from a band's."""
     mesh = prior.mesh
+    # shifts back along y are those ahead with the derivatives exchanged, which is another summand
+    covariance = covariance.clone()
+    covariance[..., 1:, :] *= 2
     # motions share derivatives: each is taken once
     middles: dict[tuple[int, ...], torch.Tensor] = {}
     found: dict[tuple[int, int, tuple[int, ...], tuple[int, ...]], torch.Tensor] = {}
@@ -264,9 +267,7 @@ def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None
         if key not in middles:
             middles[key] = along_z(covariance[a, b], mesh, first[0], second[0], cells)
         if (a, b, first, second) not in found:
-            # shifts back along y are those ahead of the terms exchanged, which is another summand
-            parts = along_y(middles[key], mesh, first[1], second[1], ahead=2.0)
-            found[a, b, first, second] = parts
+            found[a, b, first, second] = along_y(middles[key], mesh, first[1], second[1])
         return found[a, b, first, second]
 
     return prior.by_kind(
