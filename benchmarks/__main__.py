@@ -68,10 +68,12 @@ def main(arguments: list[str] | None = None) -> int:
             )
             failed |= error is not None
         report.show(found[name], console)
+        # after each one: those that are done are not lost with the others
         report.write_json(found, options.out)
+        if not options.comparisons:
+            page.write(found, options.quick)
     console.print(f"written: {options.out}", highlight=False)
     if not options.comparisons:
-        page.write(found, options.quick)
         console.print(f"written: {page.PAGE}", highlight=False)
     return int(failed)
 
