@@ -19,7 +19,14 @@ from lidar_mi.encounter.aircraft import (
     deflected,
 )
 from lidar_mi.encounter.load_plan import load_plan
-from lidar_mi.encounter.planning import HORIZON, INTERVAL, KNOTS, least_squares, travel
+from lidar_mi.encounter.planning import (
+    HORIZON,
+    INTERVAL,
+    KNOTS,
+    TRAVEL,
+    least_squares,
+    least_travel,
+)
 from lidar_mi.encounter.strips import Loads
 
 Preview = Callable[[ArrayLike], Loads]
@@ -170,16 +177,17 @@ def _roll_plan(aircraft: AircraftModel) -> Callable[[AircraftState, np.ndarray, 
     from_rate, rolls, rates = _roll_mode(aircraft, INTERVAL)
     power, effort = aircraft.control_moments[0, 0], _EFFORT * np.eye(KNOTS)
     matrix = np.concatenate([rolls * power, RATE_TIME * rates * power, effort])
+    solved = least_squares(matrix, TRAVEL)
 
     def plan(state: AircraftState, wind: np.ndarray, now: float) -> np.ndarray:
         start = from_rate * state.roll_rate + [[state.roll], [0.0]]
         target = -np.concatenate(
             [start[0] + rolls @ wind, RATE_TIME * (start[1] + rates @ wind), np.zeros(KNOTS)]
         )
-        within = travel(
+        least = least_travel(
             float(np.clip(now, -largest, largest)), np.full(KNOTS, largest), np.full(KNOTS, reach)
         )
-        return np.clip(least_squares(matrix, target, *within), -largest, largest)
+        return np.clip(solved(target, least), -largest, largest)
 
     return plan
 

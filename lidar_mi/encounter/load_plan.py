@@ -19,7 +19,7 @@ from scipy.linalg import block_diag, expm
 
 from lidar_mi.encounter.aircraft import Limits
 from lidar_mi.encounter.heave import Heave
-from lidar_mi.encounter.planning import INTERVAL, KNOTS, least_squares, travel
+from lidar_mi.encounter.planning import INTERVAL, KNOTS, TRAVEL, least_squares, least_travel
 
 PEAK = 2.0
 """The largest load factor counts four times its interval: a structure is sized by the largest."""
@@ -36,11 +36,12 @@ PATH_TIME = 2.0
 _EFFORT = 1e-2  # of a deflection in rad against a load factor
 
 LoadPlan = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Elevator and symmetric aileron (rad), shape (2,), for the first interval from
+"""Elevator and symmetric aileron (rad), shape (2,), to be commanded.
 
-the state (3,); force and moment (N, N m) of the wind in the intervals (`KNOTS`, 2); the sum of its
-bending moments (N m, `KNOTS`); elevator and symmetric aileron now (2,); the ailerons' roll
-deflections, now and as planned (rad, `KNOTS` + 1)."""
+From the state, shape (3,); force and moment of the wind in the intervals (N, N m, nose down), shape
+(`KNOTS`, 2); the sum of its bending moments (N m), shape (`KNOTS`,); elevator and symmetric aileron
+now, shape (2,); the ailerons that roll, now and as planned (rad), shape (`KNOTS` + 1,).
+"""
 
 
 def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
@@ -62,8 +63,10 @@ def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
     # the last unknown is the largest load factor of the intervals
     matrix = block_diag(np.concatenate([from_controls, _EFFORT * np.eye(count)]), PEAK)
     load, one = from_controls[:KNOTS], np.ones((KNOTS, 1))
-    peak = np.block([[-load, one], [load, one]])
-    by_bending = _BENDING_ROWS @ np.eye(KNOTS) * (BENDING / heave.level_bending)
+    within = np.pad(np.kron(np.eye(used.size), TRAVEL), ((0, 0), (0, 1)))
+    solved = least_squares(matrix, np.block([[within], [-load, one], [load, one]]))
+    # the second of the four outputs of each interval
+    by_bending = np.kron([[0], [1], [0], [0]], np.eye(KNOTS)) * (BENDING / heave.level_bending)
 
     def plan(
         state: np.ndarray,
@@ -74,24 +77,18 @@ def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
     ) -> np.ndarray:
         without = from_state @ state + np.einsum("okl,kl->o", from_wind, wind)
         without = without + by_bending @ bending
-        rooms = np.outer(largest, np.ones(KNOTS)), np.outer(rate * INTERVAL, np.ones(KNOTS))
-        rooms[0][1] = np.minimum(largest[1], limits.deflection[0] - np.abs(ailerons[1:]))
-        rooms[1][1] = np.maximum(rooms[1][1] - np.abs(np.diff(ailerons)), 0.0)
-        ways = [travel(now[k], rooms[0][k], rooms[1][k]) for k in used]
-        within = np.pad(block_diag(*(way[0] for way in ways)), ((0, 0), (0, 1)))
-        allowed = np.concatenate([within, peak])
-        least = np.concatenate([*(way[1] for way in ways), without[:KNOTS], -without[:KNOTS]])
+        room, reach = (np.tile(one[:, None], KNOTS) for one in (largest, rate * INTERVAL))
+        # what roll leaves of the ailerons' travel and rate
+        room[1] = np.minimum(room[1], limits.deflection[0] - np.abs(ailerons[1:]))
+        reach[1] = np.maximum(reach[1] - np.abs(np.diff(ailerons)), 0.0)
+        ways = [least_travel(now[k], room[k], reach[k]) for k in used]
+        least = np.concatenate([*ways, without[:KNOTS], -without[:KNOTS]])
         target = -np.concatenate([without, np.zeros(count + 1)])
         found = np.zeros(2)
-        planned = least_squares(matrix, target, allowed, least)[:-1]
-        found[used] = planned.reshape(-1, KNOTS)[:, 0]
+        found[used] = solved(target, least)[:-1].reshape(-1, KNOTS)[:, 0]
         return np.clip(found, -largest, largest)
 
     return plan
-
-
-# bending is the second of the four outputs of each interval
-_BENDING_ROWS = np.kron(np.eye(4)[:, 1:2], np.eye(KNOTS))
 
 
 def _outputs(heave: Heave) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

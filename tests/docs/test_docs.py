@@ -188,6 +188,7 @@ def _unit(field):
             (units.AngularAcceleration, "rad/s²"),
             (units.Speed, "m/s"),
             (units.Time, "s"),
+            (units.Mass, "kg"),
             (units.Energy, "J"),
             (units.Extinction, "1/m"),
             (units.Circulation, "m²/s"),

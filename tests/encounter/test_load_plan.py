@@ -15,7 +15,7 @@ from lidar_mi.encounter.aircraft import AircraftState, Commands
 from lidar_mi.encounter.control import feedforward, no_loads, wings_level
 from lidar_mi.encounter.heave_model import HeaveModel
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
-from lidar_mi.encounter.planning import KNOTS, travel
+from lidar_mi.encounter.planning import KNOTS, TRAVEL, least_travel
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads, wake_loads
 from lidar_mi.experiment.schema.encounter import Aircraft, Path
@@ -181,10 +181,10 @@ def test_an_aircraft_that_only_rolls_is_steered_in_roll():
 
 
 def test_travel_narrows_no_faster_than_the_control_moves():
-    allowed, least = travel(0.2, np.full(KNOTS, 0.05), np.full(KNOTS, 0.03))
+    least = least_travel(0.2, np.full(KNOTS, 0.05), np.full(KNOTS, 0.03))
     path = np.maximum(0.2 - 0.03 * np.arange(1, KNOTS + 1), 0.05)
-    assert (allowed @ path >= least - 1e-12).all()
-    assert not (allowed @ (path + 1e-6) >= least - 1e-9).all()
+    assert (TRAVEL @ path >= least - 1e-12).all()
+    assert not (TRAVEL @ (path + 1e-6) >= least - 1e-9).all()
 
 
 # --- an aircraft of JSBSim --------------------------------------------------------------------

@@ -160,7 +160,8 @@ def encounter_answer(
     if largest < _NO_ROLL:
         return [
             f"No flight rolls by more than {three(math.degrees(_NO_ROLL))} degrees: the {met} is "
-            "missed, or both wings meet the same wind, as in a wake across the path."
+            "missed, or both wings meet the same wind, as in a wake across the path.",
+            *loads_answer(metrics),
         ]
     answer = f"Without control, the {met} rolls the aircraft by {_degrees(off)}"
     if _lost(metrics, "off"):

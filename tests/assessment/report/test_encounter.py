@@ -123,6 +123,9 @@ def test_loads_in_words():
         "The load factor changes by up to 0.75 without control, 0.78 with the autopilot "
         "(4 % more), 0.3 with perfect preview (60 % less)."
     )
+    # a gust on both wings alike
+    level = metrics | {f"encounter.{mode}.largest_roll": 0.0 for mode in ("off", "perfect")}
+    assert encounter_answer(level, met="air")[1] == encounter_answer(metrics)[1]
     (table, *_) = encounter_summary(metrics, met="air")
     rows = {row[0]: row[1:] for row in table.rows}
     assert rows["largest change of a wing root's bending / kN m"][0] == "750"
