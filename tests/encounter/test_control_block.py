@@ -32,9 +32,10 @@ from tests.support.synthetic_lidar import encounter_keys
 SEEDS = range(1, 9)
 GUIDE = Path(__file__).parents[2] / "docs" / "guide" / "control_block.md"
 LATENCY, PERIOD, SPEED = 0.12, 0.1, 75.0
-TAPS = {"v": (0.9, 0.0), "w": (0.7, 0.25), "p": (0.6, 0.0)}
+FILTER = {"v": (0.9, 0.0, 0.0), "w": (0.95, 0.4, 0.2), "p": (0.6, 0.3, 0.4)}
 NOISE = {"v": (0.0, 0.3), "w": (0.6, 0.2), "p": (0.5, 0.008)}
-"""Of the lidar: weights of a plane and of the one before; lag and innovation of its noise."""
+"""Of the lidar: gain, decay of its weights from plane to plane before and after the estimated one;
+lag and innovation of its noise."""
 
 
 def experiment(seed=1, **path):
@@ -50,8 +51,15 @@ def experiment(seed=1, **path):
     return check(keys, "test")
 
 
+def weights(axis):
+    """Of the planes from 3 after the estimated one to 8 before it."""
+    gain, before, after = FILTER[axis]
+    found = np.array([after**k for k in (3, 2, 1)] + [before**k for k in range(9)])
+    return gain * found / found.sum()
+
+
 class KnownLidar:
-    """A lidar that is the filter `TAPS` with the noise `NOISE`; vectors are linear along y.
+    """A lidar that is the filter `FILTER` with the noise `NOISE`; vectors are linear along y.
 
     Attributes
     ----------
@@ -64,14 +72,17 @@ class KnownLidar:
     def __init__(self, one, seed):
         path, random = one.encounter.path, np.random.default_rng(seed)
         self.x = np.arange(150.0, path.start + path.beyond, SPEED * PERIOD)
-        truth = dict(zip("uvwp", true_gusts(one, self.x, 28.9).T, strict=True))
+        # the planes that have a weight in the first and in the last estimate
+        step = SPEED * PERIOD
+        around = np.concatenate(
+            [self.x[0] + step * np.arange(-8, 0), self.x, self.x[-1] + step * np.arange(1, 4)]
+        )
+        truth = dict(zip("uvwp", true_gusts(one, around, 28.9).T, strict=True))
         self.estimates = {}
         for axis, (lag, innovation) in NOISE.items():
             white = innovation * random.standard_normal(len(self.x))
-            before = np.concatenate([truth[axis][:1], truth[axis][:-1]])
-            first, second = TAPS[axis]
             noise = scipy.signal.lfilter([1], [1, -lag], white)
-            self.estimates[axis] = first * truth[axis] + second * before + noise
+            self.estimates[axis] = np.convolve(truth[axis], weights(axis), "valid") + noise
 
     def step(self, t, pose=None, expected=None):
         """The estimate of the slab that the scan at a time completes."""
@@ -159,10 +170,13 @@ def test_filter_and_noise_are_those_of_the_lidar(block):
     axes = list(block["axis"])
     assert axes == ["v", "w", "p"] and block["flights"] == 8
     for k, axis in enumerate(axes):
-        taps, lag, innovation = TAPS[axis], *NOISE[axis]
-        stderr = block["gain_stderr"][k]
-        assert abs(block["gain"][k] - sum(taps)) < 4 * stderr < 0.2 * sum(taps)
-        assert abs(block["taps"][k, 0] - taps[0]) < 4 * block["taps_stderr"][k, 0]
+        lag, innovation = NOISE[axis]
+        for name, true in zip(("gain", "decay_before", "decay_after"), FILTER[axis], strict=True):
+            error, stderr = block[name][k] - true, block[f"{name}_stderr"][k]
+            # at the edge, 0, a decay has no error
+            assert abs(error) < 4 * stderr or (true == 0 and error < 0.1)
+            assert stderr < 0.15 * max(true, 0.5)
+        np.testing.assert_allclose(block["taps"][k], weights(axis), atol=0.05)
         variance = innovation**2 / (1 - lag**2)
         assert abs(block["noise_variance"][k] - variance) < 4 * block["noise_variance_stderr"][k]
         assert block["noise_variance_stderr"][k] < 0.1 * variance
@@ -299,7 +313,7 @@ def test_folders_without_what_is_needed_are_refused(tmp_path, flights):
     with pytest.raises(InputError, match="holds no finished flight with the lidar; expected the"):
         lm.export_control(tmp_path)
     record(tmp_path / "short", experiment(start="300 m", beyond="100 m"), 1)
-    with pytest.raises(InputError, match=r"block at 150 m: v: 2\d slabs .* too few .*expected 50"):
+    with pytest.raises(InputError, match=r"block at 150 m: v: \d\d slabs .* too few .*expected 50"):
         lm.export_control(tmp_path / "short")
     with pytest.raises(InputError, match=r"block_150m\.npz: exists; expected another folder"):
         lm.export_control(flights)
