@@ -7,6 +7,8 @@ roll that differs from that of flights by more than 10 %.
 
 import json
 import re
+import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +32,7 @@ from lidar_mi.io.yaml import to_yaml
 from tests.support.synthetic_lidar import encounter_keys
 
 SEEDS = range(1, 9)
-GUIDE = Path(__file__).parents[2] / "docs" / "guide" / "control_block.md"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "control_loop.py"
 LATENCY, PERIOD, SPEED = 0.12, 0.1, 75.0
 FILTER = {"v": (0.9, 0.0, 0.0), "w": (0.95, 0.4, 0.2), "p": (0.6, 0.3, 0.4)}
 NOISE = {"v": (0.0, 0.3), "w": (0.6, 0.2), "p": (0.5, 0.008)}
@@ -244,24 +246,14 @@ def test_matlab_has_the_same_with_units(flights, block):
     assert listed["arrays"].keys() == about.keys() and listed["axes"]["p"]["units"] == "rad s-1"
 
 
-def roll_by_the_guide(folder, forward):
-    """Predicted rms roll angle, rad, by the program of the guide."""
+def example():
+    """The program that closes a loop."""
     pytest.importorskip("control")
-    program = re.search(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL).group(1)
-    changes = {
-        "outputs/air/control/block_151m.npz": str(folder / "control" / "block_150m.npz"),
-        "from_rate = 1.0, 1.0, 0.5": f"from_rate = {forward}, 1.0, 0.5",
-    }
-    for old, new in changes.items():
-        assert program.count(old) == 1
-        program = program.replace(old, new)
-    found: dict = {}
-    exec(program, found)
-    return found
+    return runpy.run_path(str(EXAMPLE))
 
 
 def rolled(moments, estimates, forward):
-    """Roll angles of a flight with the controller of the guide, by the roll model.
+    """Roll angles of a flight with the controller of the example, by the roll model.
 
     Rolling moments of the wind (N m) have a row for each period and a column for each of its parts.
     Estimates of p are of planes from 20 periods on.
@@ -297,16 +289,33 @@ def weather():
 
 
 @pytest.mark.parametrize("forward", [0.0, 1.0])
-def test_predicted_roll_agrees_with_flights(flights, weather, forward):
+def test_predicted_roll_agrees_with_flights(block, weather, forward):
     """Within 10 %: the variance of roll of nonlinear flights, by the roll model and its aileron.
 
     The air is that of the flights from which the block is identified: the variance of turbulence
     differs by more from realisation to realisation.
     """
-    predicted = roll_by_the_guide(flights, forward)["roll"] ** 2
+    predicted = example()["rms"](block, forward)[0] ** 2
     # the first 5 s are transient
     found = np.mean([np.mean(rolled(*one, forward)[200:] ** 2) for one in weather])
     assert abs(found / predicted - 1) < 0.1
+
+
+def test_the_example_flies_along_recorded_flights(flights, block, capsys, monkeypatch):
+    """Roll by the recorded estimates, within 10 % of the predicted variance."""
+    path = str(flights / "control" / "block_150m.npz")
+    monkeypatch.setattr(sys, "argv", ["control_loop.py", path, "--flights", str(flights)])
+    pytest.importorskip("control")
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3
+    for text in lines:
+        predicted, _, flown = map(float, re.findall(r"\d\.\d\d", text))
+        # both are rounded to a hundredth of a degree
+        assert abs((flown / predicted) ** 2 - 1) < 0.13
+    assert example()["AILERON_MOMENT"] == pytest.approx(
+        aircraft_of(experiment().encounter).control_moments[0, 0], rel=1e-3
+    )
 
 
 def test_folders_without_what_is_needed_are_refused(tmp_path, flights):
