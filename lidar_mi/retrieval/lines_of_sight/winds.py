@@ -10,7 +10,7 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines_of_sight.outliers import LIMIT, refitted, residuals, spread
-from lidar_mi.retrieval.lines_of_sight.posterior import LENGTHS, Level, evidence, mean_wind
+from lidar_mi.retrieval.lines_of_sight.posterior import LENGTHS, Level, along, evidence, mean_wind
 from lidar_mi.retrieval.lines_of_sight.profiles import (
     MAX_CONDITION,
     MAX_STDERR,
@@ -22,7 +22,7 @@ from lidar_mi.retrieval.lines_of_sight.profiles import (
 
 _BLOCK = 5  # levels that share their turbulence
 _MOST = 24  # numbers of a level: more lines are averaged with their neighbours
-_MOST_LINES = 120  # whose correlation is computed
+_MOST_LINES = 240  # whose correlation is computed
 _ROUNDS = 5  # of the search for outliers
 _LEAST_SPREAD = 0.02  # m/s: rounding of the velocities
 
@@ -309,20 +309,27 @@ def _condition(design: np.ndarray) -> float:
 def _level(
     design: np.ndarray, places: np.ndarray, velocity: np.ndarray, noise: np.ndarray
 ) -> tuple[Level, float]:
-    """A level of at most `_MOST` averages and their mean variance of noise (NaN: unknown)."""
+    """A level of at most `_MOST` averages and their mean variance of noise (NaN: unknown).
+
+    Lines come in the order of time. Averages are of lines of nearly one direction.
+    """
+    path = along(places)
+    steep, azimuth = np.round(20 * design[:, 2]), np.arctan2(design[:, 0], design[:, 1])
+    order = np.lexsort((azimuth, steep))
+    design, places, velocity, noise = (one[order] for one in (design, places, velocity, noise))
     many = math.ceil(len(velocity) / _MOST_LINES)
     # of very many lines, neighbours are one line
-    every = Level(design, places, np.arange(0, len(velocity), many), velocity, noise)
+    every = Level(design, places, path, np.arange(0, len(velocity), many), velocity, noise)
     design, places, velocity = (every.averaged(one) for one in (design, places, velocity))
     size = math.ceil(len(velocity) / _MOST)
     starts = np.arange(0, len(velocity), size)
-    level = Level(design, places, starts, velocity, noise)
+    level = Level(design, places, path, starts, velocity, noise)
     weights = np.where(np.isfinite(noise), noise, 1.0)
     counts = np.diff(np.append(starts, len(velocity)))
     variance = level.averaged(every.averaged(weights)) / counts / many
     known = float(variance.mean()) if np.isfinite(noise).all() else math.nan
     noise = variance / variance.mean()
-    return Level(design, places, starts, level.averaged(velocity), noise), known
+    return Level(design, places, path, starts, level.averaged(velocity), noise), known
 
 
 def _add_errors(
