@@ -16,7 +16,13 @@ from scipy.special import chdtri
 
 from lidar_mi.retrieval.along_path.statistics import Statistics, error_correlation
 from lidar_mi.retrieval.along_path.vectors import ACROSS, SlabVectors
-from lidar_mi.retrieval.along_path.von_karman import covariance, lattice_covariance
+from lidar_mi.retrieval.along_path.von_karman import (
+    Mean,
+    Shape,
+    covariance,
+    lattice_covariance,
+    mean_of,
+)
 
 # Principal components of less variance than this, over the largest, are not known.
 _LEAST = 1e-6
@@ -35,8 +41,8 @@ class Basis:
     Attributes
     ----------
     component : {"v", "w"}
-    length, resolution : float
-        Of `Statistics`, m.
+    length, resolution, shape
+        Of `Statistics`.
     axes : two ndarrays, shapes (ny,) and (nz,)
         y and z of the lattice's nodes, m.
     weights : ndarray, shape (nodes, states)
@@ -48,6 +54,7 @@ class Basis:
     component: str
     length: float
     resolution: float
+    shape: Shape
     axes: tuple[np.ndarray, np.ndarray]
     weights: np.ndarray
     variance: np.ndarray
@@ -55,18 +62,18 @@ class Basis:
 
     def mean(self, places: np.ndarray) -> np.ndarray:
         """Values per state (n, states) of a mean as a vector's at y and z (n, 2), m."""
-        return self._with_nodes(places, 2 * self.resolution**2, 0.0)
+        return self._with_nodes(places, mean_of(self.resolution, self.shape, 2), 0.0)
 
     def point(self, places: np.ndarray, swept: float) -> np.ndarray:
         """Values per state (n, states) of the wind at y and z (n, 2), m, itself.
 
         `swept` is the variance of the displacement since the slab was seen, m^2.
         """
-        return self._with_nodes(places, self.resolution**2, swept)
+        return self._with_nodes(places, mean_of(self.resolution, self.shape, 1), swept)
 
-    def _with_nodes(self, places: np.ndarray, across: float, swept: float) -> np.ndarray:
+    def _with_nodes(self, places: np.ndarray, mean: Mean, swept: float) -> np.ndarray:
         y, z = (place[:, None] - axis for place, axis in zip(places.T, self.axes, strict=True))
-        found = lattice_covariance(self.component, y, z, self.length, across, swept)
+        found = lattice_covariance(self.component, y, z, self.length, mean, swept)
         return found.reshape(len(places), -1) @ self.weights
 
 
@@ -113,19 +120,19 @@ class Lattice:
 
 @lru_cache(maxsize=64)
 def basis(
-    component: str, length: float, resolution: float, stride: float, lattice: Lattice
+    component: str, length: float, resolution: float, shape: Shape, stride: float, lattice: Lattice
 ) -> Basis:
     """The principal components on a lattice; each has its correlation over the `stride` (m)."""
     axes = lattice.axes
     y, z = (np.subtract.outer(a.ravel(), a.ravel()) for a in np.meshgrid(*axes))
-    across = 2 * resolution**2
-    here, there = (covariance(component, lag, y, z, length, across) for lag in (0.0, stride))
+    twice = mean_of(resolution, shape, 2)
+    here, there = (covariance(component, lag, y, z, length, twice) for lag in (0.0, stride))
     variance, vectors = np.linalg.eigh(here)
     some = variance > _LEAST * variance[-1]
     variance, vectors = variance[some], vectors[:, some]
     decay = np.einsum("nm,nk,km->m", vectors, there, vectors) / variance
     reach = -stride / np.log(np.clip(decay, 1e-3, 1 - 1e-9))
-    return Basis(component, length, resolution, axes, vectors / variance, variance, reach)
+    return Basis(component, length, resolution, shape, axes, vectors / variance, variance, reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,12 +184,12 @@ def observation(
     places = np.stack([y[used], z[used]], -1)
     forward = _forward(one, places.tobytes())
     stderr = statistics.scale * vectors.stderr[number][used]
-    errors = stderr[:, None] * error_correlation(places, one.resolution) * stderr
+    errors = stderr[:, None] * error_correlation(places, statistics.mean(2)) * stderr
     errors += vectors.common[number] ** 2
     arm = places[:, 1 - number] - vectors.centre[1 - number]
     errors += vectors.rotation**2 * np.outer(arm, arm)
     # what the states do not describe
-    whole = float(covariance(one.component, 0.0, 0.0, 0.0, one.length, 2 * one.resolution**2))
+    whole = float(covariance(one.component, 0.0, 0.0, 0.0, one.length, statistics.mean(2)))
     missing = np.maximum(whole - forward**2 @ one.variance, 0.0)
     own = statistics.sigma**2 * missing + np.broadcast_to(extra, used.shape)[used]
     # of errors of 0 the covariance would be singular

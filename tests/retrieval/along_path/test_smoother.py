@@ -33,7 +33,7 @@ def seen(count=6, missing=(), rejected=0):
 def field(slabs, component="w", statistics=STATISTICS, swept=0.0):
     x, time, vectors = zip(*slabs, strict=True)
     lattice = LATTICE.through(vectors[0])
-    one = basis(component, statistics.length, statistics.resolution, STRIDE, lattice)
+    one = basis(component, statistics.length, statistics.resolution, "gaussian", STRIDE, lattice)
     number = "vw".index(component)
     return smoothed(
         one,
@@ -52,7 +52,7 @@ def dense(slabs, component, x, y, z):
     one, s = found.basis, STATISTICS
     rows, errors, values, planes = [], [], [], []
     number = "vw".index(component)
-    whole = float(covariance(component, 0, 0, 0, s.length, 2 * s.resolution**2))
+    whole = float(covariance(component, 0, 0, 0, s.length, s.mean(2)))
     for plane, _, vectors in slabs:
         used = observation(one, s, vectors).used
         at_y, at_z = (a[used] for a in np.meshgrid(vectors.y, vectors.z))
@@ -60,7 +60,7 @@ def dense(slabs, component, x, y, z):
         row = one.mean(places)
         stderr = s.scale * vectors.stderr[number][used]
         own = s.sigma**2 * (whole - row**2 @ one.variance)
-        error = np.outer(stderr, stderr) * error_correlation(places, s.resolution)
+        error = np.outer(stderr, stderr) * error_correlation(places, s.mean(2))
         error += vectors.common[number] ** 2
         errors.append(error + np.diag(own))
         rows.append(row)
