@@ -17,8 +17,8 @@ GROWTH = 0.83
 PLANE = math.radians(48.0)
 """Inclination of the planes of the fastest wave (Crow 1970)."""
 
-# Length of a ring over the wavelength. Neighbours touch at 1; the roll of an aircraft at 10 degrees
-# hardly depends on it, see the theory page.
+# Length of a ring over the wavelength: a choice, as rings swing. Neighbours touch at 1; at 0.8 and
+# 0.97 the largest rolling moment of crossings at 10 degrees is 14 and 6 % larger.
 _RING_LENGTH = 0.9
 
 

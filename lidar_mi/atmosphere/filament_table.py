@@ -11,6 +11,7 @@ import scipy
 
 from lidar_mi.atmosphere.filaments import Filaments
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.errors import InputError
 
 # The fine grid reaches so many core radii beyond the lines, in l and n: five nodes of the coarse
 # one, in which what its splines miss of the cores falls to 1e-3. The coarse one reaches so many
@@ -20,6 +21,8 @@ _WIDE = 0.4
 # Spacing across the axis in core radii, of the fine and the coarse grid; along it twice as much in
 # the fine one, as lines are steep to the axis by less than that, but for rings.
 _FINE, _COARSE = 0.4, 1.6
+# Periods in core radii up to which both grids have at most some million nodes.
+_LONGEST = 400.0
 # Nodes beyond the period's ends that a cubic spline needs.
 _BEYOND = 3
 
@@ -68,9 +71,20 @@ class FilamentTable:
         Of `lidar_mi.atmosphere.crow.crow_filaments`.
     crest : float
         s of a crest, m.
+
+    Raises
+    ------
+    InputError
+        Cores too thin for the grids.
     """
 
     def __init__(self, filaments: Filaments, crest: float) -> None:
+        if filaments.period > _LONGEST * filaments.core_radius:
+            raise InputError(
+                f"crow: filaments with a core radius of {filaments.core_radius:g} m and waves of "
+                f"{filaments.period:.4g} m are not allowed; expected cores of at least "
+                f"{filaments.period / _LONGEST:.3g} m"
+            )
         self._filaments = filaments
         nodes = np.concatenate([curve.places for curve in filaments.curves])
         radius, period = filaments.core_radius, filaments.period

@@ -8,10 +8,13 @@ import numpy as np
 import scipy
 import xarray as xr
 
-from lidar_mi.encounter.filter_fit import FilterFit, autocovariance, fit_filter, fit_process
+from lidar_mi.encounter.filter_fit import BEFORE, FilterFit, autocovariance, fit_filter, fit_process
 from lidar_mi.encounter.gust_axes import GUSTS
-from lidar_mi.encounter.sensor_samples import SensorSamples
+from lidar_mi.encounter.sensor_samples import MARGIN, SensorSamples
 from lidar_mi.errors import InputError
+
+MOST_AFTER = 3
+"""Planes beyond the estimated one that may have a weight, if they are scanned by then."""
 
 FREQUENCIES = 101
 """From 0 to the Nyquist frequency."""
@@ -50,10 +53,9 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
         Too few slabs; an input that is zero, as in air at rest.
     """
     one = flights[0]
-    # samples before and after a gap in time have nothing to do with each other
-    gap = np.full((1, len(GUSTS)), np.nan)
+    # margins without an estimate part the flights
     truth, estimate = (
-        np.concatenate([part for flight in flights for part in (getattr(flight, name), gap)])
+        np.concatenate([_with_margins(flight, name) for flight in flights])
         for name in ("truth", "estimate")
     )
     measured = [k for k in range(len(GUSTS)) if np.isfinite(estimate[:, k]).any()]
@@ -63,6 +65,7 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
             f"images cover the span of {one.span:g} m"
         )
     axes = [tuple(GUSTS)[k] for k in measured]
+    delay_steps = math.ceil(one.delay / one.period - 1e-6)
     fits = []
     for axis, k in zip(axes, measured, strict=True):
         if not np.nanstd(truth[:, k]):
@@ -71,10 +74,9 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
                 "expected a flight in turbulence or in a wake"
             )
         try:
-            fits.append(fit_filter(estimate[:, k], truth[:, k]))
+            fits.append(fit_filter(estimate[:, k], truth[:, k], min(MOST_AFTER, delay_steps)))
         except InputError as error:
             raise InputError(f"{_range(one)}: {axis}: {error}") from error
-    delay_steps = math.ceil(one.delay / one.period - 1e-6)
     innovations = np.stack([fit.innovations for fit in fits])
     innovations = innovations[:, np.isfinite(innovations).all(axis=0)]
     covariance = innovations @ innovations.T / innovations.shape[1]
@@ -167,17 +169,16 @@ def _axis_state_space(
     fit: FilterFit, delay_steps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of one axis: a line of past gusts, and a line of past noise; inputs gust and white noise."""
-    length = delay_steps + len(fit.taps) - 1
-    line = np.eye(length, k=-1)
-    # state i is the gust i + 1 steps ago
-    entry, taps = np.eye(length, 1), np.zeros((1, length))
-    taps[0, delay_steps - 1 :] = fit.taps
+    # state i is the gust i + 1 steps ago; a plane as far ahead as this one was is not yet past
+    past = np.concatenate([np.zeros(delay_steps - fit.after), fit.taps])
+    line = np.eye(len(past) - 1, k=-1)
+    entry, taps = np.eye(len(past) - 1, 1), past[None, 1:]
     a, b, c = (
         scipy.linalg.block_diag(gust, noise)
         for gust, noise in zip((line, entry, taps), _process_state_space(fit.lags), strict=True)
     )
     # both add up to one output
-    return a, b, c.sum(axis=0, keepdims=True), np.array([[0.0, 1.0]])
+    return a, b, c.sum(axis=0, keepdims=True), np.array([[past[0], 1.0]])
 
 
 def _timing(one: SensorSamples, delay_steps: int) -> Variables:
@@ -220,31 +221,37 @@ def _numbers(flights: Sequence[SensorSamples], fits: Sequence[FilterFit]) -> Var
     def column(values: Sequence[float], about: dict[str, str], text: str) -> tuple[Any, ...]:
         return "axis", np.array(values, float), {**about, "long_name": text}
 
-    gain, gain_stderr = zip(*(fit.gain for fit in fits), strict=True)
     noise, noise_stderr = zip(*(fit.noise_variance for fit in fits), strict=True)
+    values = np.array([fit.parameters for fit in fits]).T
+    errors = np.sqrt([np.diag(fit.covariance) for fit in fits]).T
     tap, lag = ("axis", "tap"), ("axis", "lag")
-    return {
+    texts = {
+        "offset": (own, "mean error; not part of A, B, C, D"),
+        "gain": (ratio, "of a constant wind: the sum of taps"),
+        "decay_before": (ratio, "r: of taps from plane to plane before the estimated one"),
+        "decay_after": (ratio, "s: of taps from plane to plane after the estimated one"),
+    }
+    found = {}
+    for name, value, error in zip(texts, values, errors, strict=True):
+        about, text = texts[name]
+        found[name] = column(value, about, text)
+        found[f"{name}_stderr"] = column(error, about, f"standard error of {name}")
+    return found | {
         "taps": (
             tap,
-            padded("taps"),
-            {**ratio, "long_name": "h: weights of the newest plane and of those before it"},
+            np.array([fit.taps for fit in fits]),
+            {**ratio, "long_name": "weights of the planes `tap` planes before the estimated one"},
         ),
-        "taps_stderr": (
-            tap,
-            padded("taps_covariance"),
-            {**ratio, "long_name": "standard error of taps"},
+        "tap": (
+            "tap",
+            np.arange(-fits[0].after, BEFORE + 1),
+            {**ratio, "long_name": "planes before"},
         ),
         "lags": (lag, padded("lags"), {**ratio, "long_name": "a: autoregression of the noise"}),
         "lags_stderr": (
             lag,
             padded("lags_covariance"),
             {**ratio, "long_name": "standard error of lags"},
-        ),
-        "gain": column(gain, ratio, "of a constant wind: the sum of taps"),
-        "gain_stderr": column(gain_stderr, ratio, "standard error of gain"),
-        "offset": column([fit.offset for fit in fits], own, "mean error; not part of A, B, C, D"),
-        "offset_stderr": column(
-            [fit.offset_stderr for fit in fits], own, "standard error of offset"
         ),
         "noise_variance": column(noise, square, "of the error that the filter leaves"),
         "noise_variance_stderr": column(noise_stderr, square, "standard error of noise_variance"),
@@ -267,12 +274,12 @@ def _spectra(fits: Sequence[FilterFit], dt: float, delay_steps: int) -> Variable
         ),
         "response": (
             dims,
-            np.array([fit.response(cycles) * delayed for fit in fits]),
+            np.array([fit.response(cycles)[0] * delayed for fit in fits]),
             {"units": "1", "long_name": "of the estimate to the gust, with its delay"},
         ),
         "response_stderr": (
             dims,
-            np.array([fit.response_stderr(cycles) for fit in fits]),
+            np.array([fit.response(cycles)[1] for fit in fits]),
             {"units": "1", "long_name": "standard error of response"},
         ),
         "noise_psd": (
@@ -286,6 +293,12 @@ def _spectra(fits: Sequence[FilterFit], dt: float, delay_steps: int) -> Variable
             {**density, "long_name": "standard error of noise_psd"},
         ),
     }
+
+
+def _with_margins(flight: SensorSamples, name: str) -> np.ndarray:
+    margin = np.full((MARGIN, len(GUSTS)), np.nan)
+    around = (margin, margin) if name == "estimate" else (flight.truth_before, flight.truth_after)
+    return np.concatenate([around[0], getattr(flight, name), around[1]])
 
 
 def _range(one: SensorSamples) -> str:

@@ -1,13 +1,14 @@
 """A discrete-time filter with coloured noise, identified from input and output.
 
-y_k = c + h_0 u_k + ... + h_{m-1} u_{k-m+1} + n_k,   n_k = a_1 n_{k-1} + ... + a_p n_{k-p} + e_k,
+y_k = c + G sum_j h_j u_{k-j} + n_k,   n_k = a_1 n_{k-1} + ... + a_p n_{k-p} + e_k,   sum_j h_j = 1,
 
-with white e. Filter and noise are estimated in turn: the filter by least squares of input and
-output that the noise model whitens, the noise by Burg's method from what the filter leaves. This is
-generalised least squares (Cochrane and Orcutt, J. Am. Stat. Assoc. 44, 32-61, 1949; Ljung, System
-Identification, 1999, section 7.3). Burg's models are stable (Kay, Modern Spectral Estimation, 1988,
-section 7.5). The numbers m and p have the smallest information criterion of Schwarz (Ann. Stat. 6,
-461-464, 1978).
+with white e. The weights fall by the factor r per sample before (j > 0), as those of a recursive
+filter do, and by s per sample after (j < 0), as of an average about the sample. The filter is
+estimated by least squares of input and output that the noise model whitens, the noise by Burg's
+method from what the filter leaves, in turn. This is generalised least squares (Cochrane and Orcutt,
+J. Am. Stat. Assoc. 44, 32-61, 1949; Ljung, System Identification, 1999, section 7.3). Burg's models
+are stable (Kay, Modern Spectral Estimation, 1988, section 7.5). The number p has the smallest
+information criterion of Schwarz (Ann. Stat. 6, 461-464, 1978).
 """
 
 from dataclasses import dataclass
@@ -17,12 +18,15 @@ import scipy
 
 from lidar_mi.errors import InputError
 
-MOST_TAPS, MOST_LAGS = 3, 4
-MOST_PROCESS_LAGS = 8
-LEAST_SAMPLES = 50
-"""Of one output, below which nothing is identified."""
+BEFORE = 8
+"""Samples before a sample that have a weight."""
 
-_ROUNDS = 50
+MOST_LAGS, MOST_PROCESS_LAGS = 4, 8
+LEAST_SAMPLES = 50
+"""Outputs below which nothing is identified."""
+
+_ROUNDS = 20
+_LARGEST_DECAY = 0.8  # of which `BEFORE` samples hold 87 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +35,10 @@ class FilterFit:
 
     Attributes
     ----------
-    taps, taps_covariance : ndarray, shape (m,) and (m, m)
-        h.
-    offset, offset_stderr : float
-        c.
+    parameters, covariance : ndarray, shape (4,) and (4, 4)
+        c, G, r, s. A decay at the edge of what is allowed, 0, has no error.
+    after : int
+        Samples after a sample that have a weight.
     lags, lags_covariance : ndarray, shape (p,) and (p, p)
         a.
     innovations : ndarray, shape (n,)
@@ -44,10 +48,9 @@ class FilterFit:
         Innovations.
     """
 
-    taps: np.ndarray
-    taps_covariance: np.ndarray
-    offset: float
-    offset_stderr: float
+    parameters: np.ndarray
+    covariance: np.ndarray
+    after: int
     lags: np.ndarray
     lags_covariance: np.ndarray
     innovations: np.ndarray
@@ -55,9 +58,16 @@ class FilterFit:
     count: int
 
     @property
-    def gain(self) -> tuple[float, float]:
-        """Of a constant input, with its standard error."""
-        return float(self.taps.sum()), float(np.sqrt(self.taps_covariance.sum()))
+    def taps(self) -> np.ndarray:
+        """G h_j for j from -after to `BEFORE`."""
+        _, gain, before, ahead = self.parameters
+        return gain * _weights(before, ahead, self.after)
+
+    @property
+    def taps_covariance(self) -> np.ndarray:
+        """Of `taps`, to first order."""
+        slopes = self._slopes()
+        return slopes @ self.covariance[1:, 1:] @ slopes.T
 
     @property
     def noise_variance(self) -> tuple[float, float]:
@@ -70,14 +80,12 @@ class FilterFit:
         variance = autocovariance(self.lags, self.innovation_variance, 1)[0]
         return float(variance), float(np.sqrt(2 / self.count * np.mean(spectrum**2)))
 
-    def response(self, frequency: np.ndarray) -> np.ndarray:
-        """Of the filter at frequencies in cycles a sample."""
-        return np.exp(-2j * np.pi * np.outer(frequency, np.arange(len(self.taps)))) @ self.taps
-
-    def response_stderr(self, frequency: np.ndarray) -> np.ndarray:
-        """Standard error of the response, of real and imaginary part together."""
-        waves = np.exp(-2j * np.pi * np.outer(frequency, np.arange(len(self.taps))))
-        return np.sqrt(np.einsum("fi,ij,fj->f", waves, self.taps_covariance, waves.conj()).real)
+    def response(self, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of the filter at frequencies in cycles a sample, and the standard error of both parts."""
+        number = np.arange(-self.after, BEFORE + 1)
+        waves = np.exp(-2j * np.pi * np.outer(frequency, number))
+        stderr = np.einsum("fi,ij,fj->f", waves, self.taps_covariance, waves.conj()).real
+        return waves @ self.taps, np.sqrt(np.maximum(stderr, 0.0))
 
     def noise_spectrum(self, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Two-sided density of n per cycle a sample, and its standard error to first order."""
@@ -88,14 +96,30 @@ class FilterFit:
         relative = 2 / self.count + np.einsum("fi,ij,fj->f", slopes, self.lags_covariance, slopes)
         return density, density * np.sqrt(relative)
 
+    def _slopes(self) -> np.ndarray:
+        """Of `taps` by G, r and s; (taps, 3)."""
+        gain, decays = self.parameters[1], list(self.parameters[2:])
+        found = [_weights(decays[0], decays[1], self.after)]
+        step = 1e-5
+        for k in (0, 1):
+            # inward: a decay may be at an edge
+            other = decays.copy()
+            other[k] += step if decays[k] < _LARGEST_DECAY / 2 else -step
+            change = _weights(other[0], other[1], self.after) - found[0]
+            found.append(gain * change / (other[k] - decays[k]))
+        return np.stack(found, axis=-1)
 
-def fit_filter(output: np.ndarray, value: np.ndarray) -> FilterFit:
-    """The filter and its noise with the numbers of taps and lags that the data support.
+
+def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
+    """The filter and its noise, with the number of lags that the data support.
 
     Parameters
     ----------
     output, value : ndarray, shape (n,)
-        y and the input u, sample by sample; NaN where there is none, as between two records.
+        y and the input u, sample by sample; NaN where there is none. Two records are parted by
+        `BEFORE` samples or more without output.
+    after : int
+        Samples after a sample that may have a weight.
 
     Raises
     ------
@@ -103,21 +127,19 @@ def fit_filter(output: np.ndarray, value: np.ndarray) -> FilterFit:
         Fewer than `LEAST_SAMPLES` samples that have all inputs and outputs before them.
     """
     # all models are compared on the samples that the longest one has
-    usable = _whole(output, value, MOST_TAPS, MOST_LAGS)
+    usable = np.isfinite([_delayed(output, k) for k in range(MOST_LAGS + 1)]).all(axis=0)
     if usable.sum() < LEAST_SAMPLES:
         raise InputError(
             f"{int(usable.sum())} slabs in succession with a valid wind are too few to identify a "
             f"filter; expected {LEAST_SAMPLES} or more, as of longer flights or of several"
         )
     found, least = None, np.inf
-    for taps in range(1, MOST_TAPS + 1):
-        for lags in range(MOST_LAGS + 1):
-            fit = _fitted(output, value, taps, lags)
-            errors = fit.innovations[usable]
-            number = len(errors)
-            criterion = number * np.log(np.mean(errors**2)) + (taps + lags) * np.log(number)
-            if criterion < least:
-                found, least = fit, criterion
+    for lags in range(MOST_LAGS + 1):
+        fit = _fitted(output, value, after, lags)
+        number = int(usable.sum())
+        criterion = number * np.log(np.mean(fit.innovations[usable] ** 2)) + lags * np.log(number)
+        if criterion < least:
+            found, least = fit, criterion
     assert found is not None  # the criterion of finite data is finite
     return found
 
@@ -130,7 +152,8 @@ def fit_process(values: np.ndarray) -> tuple[np.ndarray, float]:
     values : ndarray, shape (n,)
         Without a mean; NaN between two records. There are many more than `MOST_PROCESS_LAGS`.
     """
-    usable = _whole(values, values, 1, MOST_PROCESS_LAGS)
+    before = [_delayed(values, k) for k in range(MOST_PROCESS_LAGS + 1)]
+    usable = np.isfinite(before).all(axis=0)
     found, least = (np.zeros(0), 0.0), np.inf
     for number in range(MOST_PROCESS_LAGS + 1):
         lags = burg(values, number)
@@ -159,29 +182,55 @@ def autocovariance(lags: np.ndarray, innovation_variance: float, number: int) ->
     return np.array(found[:number])
 
 
-def _fitted(output: np.ndarray, value: np.ndarray, taps: int, lags: int) -> FilterFit:
-    inputs = np.stack([np.ones(len(value)), *(_delayed(value, k) for k in range(taps))], axis=-1)
+def _weights(before: float, ahead: float, after: int) -> np.ndarray:
+    """h_j for j from -after to `BEFORE`."""
+    weights = np.concatenate(
+        [ahead ** np.arange(after, 0, -1.0), before ** np.arange(0.0, BEFORE + 1)]
+    )
+    return weights / weights.sum()
+
+
+def _fitted(output: np.ndarray, value: np.ndarray, after: int, lags: int) -> FilterFit:
+    around = np.stack([_delayed(value, k) for k in range(-after, BEFORE + 1)], axis=-1)
     a = np.zeros(0)
+    # the mean error and gain of least squares without memory
+    found = np.array([0.0, 1.0, 0.2, 0.2])
     for _ in range(_ROUNDS):
-        white, design = _whitened(output, a), _whitened(inputs, a)
+        white, design, ones = (_whitened(one, a) for one in (output, around, np.ones(len(output))))
         there = np.isfinite(white) & np.isfinite(design).all(axis=-1)
-        h = np.linalg.lstsq(design[there], white[there], rcond=None)[0]
-        before, a = a, burg(output - inputs @ h, lags)
-        if len(before) == lags and np.allclose(a, before, rtol=0, atol=1e-6):
+
+        def errors(
+            theta: np.ndarray, y: np.ndarray, x: np.ndarray, constant: np.ndarray
+        ) -> np.ndarray:
+            return y - theta[0] * constant - x @ (theta[1] * _weights(theta[2], theta[3], after))
+
+        edges = (
+            np.array([-np.inf, -np.inf, 0, 0]),
+            np.array([np.inf, np.inf, *2 * [_LARGEST_DECAY]]),
+        )
+        inside = np.clip(found, edges[0] + 1e-3, edges[1] - 1e-3)
+        data = white[there], design[there], ones[there]
+        solution = scipy.optimize.least_squares(errors, inside, bounds=edges, args=data)
+        found = solution.x
+        before, a = a, burg(errors(found, output, around, np.ones(len(output))), lags)
+        if len(before) == lags and np.allclose(a, before, rtol=0, atol=1e-5):
             break
-    errors = np.where(there, white - design @ h, np.nan)
+    innovations = np.full(len(output), np.nan)
+    innovations[there] = solution.fun
     count = int(there.sum())
-    variance = float(np.nansum(errors**2) / (count - taps - 1 - lags))
-    covariance = variance * np.linalg.inv(design[there].T @ design[there])
+    variance = float(np.sum(solution.fun**2) / (count - len(found) - lags))
     noise = scipy.linalg.toeplitz(autocovariance(a, variance, lags)) if lags else np.zeros((0, 0))
+    free = np.flatnonzero([True, True, *(found[2:] > 1e-3)])
+    covariance = np.zeros((4, 4))
+    jacobian = solution.jac[:, free]
+    covariance[np.ix_(free, free)] = variance * np.linalg.inv(jacobian.T @ jacobian)
     return FilterFit(
-        h[1:],
-        covariance[1:, 1:],
-        float(h[0]),
-        float(np.sqrt(covariance[0, 0])),
+        found,
+        covariance,
+        after,
         a,
         variance / count * np.linalg.inv(noise),
-        errors,
+        innovations,
         variance,
         count,
     )
@@ -209,8 +258,12 @@ def burg(values: np.ndarray, lags: int) -> np.ndarray:
 
 
 def _delayed(values: np.ndarray, by: int) -> np.ndarray:
+    """Values of so many samples before; of a negative number, after."""
     found = np.full(values.shape, np.nan)
-    found[by:] = values[: len(values) - by]
+    if by >= 0:
+        found[by:] = values[: len(values) - by]
+    else:
+        found[:by] = values[-by:]
     return found
 
 
@@ -219,10 +272,3 @@ def _whitened(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
     for k, a in enumerate(lags, 1):
         found -= a * _delayed(values, k)
     return found
-
-
-def _whole(output: np.ndarray, value: np.ndarray, taps: int, lags: int) -> np.ndarray:
-    """Samples with the outputs of all lags and the inputs of all taps and lags before them."""
-    needed = [_delayed(output, k) for k in range(lags + 1)]
-    needed += [_delayed(value, k) for k in range(taps + lags)]
-    return np.asarray(np.isfinite(needed).all(axis=0))

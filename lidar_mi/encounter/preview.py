@@ -143,9 +143,12 @@ class WakeTracker:
         self, x: np.ndarray, y: np.ndarray, z: np.ndarray, time: np.ndarray, width: float = 0.0
     ) -> np.ndarray:
         """Those of the usable tracks alone, without mean wind; see `wind_ahead.Vortices`."""
+        return self._remaining(x) * _tracked(self._usable, x, y, z, time, vortices=width)
+
+    def _remaining(self, x: np.ndarray) -> np.ndarray:
+        """Fraction of the tracked vortices in planes beyond the last slab."""
         end = self._usable[-1].x + _SLABS_BEYOND * self.stride
-        fraction = np.clip(1 - (x - end) / (HORIZON * self.stride / self.period), 0.0, 1.0)
-        return fraction * _tracked(self._usable, x, y, z, time, vortices=width)
+        return np.clip(1 - (x - end) / (HORIZON * self.stride / self.period), 0.0, 1.0)
 
     def preview(self, aircraft: AircraftModel, state: AircraftState) -> Preview | None:
         """The loads expected from a state on; None while nothing is known.
@@ -173,8 +176,24 @@ class WakeTracker:
             y = state.y + wing_places(self.ahead.span)
             x, z, time = (np.full_like(y, a) for a in (slab.x, state.z, state.time))
             _, stderr = self.ahead.at(x, y, z, time)
+            if self._usable:
+                stderr = np.hypot(stderr, self._vortex_errors(slab.x, y, z, state.time))
             found = np.stack(self.wind(x, y, z, time)[1:])
             self.arrivals.append(Arrival(slab.x, state.time, y, state.z, found, stderr))
+
+    def _vortex_errors(self, x: float, y: np.ndarray, z: np.ndarray, time: float) -> np.ndarray:
+        """Standard errors (2, n) of v and w by those of the tracked vortices in a plane, m/s."""
+        track = self._usable[_nearest(self._usable, np.array(x))]
+        pair = track.pair_at(x, time)
+        at_y, at_z = torch.as_tensor(y), torch.as_tensor(z)
+        slopes = torch.autograd.functional.jacobian(
+            lambda theta: pair_wind(theta, at_y, at_z, track.profile),
+            torch.as_tensor(pair.parameters),
+        ).numpy()
+        # the mean wind is that of the vectors
+        slopes[..., MEAN_WIND] = 0.0
+        fraction = float(self._remaining(np.array(x)))
+        return fraction * np.sqrt(np.einsum("cnk,kl,cnl->cn", slopes, pair.covariance, slopes))
 
     def _track(self, estimate: Estimate, place: float) -> None:
         before, pair, found = self.track, estimate.pair, None
@@ -206,8 +225,7 @@ def _tracked(
 
     With `vortices` those of the vortices alone, in a Gaussian mean of this standard deviation, m.
     """
-    away = [np.abs(x[..., None] - [one.x for one in t.slabs]).min(-1) for t in tracks]
-    nearest = np.argmin(away, axis=0)
+    nearest = _nearest(tracks, x)
     found = np.zeros((2, *x.shape))
     for k, track in enumerate(tracks):
         here = nearest == k
@@ -218,6 +236,12 @@ def _tracked(
         at_y, at_z = (torch.as_tensor(a[here]) for a in (y, z))
         found[:, here] = pair_wind(theta, at_y, at_z, track.profile).numpy()
     return found
+
+
+def _nearest(tracks: Sequence[Track], x: np.ndarray) -> np.ndarray:
+    """Which of the tracks has the slab nearest to each place."""
+    away = [np.abs(x[..., None] - [one.x for one in t.slabs]).min(-1) for t in tracks]
+    return np.argmin(away, axis=0)
 
 
 def preview_in(wind: Wind, aircraft: AircraftModel, state: AircraftState) -> Preview:

@@ -18,6 +18,9 @@ from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import check
 from lidar_mi.io.netcdf import read_netcdf
 
+MARGIN = 8
+"""Planes before and after those of a flight in which the wind is known."""
+
 
 @dataclass(frozen=True, eq=False)
 class SensorSamples:
@@ -36,6 +39,8 @@ class SensorSamples:
     truth, estimate : ndarray, shape (slabs, 4)
         Along `lidar_mi.encounter.gust_axes.GUSTS`. The truth is that of the plane when the wing
         arrives on the nominal path; NaN where nothing was estimated.
+    truth_before, truth_after : ndarray, shape (`MARGIN`, 4)
+        In the planes before and after.
     roll_moment_per_gust : float
         Rolling moment per roll gust, N m s/rad.
     lift_per_gust : float
@@ -49,6 +54,8 @@ class SensorSamples:
     delay: float
     truth: np.ndarray
     estimate: np.ndarray
+    truth_before: np.ndarray
+    truth_after: np.ndarray
     roll_moment_per_gust: float
     lift_per_gust: float
 
@@ -103,8 +110,10 @@ def samples_of(folder: Path) -> SensorSamples:
         (aircraft.strips.areas * aircraft.strips.slopes * aircraft.strips.normals[:, 2] ** 2).sum()
     )
     number = np.round((slabs["x"].values - float(slabs["x"][0])) / (speed * period)).astype(int)
-    x = float(slabs["x"][0]) + speed * period * np.arange(number[-1] + 1)
-    estimate = np.full((len(x), len(GUSTS)), np.nan)
+    count = int(number[-1]) + 1
+    planes = float(slabs["x"][0]) + speed * period * np.arange(-MARGIN, count + MARGIN)
+    truth = true_gusts(experiment, planes, span)
+    estimate = np.full((count, len(GUSTS)), np.nan)
     estimate[number] = estimated_gusts(slabs, span)
     first_scan = slabs["time"].values - period / 2
     return SensorSamples(
@@ -113,8 +122,10 @@ def samples_of(folder: Path) -> SensorSamples:
         span,
         float(np.median(slabs["x"].values - speed * first_scan)),
         float(np.median(slabs["delivered"].values - first_scan)),
-        true_gusts(experiment, x, span),
+        truth[MARGIN:-MARGIN],
         estimate,
+        truth[:MARGIN],
+        truth[-MARGIN:],
         -aircraft.roll_damping,
         lift,
     )

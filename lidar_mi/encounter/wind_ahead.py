@@ -136,7 +136,7 @@ class WindAhead:
                 <= _NEARLY * getattr(before, name)
                 for name in ("sigma", "length", "resolution", "scale")
             )
-            if same:
+            if same and before.shape == statistics.shape:
                 return
         self._known = statistics, lattice
         for slab in self._slabs:
@@ -146,7 +146,14 @@ class WindAhead:
         assert self._known is not None  # as settled
         statistics, lattice = self._known
         bases = [
-            basis(name, statistics.length, statistics.resolution, self.stride, lattice)
+            basis(
+                name,
+                statistics.length,
+                statistics.resolution,
+                statistics.shape,
+                self.stride,
+                lattice,
+            )
             for name in ACROSS
         ]
         for slab, more in zip(self._slabs, extra, strict=True):

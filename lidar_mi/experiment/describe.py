@@ -150,7 +150,10 @@ def _netcdf(path: Path) -> Iterator[Section]:
     from lidar_mi.io.netcdf import load_variable, open_netcdf
 
     if is_lines_of_sight(path):
-        yield from _lines_of_sight(path)
+        try:
+            yield from _lines_of_sight(path)
+        except InputError as error:
+            yield f"{path}: lines of sight", [("not read", str(error))]
     with open_netcdf(path) as data:
         rows = []
         for name, variable in data.variables.items():

@@ -39,5 +39,7 @@ def test_what_is_given_overrides_the_aircraft():
 
 
 def test_an_unknown_type_is_refused():
+    with pytest.raises(ValidationError, match=r"mass: not allowed without aircraft"):
+        VortexPair(mass="60 t")
     with pytest.raises(ValidationError, match=r"'B797' is not allowed; expected one of A319, A320"):
         VortexPair(aircraft="B797")

@@ -164,3 +164,8 @@ def test_what_is_no_thin_line_is_refused(change, message):
     keys = {"amplitude": 1.0, "separation": B, "wavelength": WAVE, "core_radius": CORE} | change
     with pytest.raises(InputError, match=message):
         crow.crow_filaments(**keys)
+
+
+def test_cores_too_thin_for_a_table_are_refused():
+    with pytest.raises(InputError, match=r"expected cores of at least 1\.01 m"):
+        FilamentTable(lines(1.0, core=0.9), WAVE / 4)

@@ -9,8 +9,10 @@ import math
 import pytest
 
 from lidar_mi.atmosphere.filament_path import FilamentsAlongPath
-from lidar_mi.encounter.wake import described_wake, wake_along_path
+from lidar_mi.encounter.fly import fly
+from lidar_mi.encounter.wake import described_wake, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import silent
 from tests.support.encounters import small_encounter
 
 MET = 190 / 75
@@ -59,6 +61,22 @@ def test_the_wake_of_an_aircraft_reaches_the_path():
     wake = wake_along_path(experiment)
     assert wake.separation == pytest.approx(math.pi / 4 * 79.75)
     assert dict(described_wake(experiment))["vortices when met"].startswith("of an A388, ")
+
+
+def test_flights_through_filaments():
+    """Without waves the roll is that in the straight pair; through rings the flight has no truth
+    of vortices where a plane cuts none, and goes on."""
+    rolls = []
+    for crow in ({}, {"model": "filaments"}, {"model": "filaments", "amplitude": "9 m"}):
+        path = {"start": "150 m", "beyond": "60 m", "crossing_angle": "15 deg"}
+        wake = {"age": "30 s", "crow": crow}
+        flown = small_encounter(encounter={"path": path, "wake": wake, "control": {"mode": "off"}})
+        rolls.append(fly(flown, notice=silent).metrics["encounter.off.largest_roll"])
+    assert rolls[1] == pytest.approx(rolls[0], rel=0.01)
+    assert wake_along_path(flown).rings
+    seen = [vortices_in_plane(wake_along_path(flown), x, 2.0) for x in range(0, 210, 7)]
+    assert None in seen and any(seen)
+    assert abs(rolls[2] / rolls[0] - 1) > 0.05
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ roll that differs from that of flights by more than 10 %.
 
 import json
 import re
+import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +32,12 @@ from lidar_mi.io.yaml import to_yaml
 from tests.support.synthetic_lidar import encounter_keys
 
 SEEDS = range(1, 9)
-GUIDE = Path(__file__).parents[2] / "docs" / "guide" / "control_block.md"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "control_loop.py"
 LATENCY, PERIOD, SPEED = 0.12, 0.1, 75.0
-TAPS = {"v": (0.9, 0.0), "w": (0.7, 0.25), "p": (0.6, 0.0)}
+FILTER = {"v": (0.9, 0.0, 0.0), "w": (0.95, 0.4, 0.2), "p": (0.6, 0.3, 0.4)}
 NOISE = {"v": (0.0, 0.3), "w": (0.6, 0.2), "p": (0.5, 0.008)}
-"""Of the lidar: weights of a plane and of the one before; lag and innovation of its noise."""
+"""Of the lidar: gain, decay of its weights from plane to plane before and after the estimated one;
+lag and innovation of its noise."""
 
 
 def experiment(seed=1, **path):
@@ -50,8 +53,15 @@ def experiment(seed=1, **path):
     return check(keys, "test")
 
 
+def weights(axis):
+    """Of the planes from 3 after the estimated one to 8 before it."""
+    gain, before, after = FILTER[axis]
+    found = np.array([after**k for k in (3, 2, 1)] + [before**k for k in range(9)])
+    return gain * found / found.sum()
+
+
 class KnownLidar:
-    """A lidar that is the filter `TAPS` with the noise `NOISE`; vectors are linear along y.
+    """A lidar that is the filter `FILTER` with the noise `NOISE`; vectors are linear along y.
 
     Attributes
     ----------
@@ -64,14 +74,17 @@ class KnownLidar:
     def __init__(self, one, seed):
         path, random = one.encounter.path, np.random.default_rng(seed)
         self.x = np.arange(150.0, path.start + path.beyond, SPEED * PERIOD)
-        truth = dict(zip("uvwp", true_gusts(one, self.x, 28.9).T, strict=True))
+        # the planes that have a weight in the first and in the last estimate
+        step = SPEED * PERIOD
+        around = np.concatenate(
+            [self.x[0] + step * np.arange(-8, 0), self.x, self.x[-1] + step * np.arange(1, 4)]
+        )
+        truth = dict(zip("uvwp", true_gusts(one, around, 28.9).T, strict=True))
         self.estimates = {}
         for axis, (lag, innovation) in NOISE.items():
             white = innovation * random.standard_normal(len(self.x))
-            before = np.concatenate([truth[axis][:1], truth[axis][:-1]])
-            first, second = TAPS[axis]
             noise = scipy.signal.lfilter([1], [1, -lag], white)
-            self.estimates[axis] = first * truth[axis] + second * before + noise
+            self.estimates[axis] = np.convolve(truth[axis], weights(axis), "valid") + noise
 
     def step(self, t, pose=None, expected=None):
         """The estimate of the slab that the scan at a time completes."""
@@ -159,10 +172,13 @@ def test_filter_and_noise_are_those_of_the_lidar(block):
     axes = list(block["axis"])
     assert axes == ["v", "w", "p"] and block["flights"] == 8
     for k, axis in enumerate(axes):
-        taps, lag, innovation = TAPS[axis], *NOISE[axis]
-        stderr = block["gain_stderr"][k]
-        assert abs(block["gain"][k] - sum(taps)) < 4 * stderr < 0.2 * sum(taps)
-        assert abs(block["taps"][k, 0] - taps[0]) < 4 * block["taps_stderr"][k, 0]
+        lag, innovation = NOISE[axis]
+        for name, true in zip(("gain", "decay_before", "decay_after"), FILTER[axis], strict=True):
+            error, stderr = block[name][k] - true, block[f"{name}_stderr"][k]
+            # at the edge, 0, a decay has no error
+            assert abs(error) < 4 * stderr or (true == 0 and error < 0.1)
+            assert stderr < 0.15 * max(true, 0.5)
+        np.testing.assert_allclose(block["taps"][k], weights(axis), atol=0.05)
         variance = innovation**2 / (1 - lag**2)
         assert abs(block["noise_variance"][k] - variance) < 4 * block["noise_variance_stderr"][k]
         assert block["noise_variance_stderr"][k] < 0.1 * variance
@@ -230,24 +246,14 @@ def test_matlab_has_the_same_with_units(flights, block):
     assert listed["arrays"].keys() == about.keys() and listed["axes"]["p"]["units"] == "rad s-1"
 
 
-def roll_by_the_guide(folder, forward):
-    """Predicted rms roll angle, rad, by the program of the guide."""
+def example():
+    """The program that closes a loop."""
     pytest.importorskip("control")
-    program = re.search(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL).group(1)
-    changes = {
-        "outputs/air/control/block_151m.npz": str(folder / "control" / "block_150m.npz"),
-        "from_rate = 1.0, 1.0, 0.5": f"from_rate = {forward}, 1.0, 0.5",
-    }
-    for old, new in changes.items():
-        assert program.count(old) == 1
-        program = program.replace(old, new)
-    found: dict = {}
-    exec(program, found)
-    return found
+    return runpy.run_path(str(EXAMPLE))
 
 
 def rolled(moments, estimates, forward):
-    """Roll angles of a flight with the controller of the guide, by the roll model.
+    """Roll angles of a flight with the controller of the example, by the roll model.
 
     Rolling moments of the wind (N m) have a row for each period and a column for each of its parts.
     Estimates of p are of planes from 20 periods on.
@@ -283,23 +289,40 @@ def weather():
 
 
 @pytest.mark.parametrize("forward", [0.0, 1.0])
-def test_predicted_roll_agrees_with_flights(flights, weather, forward):
+def test_predicted_roll_agrees_with_flights(block, weather, forward):
     """Within 10 %: the variance of roll of nonlinear flights, by the roll model and its aileron.
 
     The air is that of the flights from which the block is identified: the variance of turbulence
     differs by more from realisation to realisation.
     """
-    predicted = roll_by_the_guide(flights, forward)["roll"] ** 2
+    predicted = example()["rms"](block, forward)[0] ** 2
     # the first 5 s are transient
     found = np.mean([np.mean(rolled(*one, forward)[200:] ** 2) for one in weather])
     assert abs(found / predicted - 1) < 0.1
+
+
+def test_the_example_flies_along_recorded_flights(flights, block, capsys, monkeypatch):
+    """Roll by the recorded estimates, within 10 % of the predicted variance."""
+    path = str(flights / "control" / "block_150m.npz")
+    monkeypatch.setattr(sys, "argv", ["control_loop.py", path, "--flights", str(flights)])
+    pytest.importorskip("control")
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3
+    for text in lines:
+        predicted, _, flown = map(float, re.findall(r"\d\.\d\d", text))
+        # both are rounded to a hundredth of a degree
+        assert abs((flown / predicted) ** 2 - 1) < 0.13
+    assert example()["AILERON_MOMENT"] == pytest.approx(
+        aircraft_of(experiment().encounter).control_moments[0, 0], rel=1e-3
+    )
 
 
 def test_folders_without_what_is_needed_are_refused(tmp_path, flights):
     with pytest.raises(InputError, match="holds no finished flight with the lidar; expected the"):
         lm.export_control(tmp_path)
     record(tmp_path / "short", experiment(start="300 m", beyond="100 m"), 1)
-    with pytest.raises(InputError, match=r"block at 150 m: v: 2\d slabs .* too few .*expected 50"):
+    with pytest.raises(InputError, match=r"block at 150 m: v: \d\d slabs .* too few .*expected 50"):
         lm.export_control(tmp_path / "short")
     with pytest.raises(InputError, match=r"block_150m\.npz: exists; expected another folder"):
         lm.export_control(flights)

@@ -249,6 +249,14 @@ def test_damaged_netcdf_files_give_a_line_or_what_can_be_read(tmp_path_factory, 
         assert len(str(error)) < 300
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_separators_of_tables_and_comments(known, tmp_path, separator):
+    text = "# of a lidar\n" + made.csv_text(known).replace(",", separator)
+    (tmp_path / "a.csv").write_text(text)
+    found = lm.read_lines_of_sight(tmp_path / "a.csv", names={"radial_velocity": "v_r"})
+    np.testing.assert_allclose(found["radial_velocity"], known.velocity, atol=1e-5)
+
+
 # --- faults ----------------------------------------------------------------------------------
 
 
@@ -285,6 +293,18 @@ def test_scans_that_overlap_or_come_twice_are_kept_and_remarked(known, tmp_path)
     twice = lm.read_lines_of_sight([tmp_path / "a.hpl", tmp_path / "a.hpl"])
     assert twice.sizes["time"] == 12
     assert "6 lines have the time and the direction of another" in twice.attrs["remarks"]
+
+
+def test_lines_without_a_direction_are_remarked(known, tmp_path):
+    known.azimuth[2] = np.nan
+    made.write_windcube(tmp_path / "a.nc", known)
+    found = lm.read_lines_of_sight(tmp_path / "a.nc")
+    np.testing.assert_allclose(found["azimuth"], [0, 60, 180, 240, 300])
+    assert "1 of 6 lines have no time or direction" in found.attrs["remarks"]
+    known.azimuth[:] = np.nan
+    made.write_windcube(tmp_path / "a.nc", known)
+    with pytest.raises(lm.InputError, match="no line of sight, of 6, has a time"):
+        lm.read_lines_of_sight(tmp_path / "a.nc")
 
 
 def test_gates_without_any_value_are_remarked(known, tmp_path):

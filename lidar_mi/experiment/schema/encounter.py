@@ -182,6 +182,17 @@ class Control(Section):
         return "off" if value is False else value
 
 
+class Window(Section):
+    """Where the scan of the backscatter lidar looks."""
+
+    follow: bool = Field(
+        False, description="its middle follows the pair; else it is straight ahead"
+    )
+    reach: Annotated[Angle, Within(0, 0.8, "a scanner")] = Field(
+        quantity("20 deg"), description="of its middle from straight ahead"
+    )
+
+
 class Encounter(Section):
     """A flight through the wake of the experiment."""
 
@@ -195,4 +206,5 @@ class Encounter(Section):
     look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
         150.0, description="range of the farther gate's start"
     )
+    window: Window = Window()
     control: Control = Control()

@@ -68,6 +68,10 @@ class VortexPair(Section):
     @model_validator(mode="after")
     def _of_the_aircraft(self) -> Self:
         if self.aircraft is None:
+            for name in ("mass", "speed", "altitude"):
+                # a description that was saved has all defaults
+                if getattr(self, name) != type(self).model_fields[name].default:
+                    raise ValueError(f"{name}: not allowed without aircraft")
             return self
         # loaded only where it is needed
         from ambiance import Atmosphere

@@ -44,9 +44,10 @@ def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
     import pandas as pd
 
     text = read_text(path, "a table of lines of sight", _LARGEST)
+    head = next((line for line in text.splitlines() if line and not line.startswith("#")), "")
     try:
-        # the separator, comma, semicolon or tab, is found
-        table = pd.read_csv(StringIO(text), sep=None, engine="python", comment="#", dtype=str)
+        separator = max(",;\t", key=head.count)
+        table = pd.read_csv(StringIO(text), sep=separator, comment="#", dtype=str)
     except Exception as error:  # any exception of the parser
         raise InputError(f"{path}: not a table ({error}); expected a head and rows") from None
     heads = [_HEAD.fullmatch(str(name)) for name in table.columns]

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, Scan, listed
+from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, Scan, listed, part
 from lidar_mi.io.netcdf import groups, load_variable, open_netcdf
 from lidar_mi.io.text import as_text
 from lidar_mi.units import conversion
@@ -330,26 +330,13 @@ def _apart(scan: Scan, data: xr.Dataset, path: Path) -> list[Scan]:
                 f"{path}: a sweep from ray {start} to {end - 1} is not allowed; it has {lines} rays"
             )
         used[start:end] = True
-        parts.append(_part(scan, slice(start, end)))
+        parts.append(part(scan, slice(start, end)))
     if not used.all():
         scan.remarks.append(
             f"{int((~used).sum())} rays belong to no sweep; they are one of their own"
         )
-        parts.append(_part(scan, np.flatnonzero(~used)))
+        parts.append(part(scan, np.flatnonzero(~used)))
     return parts
-
-
-def _part(scan: Scan, lines: slice | np.ndarray) -> Scan:
-    return Scan(
-        scan.time[lines],
-        {name: values[lines] for name, values in scan.angles.items()},
-        scan.range[lines] if scan.range.ndim == 2 else scan.range,
-        {name: values[lines] for name, values in scan.fields.items()},
-        scan.place,
-        None if scan.rejected is None else scan.rejected[lines],
-        scan.about,
-        scan.remarks,
-    )
 
 
 class _Ragged:

@@ -94,7 +94,7 @@ def read_lines_of_sight(
         for scan in _scans(path, names or {}):
             if range_step is not None:
                 _step(scan, range_step)
-            check(scan, path)
+            scan = check(scan, path)
             found, thresholds = flags(scan, min_cnr, blind_range)
             scans.append((path.name, scan, found))
     return assembled(scans, thresholds)

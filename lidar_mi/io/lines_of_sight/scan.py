@@ -72,23 +72,41 @@ def check(scan: Scan, path: Path) -> Scan:
     Raises
     ------
     InputError
-        No line, an angle, a time or a range that is no number, ranges that do not increase or that
-        can only be kilometres.
+        No line with a time and a direction, ranges that are no numbers, do not increase or can only
+        be kilometres.
     """
     lines = len(scan.time)
-    if not lines:
-        raise InputError(f"{path}: no line of sight; expected one or more")
-    if np.isnat(scan.time).any():
-        raise InputError(f"{path}: time: missing in {int(np.isnat(scan.time).sum())} lines")
+    known = ~np.isnat(scan.time)
     for name in ("azimuth", "elevation"):
-        bad = int((~np.isfinite(scan.angles[name])).sum())
-        if bad:
-            raise InputError(
-                f"{path}: {name}: no finite number in {bad} of {lines} lines; expected degrees"
-            )
+        known &= np.isfinite(scan.angles[name])
+    if not known.any():
+        raise InputError(
+            f"{path}: no line of sight, of {lines}, has a time, an azimuth and an elevation; "
+            "expected one or more"
+        )
+    if not known.all():
+        # as while a scanner moves from one scan to the next
+        scan = part(scan, np.flatnonzero(known))
+        scan.remarks.append(
+            f"{lines - int(known.sum())} of {lines} lines have no time or direction"
+        )
     _wrap(scan)
     _check_ranges(scan.range, path)
     return scan
+
+
+def part(scan: Scan, lines: slice | np.ndarray) -> Scan:
+    """Some of the lines of a scan."""
+    return Scan(
+        scan.time[lines],
+        {name: values[lines] for name, values in scan.angles.items()},
+        scan.range[lines] if scan.range.ndim == 2 else scan.range,
+        {name: values[lines] for name, values in scan.fields.items()},
+        scan.place,
+        None if scan.rejected is None else scan.rejected[lines],
+        scan.about,
+        scan.remarks,
+    )
 
 
 def _wrap(scan: Scan) -> None:

@@ -12,15 +12,24 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import chdtri
 
 from lidar_mi.retrieval.along_path.statistics import Statistics, error_correlation
 from lidar_mi.retrieval.along_path.vectors import ACROSS, SlabVectors
-from lidar_mi.retrieval.along_path.von_karman import covariance, lattice_covariance
+from lidar_mi.retrieval.along_path.von_karman import (
+    Mean,
+    Shape,
+    covariance,
+    lattice_covariance,
+    mean_of,
+)
 
 # Principal components of less variance than this, over the largest, are not known.
 _LEAST = 1e-6
 # Variance of vectors without error, m^2/s^2.
 _ROUNDING = 1e-12
+# Fraction of slabs in turbulence whose innovations are taken for something else.
+_CHANCE = 1e-3
 # Times from slab to arrival are taken alike within such steps, s.
 _TIME_STEP = 0.5
 
@@ -32,8 +41,8 @@ class Basis:
     Attributes
     ----------
     component : {"v", "w"}
-    length, resolution : float
-        Of `Statistics`, m.
+    length, resolution, shape
+        Of `Statistics`.
     axes : two ndarrays, shapes (ny,) and (nz,)
         y and z of the lattice's nodes, m.
     weights : ndarray, shape (nodes, states)
@@ -45,6 +54,7 @@ class Basis:
     component: str
     length: float
     resolution: float
+    shape: Shape
     axes: tuple[np.ndarray, np.ndarray]
     weights: np.ndarray
     variance: np.ndarray
@@ -52,18 +62,18 @@ class Basis:
 
     def mean(self, places: np.ndarray) -> np.ndarray:
         """Values per state (n, states) of a mean as a vector's at y and z (n, 2), m."""
-        return self._with_nodes(places, 2 * self.resolution**2, 0.0)
+        return self._with_nodes(places, mean_of(self.resolution, self.shape, 2), 0.0)
 
     def point(self, places: np.ndarray, swept: float) -> np.ndarray:
         """Values per state (n, states) of the wind at y and z (n, 2), m, itself.
 
         `swept` is the variance of the displacement since the slab was seen, m^2.
         """
-        return self._with_nodes(places, self.resolution**2, swept)
+        return self._with_nodes(places, mean_of(self.resolution, self.shape, 1), swept)
 
-    def _with_nodes(self, places: np.ndarray, across: float, swept: float) -> np.ndarray:
+    def _with_nodes(self, places: np.ndarray, mean: Mean, swept: float) -> np.ndarray:
         y, z = (place[:, None] - axis for place, axis in zip(places.T, self.axes, strict=True))
-        found = lattice_covariance(self.component, y, z, self.length, across, swept)
+        found = lattice_covariance(self.component, y, z, self.length, mean, swept)
         return found.reshape(len(places), -1) @ self.weights
 
 
@@ -110,19 +120,19 @@ class Lattice:
 
 @lru_cache(maxsize=64)
 def basis(
-    component: str, length: float, resolution: float, stride: float, lattice: Lattice
+    component: str, length: float, resolution: float, shape: Shape, stride: float, lattice: Lattice
 ) -> Basis:
     """The principal components on a lattice; each has its correlation over the `stride` (m)."""
     axes = lattice.axes
     y, z = (np.subtract.outer(a.ravel(), a.ravel()) for a in np.meshgrid(*axes))
-    across = 2 * resolution**2
-    here, there = (covariance(component, lag, y, z, length, across) for lag in (0.0, stride))
+    twice = mean_of(resolution, shape, 2)
+    here, there = (covariance(component, lag, y, z, length, twice) for lag in (0.0, stride))
     variance, vectors = np.linalg.eigh(here)
     some = variance > _LEAST * variance[-1]
     variance, vectors = variance[some], vectors[:, some]
     decay = np.einsum("nm,nk,km->m", vectors, there, vectors) / variance
     reach = -stride / np.log(np.clip(decay, 1e-3, 1 - 1e-9))
-    return Basis(component, length, resolution, axes, vectors / variance, variance, reach)
+    return Basis(component, length, resolution, shape, axes, vectors / variance, variance, reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +147,17 @@ class Observation:
         From the vectors to the information on the state, H' R^-1.
     information : ndarray, shape (states, states)
         H' R^-1 H.
+    forward : ndarray, shape (used, states)
+        H, from the state to the vectors.
+    precision : ndarray, shape (used, used)
+        R^-1, of the vectors' errors, (m/s)^-2.
     """
 
     used: np.ndarray
     gain: np.ndarray
     information: np.ndarray
+    forward: np.ndarray
+    precision: np.ndarray
 
 
 def observation(
@@ -163,22 +179,24 @@ def observation(
     used = vectors.valid & (np.abs(y) <= reach[0]) & (np.abs(z) <= reach[1])
     if not used.any():
         states = len(one.variance)
-        return Observation(used, np.zeros((states, 0)), np.zeros((states, states)))
+        none = np.zeros((states, 0))
+        return Observation(used, none, np.zeros((states, states)), none.T, np.zeros((0, 0)))
     places = np.stack([y[used], z[used]], -1)
     forward = _forward(one, places.tobytes())
     stderr = statistics.scale * vectors.stderr[number][used]
-    errors = stderr[:, None] * error_correlation(places, one.resolution) * stderr
+    errors = stderr[:, None] * error_correlation(places, statistics.mean(2)) * stderr
     errors += vectors.common[number] ** 2
     arm = places[:, 1 - number] - vectors.centre[1 - number]
     errors += vectors.rotation**2 * np.outer(arm, arm)
     # what the states do not describe
-    whole = float(covariance(one.component, 0.0, 0.0, 0.0, one.length, 2 * one.resolution**2))
+    whole = float(covariance(one.component, 0.0, 0.0, 0.0, one.length, statistics.mean(2)))
     missing = np.maximum(whole - forward**2 @ one.variance, 0.0)
     own = statistics.sigma**2 * missing + np.broadcast_to(extra, used.shape)[used]
     # of errors of 0 the covariance would be singular
     errors[np.diag_indices(len(errors))] += own + _ROUNDING
-    gain = cho_solve(cho_factor(errors), forward).T
-    return Observation(used, gain, gain @ forward)
+    precision = cho_solve(cho_factor(errors), np.eye(len(errors)))
+    gain = forward.T @ precision
+    return Observation(used, gain, gain @ forward, forward, precision)
 
 
 # slabs seen from a straight path have their vectors at the same places
@@ -203,6 +221,8 @@ class PathField:
         Covariance of each slab's state with that of the next one.
     swept_speed : float
         Rms speed at which eddies are swept past a place, m/s.
+    inflation : ndarray, shape (slabs,)
+        Factor of the variances about each slab, see `smoothed`.
     """
 
     basis: Basis
@@ -213,6 +233,7 @@ class PathField:
     covariance: np.ndarray
     cross: np.ndarray
     swept_speed: float
+    inflation: np.ndarray
 
     def at(
         self, x: np.ndarray, y: np.ndarray, z: np.ndarray, time: np.ndarray, *, error: bool = True
@@ -286,7 +307,8 @@ class PathField:
         if len(self.cross):
             both = self.cross[np.minimum(left, len(self.cross) - 1)]
             variance += 2 * np.einsum("nm,nmk,nk->n", from_left, both, from_right)
-        return np.sqrt(variance)
+        larger = np.maximum(self.inflation[left], self.inflation[right])
+        return np.sqrt(larger * variance)
 
 
 def smoothed(
@@ -311,11 +333,18 @@ def smoothed(
         The component of each slab's vectors, m/s.
     swept_speed : float
         As `PathField` has it.
+
+    Notes
+    -----
+    Where the vectors of a slab and its neighbours depart from what the slabs before let expect by
+    more than 1 in 1000 turbulent slabs do, variances there are multiplied by the mean square of the
+    normalised innovations (Birge 1932): the air is not what the statistics say, as in a vortex.
     """
     prior = statistics.sigma**2 * one.variance
     decays = [np.exp(-step / one.reach) for step in np.diff(x)]
     filtered, spreads, precisions = [], [], []
     state, spread = np.zeros(len(prior)), np.diag(prior)
+    squares = np.zeros((2, len(observations)))  # of innovations, and how many
     for number, (seen, wind) in enumerate(zip(observations, winds, strict=True)):
         if number:
             decay = decays[number - 1]
@@ -323,7 +352,12 @@ def smoothed(
             spread = decay[:, None] * spread * decay + np.diag(prior * (1 - decay**2))
         precision = np.linalg.inv(spread)
         spread = np.linalg.inv(precision + seen.information)
-        state = state + spread @ (seen.gain @ wind[seen.used] - seen.information @ state)
+        innovation = wind[seen.used] - seen.forward @ state
+        change = seen.gain @ innovation
+        # i' (H P H' + R)^-1 i
+        square = innovation @ seen.precision @ innovation - change @ spread @ change
+        squares[:, number] = square, len(innovation)
+        state = state + spread @ change
         filtered.append(state)
         spreads.append(spread)
         precisions.append(precision)
@@ -345,4 +379,13 @@ def smoothed(
         after,
         cross,
         swept_speed,
+        _inflation(*squares),
     )
+
+
+def _inflation(square: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Mean square of each slab and its neighbours where it is beyond chance, else 1."""
+    three = np.ones(3)
+    total, freedom = (np.convolve(a, three)[1:-1] for a in (square, number))
+    freedom = np.maximum(freedom, 1.0)
+    return np.where(total > chdtri(freedom, _CHANCE), total / freedom, 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.fft import dctn
 
 from lidar_mi.retrieval.along_path.vectors import ACROSS, SlabVectors
-from lidar_mi.retrieval.along_path.von_karman import covariance
+from lidar_mi.retrieval.along_path.von_karman import Mean, Shape, covariance, mean_of
 
 LENGTHS = tuple(15.0 * 2.0 ** np.arange(7))
 """Lengths of turbulence that are compared, m: from a wind turbine's wake to cruise."""
@@ -16,10 +16,16 @@ LENGTHS = tuple(15.0 * 2.0 ** np.arange(7))
 RESOLUTIONS = (0.29, 0.4, 0.55, 0.75, 1.0, 1.4, 2.0)
 """Standard deviations of the mean in a vector, in windows. That of a box is 1/sqrt(12) = 0.29."""
 
+MEANS: tuple[tuple[Shape, float], ...] = (
+    *(("gaussian", part) for part in RESOLUTIONS),
+    *(("falling", part) for part in RESOLUTIONS[2:]),
+)
+"""Shapes and standard deviations of the means that are compared."""
+
 RATIOS = np.geomspace(0.01, 100.0, 36)
 """True errors of the vectors over the rms of turbulence, in units of stated errors of 1 m/s."""
 
-_SHAPE = (len(LENGTHS), len(RESOLUTIONS), len(RATIOS))
+_SHAPE = (len(LENGTHS), len(MEANS), len(RATIOS))
 # Stated errors are known to a factor of 2 before the vectors are compared with each other.
 _KNOWN_TO = np.log(2.0)
 # Slabs over which statistics are remembered: turbulence changes with height.
@@ -40,24 +46,36 @@ class Statistics:
     sigma, length : float
         Rms of a component (m/s) and length (m) of von Karman's turbulence.
     resolution : float
-        Standard deviation of the Gaussian mean that a vector is, m.
+        Standard deviation of the mean that a vector is, m.
     scale : float
         True over stated errors of the vectors.
+    shape : {"gaussian", "falling"}
+        Of the mean.
     """
 
     sigma: float
     length: float
     resolution: float
     scale: float = 1.0
+    shape: Shape = "gaussian"
+
+    def mean(self, times: int) -> Mean:
+        """Of the vectors, once or twice."""
+        return mean_of(self.resolution, self.shape, times)
 
 
-def error_correlation(places: np.ndarray, resolution: float) -> np.ndarray:
-    """Correlation of the errors of vectors at places (n, 2), in m: (n, n).
+def noise_correlation(square: np.ndarray, twice: Mean) -> np.ndarray:
+    """Of white noise after a mean, at the squares of distances, m^2; `twice` is the mean's square.
 
-    White noise in a Gaussian mean of standard deviation s has exp(-r^2/(4 s^2)).
+    A Gaussian mean of standard deviation s makes it exp(-r^2/(4 s^2)).
     """
-    square = ((places[:, None] - places) ** 2).sum(-1)
-    smooth = np.exp(-square / (4 * resolution**2))
+    weight = twice.weight / twice.variance
+    return np.exp(-square[..., None] / (2 * twice.variance)) @ weight / weight.sum()
+
+
+def error_correlation(places: np.ndarray, twice: Mean) -> np.ndarray:
+    """Correlation of the errors of vectors at places (n, 2), in m: (n, n)."""
+    smooth = noise_correlation(((places[:, None] - places) ** 2).sum(-1), twice)
     return (1 - _OWN) * smooth + _OWN * np.eye(len(places))
 
 
@@ -65,8 +83,8 @@ def error_correlation(places: np.ndarray, resolution: float) -> np.ndarray:
 class _Expected:
     """Mean squares of the cosines of a grid, by band: of turbulence of variance 1, of errors of 1.
 
-    Shapes (lengths, resolutions, 2, bands) of a slab and of two successive ones, (resolutions,
-    bands) of the errors; `band` (nz, ny) numbers the bands.
+    Shapes (lengths, means, 2, bands) of a slab and of two successive ones, (means, bands)
+    of the errors; `band` (nz, ny) numbers the bands.
     """
 
     turbulence: np.ndarray
@@ -95,19 +113,15 @@ def _expected(shape: tuple[int, int], window: float, stride: float) -> _Expected
         variance = np.einsum("zyzy->zy", both)
         return np.bincount(band.ravel(), variance.ravel()) / counts
 
-    now, lagged = np.zeros((2, len(LENGTHS), len(RESOLUTIONS), len(ACROSS), len(counts)))
-    for (i, length), (j, part), (k, name) in product(
-        enumerate(LENGTHS), enumerate(RESOLUTIONS), enumerate(ACROSS)
+    now, lagged = np.zeros((2, len(LENGTHS), len(MEANS), len(ACROSS), len(counts)))
+    twice = [mean_of(part * window, kind, 2) for kind, part in MEANS]
+    for (i, length), (j, across), (k, name) in product(
+        enumerate(LENGTHS), enumerate(twice), enumerate(ACROSS)
     ):
-        across = 2 * (part * window) ** 2
         now[i, j, k] = squares(covariance(name, 0.0, lag_y, lag_z[:, None], length, across))
         lagged[i, j, k] = squares(covariance(name, stride, lag_y, lag_z[:, None], length, across))
-    errors = np.array(
-        [
-            squares(np.exp(-(lag_z[:, None] ** 2 + lag_y**2) / (4 * (part * window) ** 2)))
-            for part in RESOLUTIONS
-        ]
-    )
+    square = lag_z[:, None] ** 2 + lag_y**2
+    errors = np.array([squares(noise_correlation(square, mean)) for mean in twice])
     return _Expected(now, lagged, errors, band)
 
 
@@ -117,9 +131,9 @@ class StatisticsEstimator:
 
     Cosines of a slab are nearly independent (Whittle 1954), and each depends on the same cosine of
     the slab before (Vecchia 1988, J. R. Stat. Soc. B 50): the likelihood is that of the Gaussian
-    conditional distributions, for every combination of `LENGTHS`, `RESOLUTIONS` and
-    `RATIOS`, each with the variance that is most likely. The prior probability of all is the same
-    but for the scale of the errors; the most probable combination is taken.
+    conditional distributions, for every combination of `LENGTHS`, `MEANS` and `RATIOS`, each with
+    the variance that is most likely. The prior probability of all is the same but for the scale of
+    the errors; the most probable combination is taken.
 
     Attributes
     ----------
@@ -190,9 +204,13 @@ class StatisticsEstimator:
         scale = np.maximum(RATIOS * sigma, 1e-9)
         cost += (np.log(scale) / _KNOWN_TO) ** 2
         i, j, k = np.unravel_index(int(cost.argmin()), cost.shape)
-        resolution = RESOLUTIONS[j] * self._window
+        kind, part = MEANS[j]
         return Statistics(
-            float(sigma[i, j, k]), float(LENGTHS[i]), resolution, float(scale[i, j, k])
+            sigma=float(sigma[i, j, k]),
+            length=float(LENGTHS[i]),
+            resolution=part * self._window,
+            scale=float(scale[i, j, k]),
+            shape=kind,
         )
 
 

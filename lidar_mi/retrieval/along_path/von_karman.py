@@ -5,14 +5,22 @@ and weaker, so that the covariance of averaged winds has a closed form.
 """
 
 from functools import lru_cache
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gamma
+from scipy.special import gamma, roots_genlaguerre
 
 COMPONENTS = ("u", "v", "w")
 """Of the wind, along x, y and z."""
 
+Shape = Literal["gaussian", "falling"]
+"""Of a mean: exp(-k^2 s^2/2) of a wave k, or (1 + k^2 s^2/2q)^-q, which falls as k^(-8/3)."""
+
+# q of the second: a Wiener filter falls as the ratio of the inertial range in a plane to noise
+_FALLING = 4 / 3
+# Gaussians whose mixture it is; exact for 2 n - 1 moments of their variances.
+_MIXED = 6
 # a of the spectrum with the length scale of von Karman, 1.339 (Etkin 1972, chapter 13)
 _A = gamma(1 / 3) / (np.sqrt(np.pi) * gamma(5 / 6))
 _EXPONENT = 17 / 6
@@ -36,11 +44,55 @@ def _eddies(length: float) -> tuple[np.ndarray, np.ndarray]:
     return 2 * t * (_A * length) ** 2, scale * weight
 
 
-def _larger(length: float, mean: float) -> tuple[np.ndarray, np.ndarray]:
-    """The eddies that a mean, of so much variance in m^2, leaves."""
+class Mean(NamedTuple):
+    """A mean in the plane of y and z as a mixture of Gaussians.
+
+    Attributes
+    ----------
+    variance, weight : ndarray, shape (gaussians,)
+        Of each, m^2 along each axis, and its fraction.
+    """
+
+    variance: np.ndarray
+    weight: np.ndarray
+
+
+POINT = Mean(np.zeros(1), np.ones(1))
+"""No mean."""
+
+
+@lru_cache(maxsize=256)
+def mean_of(resolution: float, shape: Shape, times: int) -> Mean:
+    """A mean that is taken once, or twice in a row: of one wind, or of both of a covariance.
+
+    The second shape is a gamma mixture: (1 + a)^-q is the mean of exp(-t a) over t with the gamma
+    distribution of shape q.
+
+    Parameters
+    ----------
+    resolution : float
+        s: its standard deviation, m.
+    shape : {"gaussian", "falling"}
+    times : {1, 2}
+    """
+    if shape == "gaussian":
+        return Mean(np.array([times * resolution**2]), np.ones(1))
+    power = times * _FALLING
+    nodes, weights = roots_genlaguerre(_MIXED, power - 1)
+    return Mean(nodes * resolution**2 / _FALLING, weights / gamma(power))
+
+
+def _averaged(length: float, mean: Mean, swept: float) -> tuple[np.ndarray, ...]:
+    """Squares of the eddies' sizes along the path and in the plane, m^2, and weights.
+
+    Without those that the mean removes.
+    """
     sizes, weights = _eddies(length)
-    some = sizes >= min(_LEAST * mean, sizes[-1])
-    return sizes[some], weights[some]
+    some = sizes >= min(_LEAST * (mean.variance.min() + swept), sizes[-1])
+    along = np.repeat(sizes[some] + swept, len(mean.weight))
+    plane = np.add.outer(sizes[some] + swept, mean.variance).ravel()
+    weights = np.outer(weights[some], mean.weight).ravel() / (np.sqrt(along) * plane)
+    return along, plane, weights
 
 
 def covariance(
@@ -49,7 +101,7 @@ def covariance(
     y: ArrayLike,
     z: ArrayLike,
     length: float,
-    across: float = 0.0,
+    mean: Mean = POINT,
     swept: float = 0.0,
 ) -> np.ndarray:
     """Covariance of one component of the wind at two places, over its variance.
@@ -67,9 +119,8 @@ def covariance(
         From one place to the other, m; broadcast.
     length : float
         L, m.
-    across : float
-        s_1^2 + s_2^2, m^2: 0 of winds that are not averaged, s^2 of one that is and one that is
-        not.
+    mean : Mean
+        Of both winds together, see `mean_of`; default: they are not averaged.
     swept : float
         Variance along each axis of an unknown displacement of all air between both times, m^2.
 
@@ -79,18 +130,17 @@ def covariance(
         1 at one place, without averages.
     """
     axis = COMPONENTS.index(component)
-    sizes, weights = _larger(length, across + swept)
-    square = (sizes + swept, sizes + swept + across, sizes + swept + across)
+    along, plane, weights = _averaged(length, mean, swept)
+    square = (along, plane, plane)
     places = [np.asarray(a, float)[..., None] for a in (x, y, z)]
     exponent = sum(a**2 / (2 * b) for a, b in zip(places, square, strict=True))
     # of the axes at right angles to the component: k^2 - k_i^2 in places
     curvature = sum(1 / square[n] - places[n] ** 2 / square[n] ** 2 for n in range(3) if n != axis)
-    weights = weights / np.sqrt(square[0] * square[1] * square[2])
     return (np.exp(-exponent) * curvature) @ weights
 
 
 def lattice_covariance(
-    component: str, y: np.ndarray, z: np.ndarray, length: float, across: float, swept: float
+    component: str, y: np.ndarray, z: np.ndarray, length: float, mean: Mean, swept: float
 ) -> np.ndarray:
     """`covariance` of v or w at places of one plane with the nodes of a lattice in it.
 
@@ -101,16 +151,14 @@ def lattice_covariance(
     component : {"v", "w"}
     y, z : ndarray, shapes (n, ny) and (n, nz)
         From the places to the nodes, m.
-    length, across, swept
+    length, mean, swept
         As in `covariance`.
 
     Returns
     -------
     ndarray, shape (n, nz, ny)
     """
-    sizes, weights = _larger(length, across + swept)
-    along, plane = sizes + swept, sizes + swept + across
-    weights = weights / (np.sqrt(along) * plane)
+    along, plane, weights = _averaged(length, mean, swept)
     bells = [np.exp(-(a[..., None] ** 2) / (2 * plane)) for a in (y, z)]
     # the axis of the plane at right angles to the component
     number = 0 if component == "w" else 1

@@ -77,21 +77,11 @@ def along_z(
 
 
 def along_y(
-    middle: torch.Tensor,
-    mesh: Mesh,
-    first: int,
-    second: int,
-    first_shift: int = 0,
-    ahead: float = 1.0,
+    middle: torch.Tensor, mesh: Mesh, first: int, second: int, first_shift: int = 0
 ) -> torch.Tensor:
-    """The sum over shifts along y of what `along_z` gives, at the nodes: (..., z, y).
-
-    Shifts are those from `first_shift` on; those ahead are multiplied by a factor.
-    """
+    """The sum over shifts along y, from this one on, of what `along_z` gives: (..., z, y)."""
     shifts = slice(REACH + first_shift, REACH + first_shift + middle.shape[-2])
     products = mesh.products(1, first, second)[shifts]
-    if ahead != 1.0:
-        products = torch.cat([products[:1], ahead * products[1:]])
     found = middle.new_empty(*middle.shape[:-2], products.shape[-1])
     for knots, nodes in mesh.groups(1):
         part = products[:, knots, nodes].flatten(0, 1)

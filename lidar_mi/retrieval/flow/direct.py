@@ -86,9 +86,14 @@ def factored(forms: torch.Tensor) -> Sequence[Root]:
     torch.linalg.LinAlgError
         One is not positive definite.
     """
-    if forms.device.type == "cpu":
+    if by_lapack(forms):
         return [_in_double(form) for form in forms]
     return cyclic_reduction.factored(working(forms))
+
+
+def by_lapack(form: torch.Tensor) -> bool:
+    """Whether a form is factored on the processor: where it is."""
+    return form.device.type == "cpu"
 
 
 def covariance_near(root: Root, form: torch.Tensor) -> torch.Tensor:
@@ -148,17 +153,19 @@ def solved_in_single(
     mesh: Mesh,
     coefficients: torch.Tensor,
     prior_term: PriorTerm,
-    near: BandCholesky | None = None,
+    near: Root | None = None,
 ) -> torch.Tensor:
     """Coefficients after a step in single precision; its residual is looked at in double precision.
 
     By conjugate gradients from the factor of a form that is `near` the step's own, or by the factor
     of that. Where there is no such factor, or the residual is not small, all is in double
-    precision.
+    precision; so it is on another device than the processor.
     """
     gradient = mesh.transposed(linear.gradient) + prior_term.gradient
     whole = data_form(linear, mesh) + prior_term.whole
-    if near is not None:
+    if not by_lapack(whole):
+        return coefficients + factored(whole[None])[0].solve(gradient)
+    if isinstance(near, BandCholesky):
         step = solved_near(near, whole, gradient, _SINGLE, _MOST_PRODUCTS)
         if step is not None:
             return coefficients + step
@@ -171,8 +178,10 @@ def solved_in_single(
     return coefficients + _in_double(whole).solve(gradient)
 
 
-def factor_in_single(form: torch.Tensor) -> BandCholesky:
-    """Factor of a form in single precision, or in double where there is none."""
+def factor_in_single(form: torch.Tensor) -> Root:
+    """Factor of a form in single precision; in double where there is none, and on other devices."""
+    if not by_lapack(form):
+        return factored(form[None])[0]
     return cholesky(form.float()) or _in_double(form)
 
 
@@ -246,6 +255,9 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
 def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None) -> torch.Tensor:
     """Variance of each kind of motion (kinds, ...) on the prior's mesh, from a band's."""
     mesh = prior.mesh
+    # shifts back along y are those ahead with the derivatives exchanged, which is another summand
+    covariance = covariance.clone()
+    covariance[..., 1:, :] *= 2
     # motions share derivatives: each is taken once
     middles: dict[tuple[int, ...], torch.Tensor] = {}
     found: dict[tuple[int, int, tuple[int, ...], tuple[int, ...]], torch.Tensor] = {}
@@ -255,9 +267,7 @@ def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None
         if key not in middles:
             middles[key] = along_z(covariance[a, b], mesh, first[0], second[0], cells)
         if (a, b, first, second) not in found:
-            # shifts back along y are those ahead of the terms exchanged, which is another summand
-            parts = along_y(middles[key], mesh, first[1], second[1], ahead=2.0)
-            found[a, b, first, second] = parts
+            found[a, b, first, second] = along_y(middles[key], mesh, first[1], second[1])
         return found[a, b, first, second]
 
     return prior.by_kind(

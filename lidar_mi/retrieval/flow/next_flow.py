@@ -8,10 +8,10 @@ import torch
 
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.flow.band import spread
-from lidar_mi.retrieval.flow.band_cholesky import BandCholesky
 from lidar_mi.retrieval.flow.direct import (
     Posterior,
     PriorTerm,
+    Root,
     factor_in_single,
     form_of_slopes,
     prior_term_of,
@@ -168,7 +168,7 @@ class ExpectedFlow:
     first : tuple of torch.Tensor, shape (1, z, y)
         Value and slopes of the first image there.
     prior_term : PriorTerm
-    root : BandCholesky
+    root : Root
         Factor of the precision of the flow, by the information that the first image shows.
     covariance : torch.Tensor, shape (2, 2, *windows.count)
         Of the flow by it, px^2.
@@ -183,7 +183,7 @@ class ExpectedFlow:
     places: torch.Tensor
     first: tuple[torch.Tensor, ...]
     prior_term: PriorTerm
-    root: BandCholesky
+    root: Root
     covariance: torch.Tensor
     information: torch.Tensor
 

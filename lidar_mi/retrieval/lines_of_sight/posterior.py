@@ -38,7 +38,7 @@ _MOST_PLACES = 200
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Lines at one height, in the order of time; neighbours may be averaged to one number.
+    """Lines at one height; neighbours in direction may be averaged to one number.
 
     Attributes
     ----------
@@ -46,6 +46,8 @@ class Level:
         Unit vectors of the lines: east, north, up.
     places : (n, 3) array
         Of the gates, m, in the frame that moves with the mean wind.
+    path : (m, 3) array
+        Places over which the wind is averaged, m.
     starts : (k,) array of int
         First line of each average.
     velocity : (k,) array
@@ -56,6 +58,7 @@ class Level:
 
     design: np.ndarray
     places: np.ndarray
+    path: np.ndarray
     starts: np.ndarray
     velocity: np.ndarray
     noise: np.ndarray
@@ -111,6 +114,7 @@ def evidence(levels: Sequence[Level], lengths: Sequence[float], noise: float) ->
     together = Level(
         design,
         places,
+        places,
         np.concatenate([one.starts + k for one, k in zip(levels, first, strict=True)]),
         velocity,
         independent,
@@ -144,13 +148,12 @@ def evidence(levels: Sequence[Level], lengths: Sequence[float], noise: float) ->
 def mean_wind(
     level: Level, found: Evidence, lengths: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Average wind along the path of a level's lines (3,), m/s, and its covariance (3, 3).
+    """Average wind over the path of a level (3,), m/s, and its covariance (3, 3).
 
     Under each model by universal kriging (Cressie, Statistics for Spatial Data, 1993, section 3.4);
     the spread of the models is part of the error.
     """
-    path = along(level.places)
-    path = path[:: math.ceil(len(path) / _MOST_PLACES)]
+    path = level.path[:: math.ceil(len(level.path) / _MOST_PLACES)]
     means = level.averaged(level.design)
     winds, errors = [], []
     for length in lengths:

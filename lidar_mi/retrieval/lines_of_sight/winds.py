@@ -1,6 +1,5 @@
 """Profiles of the wind from scans of a Doppler lidar: VAD, DBS, PPI."""
 
-import enum
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,60 +10,21 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines_of_sight.outliers import LIMIT, refitted, residuals, spread
-from lidar_mi.retrieval.lines_of_sight.posterior import LENGTHS, Level, evidence, mean_wind
-from lidar_mi.retrieval.lines_of_sight.profile_dataset import profile_dataset
-
-MAX_CONDITION = 100.0
-"""Largest condition number of the lines of a valid wind.
-
-Beyond it the component that they know least has a hundred times the error of the best.
-"""
+from lidar_mi.retrieval.lines_of_sight.posterior import LENGTHS, Level, along, evidence, mean_wind
+from lidar_mi.retrieval.lines_of_sight.profiles import (
+    MAX_CONDITION,
+    MAX_STDERR,
+    MIN_FRACTION,
+    Profile,
+    WindFlag,
+    profile_dataset,
+)
 
 _BLOCK = 5  # levels that share their turbulence
 _MOST = 24  # numbers of a level: more lines are averaged with their neighbours
-_MOST_LINES = 120  # whose correlation is computed
+_MOST_LINES = 240  # whose correlation is computed
 _ROUNDS = 5  # of the search for outliers
 _LEAST_SPREAD = 0.02  # m/s: rounding of the velocities
-
-
-class WindFlag(enum.IntFlag):
-    """Reasons not to use a wind; 0: valid."""
-
-    TOO_FEW_LINES = 1
-    """Fewer than three valid lines, or lines in one plane."""
-    ILL_CONDITIONED = 2
-    """The lines hardly know one component: `MAX_CONDITION`."""
-    OUTLIERS = 4
-    """More than a third of the lines are outliers."""
-    ERROR_UNKNOWN = 8
-    """No residual and no stated noise tells the error."""
-
-
-@dataclass(eq=False)
-class Profile:
-    """Winds of one scan.
-
-    Attributes
-    ----------
-    time : datetime64
-    heights : (levels,) array
-        m above the lidar.
-    wind : (levels, 3) array
-    covariance : (levels, 3, 3) array
-    residual, condition : (levels,) arrays
-    dof, lines, outliers, flag : (levels,) arrays of int
-    """
-
-    time: np.datetime64
-    heights: np.ndarray
-    wind: np.ndarray
-    covariance: np.ndarray
-    residual: np.ndarray
-    condition: np.ndarray
-    dof: np.ndarray
-    lines: np.ndarray
-    outliers: np.ndarray
-    flag: np.ndarray
 
 
 @checked_arguments
@@ -142,7 +102,7 @@ def fit_winds_to_lines(
             "lines: no scan has three valid lines that are not in one plane; expected a VAD, "
             f"DBS or PPI (this is {lines.attrs.get('scan', 'unknown')})"
         )
-    return profile_dataset(profiles, WindFlag, lines.attrs)
+    return profile_dataset(profiles, lines.attrs)
 
 
 def _check(
@@ -205,20 +165,24 @@ def _scans(lines: xr.Dataset, interval: float | None) -> Iterator[np.ndarray]:
 class _Cells:
     """Usable gates of a scan: line, gate and level of each, heights of the levels, their stride.
 
-    Levels that are one stride apart share no air.
+    Levels that are one stride apart share no air; `all` is how many gates a level has, usable or
+    not.
     """
 
     line: np.ndarray
     gate: np.ndarray
     level: np.ndarray
     heights: np.ndarray
+    all: np.ndarray
     stride: int
 
 
 def _cells(scan: xr.Dataset, usable: np.ndarray, step: float | None) -> _Cells | None:
-    line, gate = np.nonzero(usable)
-    if line.size < 3:
+    if usable.sum() < 3:
         return None
+    # gates above and below are no levels
+    there = np.isfinite(scan["radial_velocity"].values) & usable.any(0)
+    line, gate = np.nonzero(there)
     sine = np.sin(np.deg2rad(scan["elevation"].values))
     ranges = scan["range"].values
     height = ranges[gate] * sine[line]
@@ -232,7 +196,9 @@ def _cells(scan: xr.Dataset, usable: np.ndarray, step: float | None) -> _Cells |
     length = float(scan.attrs.get("gate_length", 0.0)) * float(sine.max())
     # at most the whole profile: also where the file's length of a gate makes no sense
     stride = int(np.clip(math.ceil(length / apart - 0.1), 1, heights.size))
-    return _Cells(line, gate, level.ravel(), heights, stride)
+    level, count = level.ravel(), np.bincount(level.ravel())
+    kept = usable[line, gate]
+    return _Cells(line[kept], gate[kept], level[kept], heights, count, stride)
 
 
 def _profile(
@@ -270,7 +236,7 @@ def _profile(
             found.flag[k] |= WindFlag.OUTLIERS.value
         line, gate = cells.line[used], cells.gate[used]
         found.condition[k] = _condition(design[line])
-        if not found.condition[k] < 1e6:
+        if not found.condition[k] < 1e6 or index.size < MIN_FRACTION * cells.all[k]:
             found.flag[k] |= WindFlag.TOO_FEW_LINES.value
             continue
         if found.condition[k] > MAX_CONDITION:
@@ -286,6 +252,8 @@ def _profile(
         levels[k] = _level(here, places, speed, noise)
         found.wind[k] = uniform
     _add_errors(found, levels, cells.stride, lengths)
+    variance = found.covariance[:, 0, 0] + found.covariance[:, 1, 1]
+    found.flag[variance > MAX_STDERR**2] |= WindFlag.UNCERTAIN.value
     return found
 
 
@@ -341,20 +309,27 @@ def _condition(design: np.ndarray) -> float:
 def _level(
     design: np.ndarray, places: np.ndarray, velocity: np.ndarray, noise: np.ndarray
 ) -> tuple[Level, float]:
-    """A level of at most `_MOST` averages and their mean variance of noise (NaN: unknown)."""
+    """A level of at most `_MOST` averages and their mean variance of noise (NaN: unknown).
+
+    Lines come in the order of time. Averages are of lines of nearly one direction.
+    """
+    path = along(places)
+    steep, azimuth = np.round(20 * design[:, 2]), np.arctan2(design[:, 0], design[:, 1])
+    order = np.lexsort((azimuth, steep))
+    design, places, velocity, noise = (one[order] for one in (design, places, velocity, noise))
     many = math.ceil(len(velocity) / _MOST_LINES)
     # of very many lines, neighbours are one line
-    every = Level(design, places, np.arange(0, len(velocity), many), velocity, noise)
+    every = Level(design, places, path, np.arange(0, len(velocity), many), velocity, noise)
     design, places, velocity = (every.averaged(one) for one in (design, places, velocity))
     size = math.ceil(len(velocity) / _MOST)
     starts = np.arange(0, len(velocity), size)
-    level = Level(design, places, starts, velocity, noise)
+    level = Level(design, places, path, starts, velocity, noise)
     weights = np.where(np.isfinite(noise), noise, 1.0)
     counts = np.diff(np.append(starts, len(velocity)))
     variance = level.averaged(every.averaged(weights)) / counts / many
     known = float(variance.mean()) if np.isfinite(noise).all() else math.nan
     noise = variance / variance.mean()
-    return Level(design, places, starts, level.averaged(velocity), noise), known
+    return Level(design, places, path, starts, level.averaged(velocity), noise), known
 
 
 def _add_errors(

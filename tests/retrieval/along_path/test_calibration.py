@@ -31,7 +31,7 @@ def predictions(air, slabs, evolving, count=42):
         truth = air(*at)
         for component in "vw":
             k = "vw".index(component)
-            one = basis(component, known.length, known.resolution, STRIDE, lattice)
+            one = basis(component, known.length, known.resolution, known.shape, STRIDE, lattice)
             seen = [observation(one, known, v) for *_, v in kept]
             planes, times, vectors_of = zip(*kept, strict=True)
             winds = [v.wind[k] for v in vectors_of]

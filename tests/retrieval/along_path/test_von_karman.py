@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import gamma, kv
 
-from lidar_mi.retrieval.along_path.von_karman import covariance, lattice_covariance
+from lidar_mi.retrieval.along_path.von_karman import covariance, lattice_covariance, mean_of
 
 
 def published(r, length):
@@ -44,7 +44,8 @@ def test_means_are_those_of_points():
     for component in ("v", "w"):
         at = off + np.array([3.0, 5.0, -2.0])
         drawn = covariance(component, *at.T, length)
-        expected = covariance(component, 3.0, 5.0, -2.0, length, width**2, swept**2)
+        mean = mean_of(width, "gaussian", 1)
+        expected = covariance(component, 3.0, 5.0, -2.0, length, mean, swept**2)
         error = drawn.std() / np.sqrt(len(drawn))
         assert abs(drawn.mean() - expected) < 4 * error < 0.002
 
@@ -52,7 +53,17 @@ def test_means_are_those_of_points():
 @pytest.mark.parametrize("component", ["v", "w"])
 def test_lattice_is_as_its_nodes(component):
     y, z = np.array([[-9.0, 0.0, 7.0]]), np.array([[-3.0, 4.0]])
-    found = lattice_covariance(component, y, z, 40.0, 9.0, 4.0)
+    found = lattice_covariance(component, y, z, 40.0, mean_of(3.0, "falling", 1), 4.0)
     at_y, at_z = np.meshgrid(y, z)
-    expected = covariance(component, 0.0, at_y, at_z, 40.0, 9.0, 4.0)
+    expected = covariance(component, 0.0, at_y, at_z, 40.0, mean_of(3.0, "falling", 1), 4.0)
     np.testing.assert_allclose(found[0], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_the_falling_mean_is_the_mixture(times):
+    """Of waves whose mean is not small."""
+    mean = mean_of(5.0, "falling", times)
+    for k in (0.0, 0.05, 0.1, 0.2):
+        mixed = float(np.exp(-(k**2) * mean.variance / 2) @ mean.weight)
+        expected = (1 + k**2 * 25 * 3 / 8) ** (-times * 4 / 3)
+        assert mixed == pytest.approx(expected, abs=0.01)

@@ -8,6 +8,7 @@ import torch
 from lidar_mi.retrieval.flow.band import Band, form, spread
 from lidar_mi.retrieval.flow.band_cholesky import cholesky, solved_near
 from lidar_mi.retrieval.flow.block_banded import factor
+from lidar_mi.retrieval.flow.direct import covariance_near
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
 
 AXES = Axis(23, 4.0), Axis(38, 5.0)
@@ -88,3 +89,21 @@ def test_a_form_that_is_not_positive_has_no_factor():
     mesh = Mesh(AXES, pixels())
     band = form(-torch.ones(2, 2, 23, 38, dtype=torch.float64), mesh)
     assert cholesky(band) is None
+
+
+def test_a_covariance_is_of_single_precision_only_where_that_suffices():
+    """Degrees of freedom of each coefficient to 1e-3; a form that is stiffer by 1e10 in part."""
+    knots = Band(*(axis.knots for axis in AXES))
+    mesh = Mesh(AXES, pixels())
+    band = torch.zeros(2, 2, 7, knots.rows, 4, knots.columns, dtype=torch.float64)
+    plain = form(torch.ones(23, 38, dtype=torch.float64), mesh)
+    stiff = form(torch.ones(23, 38, dtype=torch.float64), mesh, (1, 1), (1, 1))
+    for strength, same in ((1.0, False), (1e10, True)):
+        for a in (0, 1):
+            band[a, a] = plain + strength * stiff
+            band[a, a, 3, :, 0] += 0.1
+        root = cholesky(band)
+        exact, found = root.covariance(), covariance_near(root, band)
+        assert torch.equal(found, exact) == same
+        ones = torch.ones(2, knots.rows, knots.columns, dtype=torch.float64)
+        torch.testing.assert_close(knots.apply(found * band, ones), ones, rtol=0, atol=1e-3)

@@ -14,9 +14,12 @@ from lidar_mi.retrieval.flow.band import Band, form
 from lidar_mi.retrieval.flow.band_cholesky import cholesky
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.flow.likelihood import linearised, prepared
+from lidar_mi.retrieval.flow.next_flow import next_flow
 from lidar_mi.retrieval.flow.prior import first_prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
-from lidar_mi.retrieval.flow.variational import variational
+from lidar_mi.retrieval.flow.variational import variational, variational_and_flow
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.windows import Windows
 from tests.support.flows import axes, plane_waves, texture
 
 
@@ -97,7 +100,7 @@ def moving_texture():
 
 def test_an_iteration_waits_for_one_answer(monkeypatch):
     """Whether the factors are there; the likelihood, the evidence and the prior ask for nothing."""
-    monkeypatch.setattr(direct, "factored", cyclic_reduction.factored)
+    monkeypatch.setattr(direct, "by_lapack", lambda form: False)
     settings, stack = VariationalSettings(), moving_texture()
     images = prepared(stack, None, 0.0, settings)
     shape = [Axis(n, 4.0) for n in stack[0].shape]
@@ -117,6 +120,13 @@ def test_an_iteration_waits_for_one_answer(monkeypatch):
     assert asked.number == 1
 
 
+def agree(found, expected):
+    deviation = expected.covariance.diagonal().sqrt().movedim(-1, 0)
+    assert float(((found.d - expected.d) / deviation).abs().max()) < 1e-3
+    torch.testing.assert_close(found.covariance, expected.covariance, rtol=1e-3, atol=1e-9)
+    assert torch.equal(found.flag, expected.flag)
+
+
 def test_a_form_that_is_not_positive_has_no_factor():
     band, _ = positive_form(5, 1)
     with pytest.raises(torch.linalg.LinAlgError, match="not positive definite"):
@@ -124,12 +134,25 @@ def test_a_form_that_is_not_positive_has_no_factor():
 
 
 def test_winds_are_those_of_lapack(monkeypatch):
-    """The flow and its errors by either factor, to a thousandth of a standard error."""
+    """The flow, its errors and the next flow by either factor, to 1e-3 of a standard error."""
     images = moving_texture()
-    expected = variational(*images, stride=4, noise=0.01)
-    monkeypatch.setattr(direct, "factored", cyclic_reduction.factored)
-    found = variational(*images, stride=4, noise=0.01)
-    deviation = expected.covariance.diagonal().sqrt().movedim(-1, 0)
-    assert float(((found.d - expected.d) / deviation).abs().max()) < 1e-3
-    torch.testing.assert_close(found.covariance, expected.covariance, rtol=1e-3, atol=1e-9)
-    assert torch.equal(found.flag, expected.flag)
+    windows = Windows(tuple(images[0].shape), 8, 16, 4)
+
+    def found():
+        first, flow = variational_and_flow(images, windows, noise=0.01, keep=True)
+        return first, next_flow(flow, images, 0.01, 0.5)[0]
+
+    expected = found()
+    monkeypatch.setattr(direct, "by_lapack", lambda form: False)
+    for one, other in zip(found(), expected, strict=True):
+        agree(one, other)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_winds_are_those_of_the_processor():
+    images = moving_texture()
+    found = variational(*(image.cuda() for image in images), stride=4, noise=0.01)
+    agree(
+        Displacement(*(part.cpu() for part in found[:4])),
+        variational(*images, stride=4, noise=0.01),
+    )

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
-from lidar_mi.retrieval.lines_of_sight.winds import WindFlag
+from lidar_mi.retrieval.lines_of_sight.profiles import WindFlag
 from tests.support import line_winds as made
 
 REAL = Path(__file__).parents[4] / "shared" / "data" / "lines_of_sight"
@@ -150,6 +150,16 @@ def test_outliers_are_left_out_and_air_is_not():
     assert int(lm.fit_winds_to_lines(lines)["flag"][0, 3]) & WindFlag.OUTLIERS
 
 
+def test_a_few_lines_above_the_threshold_are_noise():
+    lines, _ = made.scan(made.calm, ranges=RANGES, **VAD)
+    flag = lines["flag"].values
+    flag[:7, 6:] = 4  # 5 of 12 are left
+    flag[:6, 5] = 4
+    winds = lm.fit_winds_to_lines(lines).isel(time=0)
+    assert (winds["flag"][:6] == 0).all()
+    assert (winds["flag"][6:] == WindFlag.TOO_FEW_LINES).all() and np.isnan(winds["u"][6:]).all()
+
+
 def test_profiles_of_scans_and_of_intervals():
     lines, _ = made.scan(made.calm, ranges=RANGES, **VAD)
     later = lines.assign_coords(time=lines["time"] + np.timedelta64(600, "s"))
@@ -164,6 +174,25 @@ def test_profiles_of_scans_and_of_intervals():
     assert lm.fit_winds_to_lines(both, interval=300.0).sizes["time"] == 2
 
 
+def test_many_cycles_of_beams_are_one_profile():
+    """Ten minutes of a DBS: averages are of beams of one direction, not of successive ones."""
+    azimuth = np.tile([0, 90, 180, 270], 40)
+    z, stderr = [], []
+    for seed in range(6):
+        lines, truth = made.scan(
+            made.turbulent(seed), azimuth, 70.0, RANGES[:5], 4.0 * np.arange(160), seed=seed
+        )
+        winds = lm.fit_winds_to_lines(lines).isel(time=0)
+        z += [
+            (winds[c].values - truth[:, k]) / winds[f"{c}_stderr"].values
+            for k, c in enumerate("uvw")
+        ]
+        stderr.append(float(winds["u_stderr"].mean()))
+    # of 40 cycles of each component, far below 0.8 m/s / cos 70 degrees of one
+    assert np.max(stderr) < 0.35
+    assert 0.4 < np.mean(np.square(z)) < 2.2
+
+
 def test_what_tells_no_wind_is_refused_or_flagged():
     stare, _ = made.scan(made.calm, np.zeros(9), 90.0, RANGES, 2.0 * np.arange(9))
     plane, _ = made.scan(made.calm, np.full(9, 30.0), np.linspace(5, 80, 9), RANGES, np.arange(9.0))
@@ -175,6 +204,8 @@ def test_what_tells_no_wind_is_refused_or_flagged():
         else:
             assert (winds["flag"].values & WindFlag.TOO_FEW_LINES).all()
             assert np.isnan(winds["u"]).all()
+    noise, _ = made.scan(made.calm, ranges=RANGES, noise=30.0, **VAD)
+    assert (lm.fit_winds_to_lines(noise)["flag"].values & WindFlag.UNCERTAIN).all()
     narrow, _ = made.scan(made.calm, 0.4 * np.arange(12), 3.0, RANGES, np.arange(12.0))
     assert (lm.fit_winds_to_lines(narrow)["flag"].values & WindFlag.ILL_CONDITIONED).all()
     flagged = stare.assign(flag=stare["flag"] + 1)

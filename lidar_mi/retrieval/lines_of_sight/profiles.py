@@ -2,13 +2,11 @@
 
 import enum
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
-
-if TYPE_CHECKING:
-    from lidar_mi.retrieval.lines_of_sight.winds import Profile
 
 _COMPONENTS = {
     "u": ("eastward_wind", "wind to the east"),
@@ -17,17 +15,71 @@ _COMPONENTS = {
 }
 
 
-def profile_dataset(
-    profiles: Sequence["Profile"], flags: type[enum.IntFlag], about: Mapping[str, Any]
-) -> xr.Dataset:
+MAX_CONDITION = 100.0
+"""Largest condition number of the lines of a valid wind.
+
+Beyond it the component that they know least has a hundred times the error of the best.
+"""
+
+MIN_FRACTION = 0.5
+"""Least fraction of the lines at a height that are valid.
+
+Where most lines see nothing, those few that pass the threshold of the signal are mostly noise.
+"""
+
+MAX_STDERR = 5.0
+"""Largest standard error of the horizontal vector of a valid wind, m/s: as large as most winds."""
+
+
+class WindFlag(enum.IntFlag):
+    """Reasons not to use a wind; 0: valid."""
+
+    TOO_FEW_LINES = 1
+    """Fewer than three valid lines or than `MIN_FRACTION`, or lines in one plane."""
+    ILL_CONDITIONED = 2
+    """The lines hardly know one component: `MAX_CONDITION`."""
+    OUTLIERS = 4
+    """More than a third of the lines are outliers."""
+    ERROR_UNKNOWN = 8
+    """No residual and no stated noise tells the error."""
+    UNCERTAIN = 16
+    """The standard error of the horizontal wind is above `MAX_STDERR`."""
+
+
+@dataclass(eq=False)
+class Profile:
+    """Winds of one scan.
+
+    Attributes
+    ----------
+    time : datetime64
+    heights : (levels,) array
+        m above the lidar.
+    wind : (levels, 3) array
+    covariance : (levels, 3, 3) array
+    residual, condition : (levels,) arrays
+    dof, lines, outliers, flag : (levels,) arrays of int
+    """
+
+    time: np.datetime64
+    heights: np.ndarray
+    wind: np.ndarray
+    covariance: np.ndarray
+    residual: np.ndarray
+    condition: np.ndarray
+    dof: np.ndarray
+    lines: np.ndarray
+    outliers: np.ndarray
+    flag: np.ndarray
+
+
+def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr.Dataset:
     """All profiles on common heights, in the order of time.
 
     Parameters
     ----------
     profiles : sequence of Profile
         Heights that differ by less than 1 cm are one.
-    flags : enumeration
-        Meanings of the flag.
     about : mapping
         Attributes of the lines of sight.
     """
@@ -90,8 +142,8 @@ def profile_dataset(
     ):
         values = full([getattr(one, name) for one in order], 0).astype(np.int32)
         data[name] = (("time", "height"), values, {"long_name": long_name, "units": "1"})
-    missing = flags(1).value
-    masks = np.array([one.value for one in flags], np.uint16)
+    missing = WindFlag.TOO_FEW_LINES.value
+    masks = np.array([one.value for one in WindFlag], np.uint16)
     data["flag"] = (
         ("time", "height"),
         full([one.flag for one in order], missing).astype(np.uint16),
@@ -100,7 +152,7 @@ def profile_dataset(
             "standard_name": "quality_flag",
             "flag_masks": masks,
             "flag_values": masks,
-            "flag_meanings": " ".join(str(one.name).lower() for one in flags),
+            "flag_meanings": " ".join(str(one.name).lower() for one in WindFlag),
         },
     )
     coords = {
