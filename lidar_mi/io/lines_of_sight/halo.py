@@ -6,6 +6,7 @@ elevation and, of later software, pitch and roll, then a line for every gate: nu
 """
 
 import re
+import warnings
 from datetime import datetime
 from pathlib import Path
 
@@ -144,9 +145,7 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
         if not np.isfinite(ray[0, :3]).all():
             lost += end - begin
             continue
-        block = [line.split() for line in lines[begin + 1 : end]]
-        number = np.array([int(line[0]) for line in block if len(line[0]) < 9], int)
-        table = _floats([line[1:] for line in block if len(line[0]) < 9], 4)
+        number, table = _gates(lines[begin + 1 : end])
         inside = number < gates
         odd += int((~inside).sum()) + int((~np.isfinite(table[:, :2])).any(1).sum())
         one = np.full((gates, 4), np.nan)
@@ -168,6 +167,33 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
     if lost:
         remarks.append(f"{lost} lines belong to no ray with a time and two angles")
     return np.array(rays), np.array(values), remarks
+
+
+def _gates(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of gates (n,) and their values (n, 4), NaN where there is none."""
+    width = len(lines[0].split()) if lines else 0
+    if width in (4, 5):
+        found = _numbers_of(" ".join(lines))
+        if found.size == width * len(lines):
+            found = found.reshape(-1, width)
+            if np.array_equal(found[:, 0], np.arange(len(lines))):
+                table = np.full((len(lines), 4), np.nan)
+                table[:, : width - 1] = found[:, 1:]
+                return np.arange(len(lines)), table
+    words = [line.split() for line in lines]
+    words = [one for one in words if len(one[0]) < 9]
+    return np.array([int(one[0]) for one in words], int), _floats([one[1:] for one in words], 4)
+
+
+def _numbers_of(text: str) -> np.ndarray:
+    """Numbers of a text, (n,); none if there is a word that is no number."""
+    with warnings.catch_warnings():
+        # by the version of numpy, what is no number ends the reading or is an error
+        warnings.simplefilter("ignore", DeprecationWarning)
+        try:
+            return np.fromstring(text, sep=" ")
+        except ValueError:
+            return np.empty(0)
 
 
 def _floats(rows: list[list[str]], width: int) -> np.ndarray:

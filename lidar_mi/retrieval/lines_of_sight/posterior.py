@@ -130,7 +130,7 @@ def evidence(levels: Sequence[Level], lengths: Sequence[float], noise: float) ->
             )
             basis, triangle = np.linalg.qr(white[:, :-1])
             left = white[:, -1] - basis @ (basis.T @ white[:, -1])
-            # velocities are rounded to centimetres per second: no fit is better
+            # velocities are rounded: no fit is better than 1 mm/s
             square = max(float(left @ left), 1e-6 * dof)
             fit = -np.log(np.diag(factor)).sum() - np.log(np.abs(np.diag(triangle))).sum()
             fit -= dof / 2 * np.log(square)

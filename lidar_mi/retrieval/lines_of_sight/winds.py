@@ -22,7 +22,7 @@ from lidar_mi.retrieval.lines_of_sight.profiles import (
 
 _BLOCK = 5  # levels that share their turbulence
 _MOST = 24  # numbers of a level: more lines are averaged with their neighbours
-_MOST_LINES = 240  # whose correlation is computed
+_MOST_LINES = 120  # whose correlation is computed
 _ROUNDS = 5  # of the search for outliers
 _LEAST_SPREAD = 0.02  # m/s: rounding of the velocities
 
