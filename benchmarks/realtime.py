@@ -112,7 +112,8 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
         tuple(lines),
         (
             f"{number} slabs, two before them not counted; noise of {NOISE:.0%} of the mean. Found "
-            f"from the start: {started:.0%}. From nothing: every {COLD}th slab.",
+            f"from the start: {started:.0%}. From nothing, the pair by matched filters: every "
+            f"{COLD}th slab.",
             f"Requirement: {RATE:g} slabs a second, {1e3 / RATE:.0f} ms. 99 % of the slabs took at "
             f"most {1e3 * latency:.0f} ms ({_verdict(latency)}). All parts of a slab together took "
             f"{1e3 * work:.0f} ms in the mean, of {2e3 / RATE:.0f} ms that two cores have.",

@@ -171,7 +171,7 @@ class Estimator:
             if retrieved:
                 wind, flags, parts = retrieved.result()
                 seconds |= parts
-        # a slab without an expected pair follows skipped ones: no work is pending
+        # without an expected pair there may be no last slab, or skipped ones: no work is pending
         since = self._busy if expected else (0.0, 0.0)
         self._busy = _with_delay(seconds, since, dt, self._processes)
         # a failed fit is no start for the next wind
@@ -187,7 +187,7 @@ def _with_delay(
     A process goes on with the last slab for so many seconds `since` the first image, which came
     with that slab's second one. Then it does the work before the second image; the lines are
     recorded half a period before it. A slab delays the next one by a period at most: after a longer
-    one, as from nothing, slabs are skipped.
+    one slabs are skipped.
 
     Returns
     -------

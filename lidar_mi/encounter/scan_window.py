@@ -2,11 +2,14 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidar_mi.experiment.schema.encounter import Encounter
-from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
+if TYPE_CHECKING:  # slabs are described without torch
+    from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 # Least probability of a vortex at which a scan moves towards a pair that is not tracked.
 _LEAST_PROBABILITY = 0.5
@@ -37,10 +40,10 @@ class ScanWindow:
     encounter: Encounter
     size: tuple[float, float]
     _middles: dict[int, np.ndarray] = field(default_factory=dict)
-    _estimates: dict[int, VortexPairFit] = field(default_factory=dict)
+    _estimates: "dict[int, VortexPairFit]" = field(default_factory=dict)
 
     def at(
-        self, number: int, place: tuple[float, float], expected: VortexPairFit | None
+        self, number: int, place: tuple[float, float], expected: "VortexPairFit | None"
     ) -> tuple[float, float]:
         """Of a scan, m.
 
@@ -68,7 +71,7 @@ class ScanWindow:
         self._middles[number] = middle
         return float(middle[0]), float(middle[1])
 
-    def add(self, number: int, pair: VortexPairFit) -> None:
+    def add(self, number: int, pair: "VortexPairFit") -> None:
         """The estimate that a scan has completed."""
         oldest = number - self._delay - 1
         self._estimates = {n: p for n, p in self._estimates.items() if n >= oldest}
@@ -79,7 +82,7 @@ class ScanWindow:
         """Scans until an estimate is delivered."""
         return math.ceil(self.encounter.control.latency * self.encounter.rate - 1e-9)
 
-    def _wanted(self, number: int, expected: VortexPairFit | None) -> np.ndarray | None:
+    def _wanted(self, number: int, expected: "VortexPairFit | None") -> np.ndarray | None:
         """Middle of the pair in the farther slab, path frame, m; None if none is known."""
         if expected is not None:
             slopes = expected.slopes if expected.slopes is not None else np.zeros(2)
@@ -90,5 +93,5 @@ class ScanWindow:
         return _middle(newest) if np.isfinite(newest.parameters).all() else None
 
 
-def _middle(pair: VortexPairFit) -> np.ndarray:
+def _middle(pair: "VortexPairFit") -> np.ndarray:
     return np.array([pair.parameters[[2, 6]].mean(), pair.parameters[[3, 7]].mean()])
