@@ -26,7 +26,7 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "transient": {"columns": 40, "rows": 30, "samples": 16},
     "gpu": {},
 }
-"""Comparisons of the page, with the arguments that make them small. `report` has the others."""
+"""Comparisons of the page, with the arguments that make them small; JSON has the others, too."""
 
 
 def write(found: Mapping[str, Comparison], quick: bool) -> None:
