@@ -3,6 +3,7 @@
 import os
 import platform
 import re
+import textwrap
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
@@ -20,15 +21,13 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "velocimetry": {"columns": 110, "rows": 90},
     "growth": {"sizes": ((110, 90), (219, 139))},
     "batch": {"pairs": 4},
-    "threads": {"sizes": ((219, 139),), "loads": (False,)},
     "rings": {"width": 480, "height": 390},
     "fringes": {"width": 240, "height": 195},
     "transient": {"columns": 40, "rows": 30, "samples": 16},
-    "estimators": {"columns": 60, "rows": 40, "samples": 16},
     "candidates": {"columns": 60, "rows": 40},
     "gpu": {},
 }
-"""Comparisons of a quick page, with the arguments that make them small."""
+"""Comparisons of the page, with the arguments that make them small; JSON has the others, too."""
 
 
 def write(found: Mapping[str, Comparison], quick: bool) -> None:
@@ -57,8 +56,8 @@ def measured(found: Mapping[str, Comparison], quick: bool) -> list[str]:
         "",
         f"Measured on {date.today().isoformat()} by `{command}`"
         + (" (small cases, few turns)." if quick else "."),
-        "Both sides of a ratio take turns in one run; above 1 lidar-mi is better. Times depend on",
-        "the machine and on what else it does, ratios hardly.",
+        "Both sides of a ratio take turns in one run; above 1 lidar-mi is better. Where the load",
+        "is above the number of cores, wall times are mostly waiting: compare those of all cores.",
         "",
         f"- processor: {processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads",
         f"- load over the last 15 minutes: {load()}",
@@ -66,7 +65,7 @@ def measured(found: Mapping[str, Comparison], quick: bool) -> list[str]:
         f"- {versions}",
         "",
     ]
-    for comparison in found.values():
+    for comparison in (found[name] for name in QUICK if name in found):
         lines += [f"### {comparison.title}", "", *_table(comparison), ""]
     return lines
 
@@ -99,7 +98,8 @@ def _table(comparison: Comparison) -> list[str]:
         case = "" if line.case == last else line.case
         lines.append(_row([case, quantity, *(values[:1] if alone else values), line.note]))
         last = line.case
-    return [*lines, "", *comparison.notes]
+    notes = (textwrap.wrap(note, 118, subsequent_indent="  ") for note in comparison.notes)
+    return [*lines, *(line for one in notes for line in ("", "- " + one[0], *one[1:]))]
 
 
 def _row(cells: list[str]) -> str:
