@@ -31,7 +31,7 @@ MINUTES := 20
 fuzz: setup ## try hostile input: make fuzz MINUTES=20; what breaks something goes to tests/corpus
 	$(PYTHON_ENV) -m tests.fuzz --minutes $(MINUTES) $(ARGS)
 
-bench: setup ## compare with other programs, side by side
+bench: setup ## compare with other programs, side by side: docs/performance.md; less: make bench ARGS=--quick
 	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (all(map(f, ('mitransient', 'openpiv', 'cv2', 'skimage')))))" \
 		|| $(PYTHON_ENV) -m pip install -q -e ".[bench]"
 	$(PYTHON_ENV) -m benchmarks $(ARGS)

@@ -1,13 +1,15 @@
 """lidar-mi side by side with other ways to the same result, measured in one run.
 
-``make bench`` (or ``python -m benchmarks``) prints one table per comparison and writes
-``outputs/benchmarks.json``. The ratios are the result: both sides take turns, and a ratio is the
+``make bench`` (or ``python -m benchmarks``) prints one table per comparison and writes them to
+``docs/performance.md`` and ``outputs/benchmarks.json``; with ``--quick`` small cases of some, and
+of those named no page. The ratios are the result: both sides take turns, and a ratio is the
 median over the turns, as times are noisy and depend on the machine.
 
 estimators   the gated estimator against the analog one
 transient    the renderer against mitransient's volumetric integrator
 velocimetry  cross-correlation against OpenPIV
 methods      wind from exact images by all methods, and by public codes
+batch        winds of several pairs at once and one after the other
 threads      winds on one thread and on several, on a quiet and on a busy machine
 settings     wind after each setting of a method is halved and doubled
 rendered     wind from rendered images by all methods, and the fraction of every cause of error

@@ -15,7 +15,18 @@ from typing import Literal
 from rich.console import Console
 from rich.table import Table
 
-PACKAGES = ("lidar-mi", "mitsuba", "drjit", "mitransient", "torch", "OpenPIV", "numpy")
+PACKAGES = (
+    "lidar-mi",
+    "mitsuba",
+    "drjit",
+    "torch",
+    "numpy",
+    "scipy",
+    "mitransient",
+    "OpenPIV",
+    "opencv-python-headless",
+    "scikit-image",
+)
 
 
 @dataclass(frozen=True)
@@ -114,10 +125,10 @@ def show(comparison: Comparison, console: Console) -> None:
             case = line.case
         spread = line.ratio_range
         cells = [
-            _number(line.ours),
-            _number(line.other),
-            f"[bold]{_number(line.ratio)}[/bold]",
-            f"{_number(spread[0])} ... {_number(spread[1])}" if spread else "",
+            number(line.ours),
+            number(line.other),
+            f"[bold]{number(line.ratio)}[/bold]",
+            f"{number(spread[0])} ... {number(spread[1])}" if spread else "",
         ]
         quantity = f"  {line.quantity}, {line.unit}" if line.unit else f"  {line.quantity}"
         table.add_row(quantity, *(cells[:1] if alone else cells), line.note)
@@ -136,7 +147,7 @@ def as_json(comparisons: Mapping[str, Comparison]) -> str:
             "cores": os.cpu_count(),
             "python": platform.python_version(),
         },
-        "versions": {name: _version(name) for name in PACKAGES},
+        "versions": {name: version_of(name) for name in PACKAGES},
         "ratio": "how many times better lidar-mi is: above 1 better, below 1 worse",
         "comparisons": {name: asdict(found) for name, found in comparisons.items()},
     }
@@ -154,7 +165,7 @@ def write_json(comparisons: Mapping[str, Comparison], path: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
     """Three digits."""
     if value is None or not math.isfinite(value):
         return ""
@@ -163,7 +174,8 @@ def _number(value: float | None) -> str:
     return f"{value:.3g}" if abs(value) < 1000 else f"{float(f'{value:.3g}'):,.0f}"
 
 
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """Of an installed package; None: it is absent."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -55,10 +55,13 @@ class PaperScan:
         )
 
 
-def paper_scan(columns: int = 219, rows: int = 139) -> PaperScan:
-    """The demo experiment in single scattering; fewer columns and rows: the middle of its grid."""
+def paper_scan(
+    columns: int = 219, rows: int = 139, pulse_duration: float = 0.0, max_order: int = 1
+) -> PaperScan:
+    """The demo experiment; fewer columns and rows: the middle of its grid. Pulse in s."""
     path = Path(str(files("lidar_mi.scenes"))) / "wake_backscatter.yaml"
-    experiment = load(path, ["render.max_order=1"])
+    changed = [f"render.max_order={max_order}", f"lidar.pulse_duration={pulse_duration} s"]
+    experiment = load(path, changed)
     truth = make_truth(experiment)
     y, z = (_middle(truth.wind[axis], count) for axis, count in (("y", columns), ("z", rows)))
     flown = experiment.platform.speed * experiment.platform.dt

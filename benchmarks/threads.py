@@ -21,12 +21,14 @@ NOISE = 0.02
 
 
 def compare(
-    repeats: int = 5, sizes: tuple[tuple[int, int], ...] = ((219, 139), (438, 278))
+    repeats: int = 5,
+    sizes: tuple[tuple[int, int], ...] = ((219, 139), (438, 278)),
+    loads: tuple[bool, ...] = (False, True),
 ) -> Comparison:
     """Wall time of one retrieval."""
     lines = []
     pairs = [vortex_pair_images(NOISE, 1, *size) for size in sizes]
-    for busy in (False, True):
+    for busy in loads:
         with _load(busy):
             lines += [_row(pair, method, busy, repeats) for pair in pairs for method in METHODS]
     note = (

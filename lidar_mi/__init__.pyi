@@ -2,6 +2,7 @@
 
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
+from .encounter.export_control import export_control
 from .encounter.fly import Flights, fly
 from .encounter.pose import AircraftPose
 from .encounter.virtual_lidar import VirtualLidar
@@ -16,11 +17,13 @@ from .experiment.shipped import campaigns, experiments, scene_file
 from .experiment.truth.extinction import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
+from .io.lines_of_sight.read import read_lines_of_sight
 from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .rendering.variant import use_variant
 from .retrieval.images.common_grid import on_one_grid
 from .retrieval.images.quality import Flag
+from .retrieval.lines_of_sight.winds import fit_winds_to_lines
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
 from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines
@@ -56,8 +59,10 @@ __all__ = [
     "doctor",
     "experiments",
     "export",
+    "export_control",
     "fit_vortices",
     "fit_vortices_to_wind",
+    "fit_winds_to_lines",
     "fly",
     "gap_from_fractions",
     "gap_from_lines",
@@ -66,6 +71,7 @@ __all__ = [
     "on_one_grid",
     "open_campaign",
     "read_image",
+    "read_lines_of_sight",
     "read_noise",
     "read_scan",
     "read_vortices",

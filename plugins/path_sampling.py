@@ -1,7 +1,8 @@
 """Light paths of a lidar: from the laser over vertices in the air to a point of the telescope.
 
-`Lidar.forced` samples paths that end in a gate, `Lidar.analog` samples free flights from their
-physical distribution. Both give Stokes vectors about the instrument's horizontal axis.
+`Lidar.single` and `Lidar.further` sample paths that end in a gate, `Lidar.analog` samples free
+flights from their physical distribution. All give Stokes vectors about the instrument's horizontal
+axis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,7 @@ import mitsuba as mi
 from .bodies import slabs
 from .bounds import Bounds
 from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
+from .gate_sampling import pulse_in_gate
 from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
 from .mitsuba_tables import has_tables, off_the_poles
@@ -97,6 +99,8 @@ class Lidar:
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
+        # of the delays, half the path: so ranges of a gate shift by as much
+        self.pulse_sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
         self.context = mi.PhaseFunctionContext()
 
     def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
@@ -112,10 +116,8 @@ class Lidar:
         aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
-        # half the path, so that ranges of a gate shift by as much
         if laser.pulse_duration > 0:
-            sigma = FWHM_TO_SIGMA * laser.pulse_duration * SPEED_OF_LIGHT / 2
-            delay = sigma * mi.warp.square_to_std_normal(pair(rng)).x
+            delay = self.pulse_sigma * mi.warp.square_to_std_normal(pair(rng)).x
         stokes = [mi.Float(1)]
         if mi.is_polarized:
             stokes = rotate_stokes(
@@ -126,7 +128,76 @@ class Lidar:
             )
         return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
 
-    def forced(
+    def single(self, sample: Sample, path: Float, width: Float) -> Stokes:
+        """Stokes vector (about e_h) of the light scattered once, for whole paths of a length.
+
+        ``width`` is that of the gate, as whole path, over the density of ``path`` relative to a
+        uniform one.
+        """
+        medium = mi.MediumPtr(self.sensor.get_medium())
+        closure, volume = self._closure(sample, path)
+        return self._connect(
+            sample,
+            sample.rng,
+            sample.origin,
+            sample.direction,
+            closure,
+            medium,
+            sample.stokes,
+            width * volume,
+            (path > 0) & (closure > 0),
+        )
+
+    def _closure(self, sample: Sample, path: Float) -> tuple[Float, Float]:
+        """Distance at which a path of one scattering closes, and d(distance)/d(path)."""
+        closure = closing_distance(sample.origin - sample.aperture, sample.direction, path)
+        back = dr.normalize(sample.aperture - (sample.origin + sample.direction * closure))
+        # a vertex farther by ds lengthens the path by ds less its component along the way back
+        return closure, dr.rcp(1 - dr.dot(sample.direction, back))
+
+    @dr.syntax
+    def by_contribution(
+        self, sample: Sample, low: Float, high: Float, candidates: UInt
+    ) -> tuple[Float, Float]:
+        """A whole path of light scattered once, of several by its contribution, and its weight.
+
+        ``low`` and ``high`` are twice the gate's ranges. They and the pulse's duration distribute
+        paths; each candidate is drawn from another part of that distribution, all of which are
+        equally probable. Contributions are compared without attenuation (resampled importance
+        sampling, Talbot et al. 2005). Not for scenes with open surfaces, whose media are known
+        behind one another only.
+        """
+        rng, aperture, axes = sample.rng, sample.aperture, sample.axes
+        origin, direction, time = sample.origin, sample.direction, sample.time
+        sigma = 2 * self.pulse_sigma
+        crossings = self.air.crossings(origin, direction)
+        around = mi.MediumPtr(self.sensor.get_medium())
+        chosen, total, target = mi.Float(0), mi.Float(0), mi.Float(0)
+        number = mi.UInt32(0)
+        while dr.hint(number < candidates, label="places in the gate"):
+            part = (mi.Float(number) + rng.next_float32()) / mi.Float(candidates)
+            path, weight = pulse_in_gate(part, low, high, sigma)
+            closure, volume = self._closure(sample, path)
+            active = (path > 0) & (closure > 0)
+            place = origin + direction * closure
+            active &= self.sensor.in_field_of_view(axes, place - aperture)
+            _, _, _, medium, _ = self.air.next_surface(
+                crossings, origin, direction, closure, mi.Float(dr.inf), around, active
+            )
+            active &= medium != None
+            mei = interaction(medium, place, direction, self.wavelengths, time)
+            scattering, _ = coefficients(medium, mei, self.channel, active)
+            here = weight * scattering * volume / dr.squared_norm(place - aperture)
+            here = dr.select(active, here, 0)
+            total += here
+            takes = rng.next_float32() * total < here
+            chosen = dr.select(takes, path, chosen)
+            target = dr.select(takes, here / weight, target)
+            number += 1
+        share = dr.select(target > 0, total / (target * mi.Float(candidates)), 0)
+        return chosen, share
+
+    def further(
         self,
         sample: Sample,
         low: Float,
@@ -137,42 +208,20 @@ class Lidar:
         by_order: Float,
         cell: UInt,
     ) -> Stokes:
-        """Stokes vector (about e_h) received from each sample's gate.
+        """The sum of all orders from the second up to ``max_order``, as `single` gives the first.
 
         ``low`` and ``high`` are twice the gate's ranges less the sample's delay, ``position`` (0
-        to 1) is the place of the sample's whole path between them. The sum of all orders up to
-        ``max_order``; with ``split`` each order's S0 is also added to ``by_order``.
+        to 1) is the place of the sample's whole path between them. With ``split`` each order's S0
+        is also added to ``by_order``.
         """
         medium = mi.MediumPtr(self.sensor.get_medium())
-        offset = sample.origin - sample.aperture
         path = dr.lerp(low, high, position)
-        closure = closing_distance(offset, sample.direction, path)
-        back = dr.normalize(sample.aperture - (sample.origin + sample.direction * closure))
-        # times d(distance)/d(path): a vertex farther by ds lengthens the path by ds less its
-        # component along the way back
-        volume = (high - low) / (1 - dr.dot(sample.direction, back))
-        total = self._connect(
-            sample,
-            sample.rng,
-            sample.origin,
-            sample.direction,
-            closure,
-            medium,
-            sample.stokes,
-            volume,
-            (path > 0) & (closure > 0),
-        )
-        if split:
-            _add(by_order, total[0], cell * max_order)
-        if max_order == 1:
-            return total
-        further = self._forced_further(
+        return self._further(
             sample, medium, path, high - low, mi.UInt32(max_order), split, by_order, cell, max_order
         )
-        return _sum(total, further)
 
     @dr.syntax
-    def _forced_further(
+    def _further(
         self,
         sample: Sample,
         medium: MediumPtr,
@@ -234,7 +283,7 @@ class Lidar:
             )
             total = _sum(total, gain)
             if dr.hint(split, mode="scalar"):
-                _add(by_order, gain[0], cell * max_order + order - 1, active)
+                add(by_order, gain[0], cell * max_order + order - 1, active)
 
             order += 1
             active &= order <= last
@@ -541,7 +590,7 @@ class Lidar:
             held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
             gate = now
             if dr.hint(split, mode="scalar"):
-                _add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
+                add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
             order += 1
             # later orders arrive from farther away still
             active &= (order <= max_order) & (range_ < high)
@@ -554,7 +603,8 @@ class Lidar:
             _deposit(sums, products, largest, magnified, base + gate, held, began & ~active)
 
 
-def _add(total: Float, value: Float, cell: UInt, active: Mask = True) -> None:
+def add(total: Float, value: Float, cell: UInt, active: Mask = True) -> None:
+    """Add values of samples to the sums of their cells."""
     # the default mode would compile the number of cells into the kernel
     dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, active, mode=dr.ReduceMode.Local)
 
@@ -571,9 +621,9 @@ def _deposit(
     """Add contributions of samples to their gates, and products of their components."""
     active = active & (held[0] != 0)
     for total, value in zip(sums, held, strict=True):
-        _add(total, value, cell, active)
+        add(total, value, cell, active)
     for (i, j), total in products.items():
-        _add(total, magnified * held[i] * (magnified * held[j]), cell, active)
+        add(total, magnified * held[i] * (magnified * held[j]), cell, active)
     # positive floats are ordered as their bits, of which every backend has an atomic maximum
     square = dr.reinterpret_array(mi.UInt32, dr.square(magnified * held[0]))
     dr.scatter_reduce(dr.ReduceOp.Max, largest, square, cell, active, mode=dr.ReduceMode.Local)

@@ -65,7 +65,7 @@ FLOORS = {
     "experiment": (("schema",), ("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (
         ("images", "rings"),
-        ("correlation", "channels", "lines"),
+        ("correlation", "channels", "lines", "lines_of_sight"),
         ("flow", "defects"),
         ("along_path", "vortices"),
         ("wind",),

@@ -15,6 +15,8 @@ strips               loads of a wake on a wing: closed forms, a lattice of vorti
 track                track of a vortex pair: errors over simulated flights are as stated
 timing               winds of beams with times and poses: closed forms
 air                  turbulence, gusts and a microburst: theory, regulations
+filaments            bent vortices, rings, decay: theory, published numbers
+loads                an aircraft that rises in gusts: closed forms, its frequency response
 stored_state         stored state of the shipped simulation: how much is wind, how much numerics
 coverage             standard errors of winds where air changes: its section, by name or --slow
 instrument           winds by an etalon with defects; only by name
@@ -38,6 +40,8 @@ GROUPS = (
     "track",
     "timing",
     "air",
+    "filaments",
+    "loads",
     "stored_state",
     "coverage",
 )

@@ -170,8 +170,8 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
         "Comparisons of lidar-mi with independent numbers: closed forms, published",
         "values, conservation laws and other programs. They concern the light transport, the "
         "receivers of",
-        "the Doppler shift, the loads of a wake on a wing, the air about it, the track of "
-        "vortices, and times and poses of beams; errors of the retrievals are under "
+        "the Doppler shift, the loads of a wake on a wing, the air about it, loads of gusts, "
+        "the track of vortices, and times and poses of beams; errors of the retrievals are under "
         "[accuracy](accuracy.md). Every row of this page is computed again by",
         "",
         "```sh",

@@ -92,7 +92,7 @@ class PairAlongPath:
     Parameters
     ----------
     circulation : float
-        m^2 s^-1, > 0, at time 0.
+        m^2 s^-1, > 0, at age 0.
     separation, core_radius : float
         m, across the wake's axis.
     model : {"lamb_oseen", "burnham_hallock"}
@@ -110,7 +110,11 @@ class PairAlongPath:
         m; by default no deformation, and 8.6 separations. Each vortex is displaced by amplitude
         times a sine along the axis, in planes inclined by 45 degrees, the direction in which the
         partner's strain stretches it: outward and up, inward and down (Crow 1970, in the limit of
-        long waves). The sine is 0 at the wake's centre, moves with the pair and does not grow.
+        long waves). The sine moves with the pair and does not grow.
+    crow_phase : float
+        Of the sine at the wake's centre, rad.
+    age : float
+        At time 0, s.
 
     Notes
     -----
@@ -135,6 +139,8 @@ class PairAlongPath:
     decay_time: float | None = None
     crow_amplitude: float = 0.0
     crow_wavelength: float | None = None
+    crow_phase: float = 0.0
+    age: float = 0.0
 
     def __post_init__(self) -> None:
         vortex_pair(self.circulation, self.separation, self.core_radius, model=self.model)
@@ -169,7 +175,7 @@ class PairAlongPath:
         time = np.asarray(time, float)
         if self.decay_time is None:
             return np.full(time.shape, self.circulation)
-        return self.circulation * np.exp(-time / self.decay_time)
+        return self.circulation * np.exp(-(self.age + time) / self.decay_time)
 
     def centre_at(self, time: ArrayLike) -> Components:
         """x, y, z (m) at a time of the point that is at x_c and ``miss`` at t_c."""
@@ -179,8 +185,9 @@ class PairAlongPath:
         if self.decay_time is None:
             above = speed * (self.t_c - time)
         else:
-            fractions = np.exp(-time / self.decay_time) - math.exp(-self.t_c / self.decay_time)
-            above = speed * self.decay_time * fractions
+            ages = (self.age + time, self.age + self.t_c)
+            now, met = (np.exp(-np.asarray(age) / self.decay_time) for age in ages)
+            above = speed * self.decay_time * (now - met)
         arrival, wind = (self.x_c, *self.miss), (0.0, *self.mean_wind)
         x, y, z = (
             place + speed * (time - self.t_c) + axis * above
@@ -264,8 +271,8 @@ class PairAlongPath:
         # both planes are inclined by 45 degrees, mirror images (Crow 1970)
         inclined = (side * left + up) / math.sqrt(2)
         k = 2 * math.pi / wavelength
-        size = self.crow_amplitude * np.sin(k * axial)
-        rate = self.crow_amplitude * k * np.cos(k * axial)
+        size = self.crow_amplitude * np.sin(k * axial + self.crow_phase)
+        rate = self.crow_amplitude * k * np.cos(k * axial + self.crow_phase)
         return [size * axis for axis in inclined], [*(rate * axis for axis in inclined), rate]
 
 

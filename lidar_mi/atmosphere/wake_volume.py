@@ -15,64 +15,9 @@ from numpy.typing import ArrayLike
 
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.atmosphere.wake_path import Components, check_cut, wake_axes
-from lidar_mi.errors import InputError
 
-# A period is closed where its seam is no rougher than the roughest place within it, by this factor.
-_SEAM = 2.0
-# Planes that are equal to this fraction of the largest speed are the same plane.
-_EQUAL = 1e-5
 # Nodes beyond the period's ends that a cubic spline needs.
 _BEYOND = 3
-
-
-def one_period(flow: xr.Dataset) -> xr.Dataset:
-    """The planes of one period of a wake that is periodic along x.
-
-    The step from the last plane to the first, and the curvature there, are compared with those
-    within the volume: where either is more than twice the largest inside, the volume is not
-    periodic. A last plane that repeats the first one is omitted. A wake that is uniform
-    along its axis becomes a single plane.
-
-    Parameters
-    ----------
-    flow : xarray.Dataset
-        v, w and maybe u on (x, y, z), x even.
-
-    Raises
-    ------
-    InputError
-        A volume that is not periodic, of fewer than 4 planes.
-    """
-    count = flow.sizes["x"]
-    if count == 1:
-        return flow
-    if count < 4:
-        raise InputError(
-            f"wake.depth: volume is not allowed with {count} planes; expected 4 or more, or "
-            "wake.depth: plane"
-        )
-    names = [name for name in ("u", "v", "w") if name in flow]
-    values = np.stack([flow[name].transpose("x", "y", "z").values for name in names])
-    floor = _EQUAL * np.abs(values).max()
-    if np.ptp(values, axis=1).max() <= floor:
-        return flow.isel(x=[0])
-    if np.abs(values[:, -1] - values[:, 0]).max() <= floor:
-        flow, values = flow.isel(x=slice(0, -1)), values[:, :-1]
-    for order in (1, 2):
-        # differences about the circle: those of the last `order` places go across the seam
-        size = values
-        for _ in range(order):
-            size = np.roll(size, -1, axis=1) - size
-        rms = np.sqrt((size**2).mean((0, 2, 3)))
-        inside, seam = rms[:-order].max(), rms[-order:].max()
-        if seam > _SEAM * inside + floor:
-            what = "step" if order == 1 else "curvature"
-            raise InputError(
-                "wake.depth: volume is not allowed in an encounter, as the wake is not periodic "
-                f"along x: the {what} from its last plane to its first is {seam / inside:.2g} "
-                "times the largest within; expected a whole period, or wake.depth: plane"
-            )
-    return flow
 
 
 @dataclass(frozen=True, eq=False)

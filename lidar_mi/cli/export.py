@@ -1,4 +1,4 @@
-"""``lidar-mi export``: results of a run for ParaView, a spreadsheet, MATLAB."""
+"""``lidar-mi export``: results of a run for ParaView, a spreadsheet, MATLAB, control design."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,21 +11,23 @@ from lidar_mi.cli.terminal import output
 EXAMPLES = (
     "lidar-mi export outputs/wake_sensor",
     "lidar-mi export outputs/wake_sensor --format csv -o tables",
+    "lidar-mi export outputs/gust --format control",
 )
 
 
 def complete_format(incomplete: str) -> list[str]:
     """Formats, for a shell."""
-    return starting(incomplete, ("vtk", "csv", "mat"))
+    return starting(incomplete, ("vtk", "csv", "mat", "control"))
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(help="Folder of a run or of a flight.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a run, of a flight, or of flights.")],
     format: Annotated[
         str,
         typer.Option(
             "--format",
-            help="vtk (ParaView), csv (spreadsheets, R) or mat (MATLAB).",
+            help="vtk (ParaView), csv (spreadsheets, R), mat (MATLAB), or control: the lidar of "
+            "flights as a state-space block with its noise (.npz, .mat for Simulink).",
             autocompletion=complete_format,
         ),
     ] = "vtk",
@@ -42,8 +44,16 @@ def export(
     """Write winds, volumes, images, lines of sight and vortices of a run as VTK, CSV or MATLAB.
 
     Of a flight: the aircraft's way, the track of the vortices, winds and images of the slabs.
+    With `--format control`, of a flight or of all flights below a folder: the lidar as a linear
+    filter from the wind ahead to its estimate, with delay and noise, for every range and axis.
     """
-    from lidar_mi.experiment import export as exporting
+    if format == "control":
+        from lidar_mi.encounter.export_control import export_control
 
-    for path in exporting.export(folder, format, out, overwrite=overwrite):
+        paths = export_control(folder, out, overwrite=overwrite)
+    else:
+        from lidar_mi.experiment import export as exporting
+
+        paths = exporting.export(folder, format, out, overwrite=overwrite)
+    for path in paths:
         output.print(str(path), soft_wrap=True)

@@ -32,9 +32,9 @@ def info(
     what: Annotated[
         str,
         typer.Argument(
-            help="EXR, NetCDF or scattering-table file (.txt), folder of a run, of variants or of "
-            "a campaign, or a name: molecules, spheroids, spheres, continental, sea_salt, dust, "
-            "droplets, soot.",
+            help="EXR or NetCDF file, lines of sight (.hpl, .csv) or scattering table (.txt), "
+            "folder of a run, of variants or of a campaign, or a name: molecules, spheroids, "
+            "spheres, continental, sea_salt, dust, droplets, soot.",
             autocompletion=complete_contents,
         ),
     ],

@@ -57,7 +57,7 @@ def complete_contents(incomplete: str) -> list[str]:
     """Files and folders that can be shown, and the names of scatterers."""
     from lidar_mi.atmosphere.aerosols import AEROSOLS
 
-    return starting(incomplete, ("molecules", *AEROSOLS), "*.exr", "*.nc", "*.txt")
+    return starting(incomplete, ("molecules", *AEROSOLS), "*.exr", "*.nc", "*.hpl", "*.txt")
 
 
 def complete_method(incomplete: str) -> list[str]:

@@ -1,12 +1,14 @@
 """The aircraft: its state, its controls, and the protocol of its models."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lidar_mi.encounter.heave import Heave
 from lidar_mi.encounter.strips import Loads, Strips, wake_loads
 from lidar_mi.instrument.motion import attitude
 
@@ -36,6 +38,14 @@ class AircraftState:
     departed : bool
         The flight is lost: the aircraft is upset (rolled beyond `LARGEST_ROLL`), or its equations
         have no finite solution any more.
+    vertical_speed : float
+        m/s, of the centre of gravity along z.
+    load_factor : float
+        Specific force along the body's z axis at the centre of gravity over g; 1 in level flight.
+        NaN: the model does not rise.
+    port_bending, starboard_bending : float
+        Wing-root bending moments (N m), changes from the trim, positive with the tip up: of air
+        loads less the inertia of the wing. NaN: the model does not rise.
     """
 
     time: float = 0.0
@@ -50,6 +60,10 @@ class AircraftState:
     yaw_rate: float = 0.0
     airspeed: float = 75.0
     departed: bool = False
+    vertical_speed: float = 0.0
+    load_factor: float = math.nan
+    port_bending: float = math.nan
+    starboard_bending: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -57,16 +71,19 @@ class Commands:
     """Commanded deflections, rad.
 
     Positive ones roll the port wing up (aileron), move the nose down (elevator) and to port
-    (rudder): each gives a positive moment of `Loads`.
+    (rudder): each gives a positive moment of `Loads`. A positive symmetric aileron has both
+    trailing edges down, and lifts: the port aileron is at symmetric + aileron, the starboard one at
+    symmetric - aileron.
     """
 
     aileron: float = 0.0
     elevator: float = 0.0
     rudder: float = 0.0
+    symmetric_aileron: float = 0.0
 
     @property
     def array(self) -> np.ndarray:
-        """(3,), rad."""
+        """(3,), rad, of aileron, elevator and rudder."""
         return np.array([self.aileron, self.elevator, self.rudder])
 
 
@@ -78,10 +95,14 @@ class Limits:
     ----------
     deflection, rate : ndarray, shape (3,)
         0 for a control that the model does not have.
+    symmetric_aileron : float
+        Largest symmetric deflection of the ailerons (rad), of the travel that they share with roll:
+        each stays within deflection[0] and rate[0]. 0: there is none.
     """
 
     deflection: np.ndarray
     rate: np.ndarray
+    symmetric_aileron: float = 0.0
 
 
 class AircraftModel(Protocol):
@@ -123,6 +144,20 @@ class AircraftModel(Protocol):
     def step(self, dt: float, loads: Loads, commands: Commands) -> AircraftState:
         """State after dt (s), with the wake's loads constant and the controls moving."""
         ...
+
+
+@runtime_checkable
+class RisingAircraft(AircraftModel, Protocol):
+    """A model that also rises and pitches, whose loads a controller can plan.
+
+    Attributes
+    ----------
+    heave : Heave
+        Its linear equations about the start.
+    """
+
+    @property
+    def heave(self) -> Heave: ...  # noqa: D102
 
 
 def loads_in_wind(
@@ -184,3 +219,36 @@ def deflected(
     # the rate of a control that the model does not have is 0
     time = np.divide(moved, limits.rate, out=np.zeros(3), where=limits.rate > 0)
     return after, np.minimum(time, dt)
+
+
+def ailerons_deflected(
+    aileron: float, symmetric: float, commands: Commands, dt: float, limits: Limits
+) -> tuple[float, float]:
+    """Both ailerons, each within its limits and at most at its rate; roll has the first claim.
+
+    Of the travel that a commanded roll leaves, the symmetric deflection gets what it asks for.
+
+    Parameters
+    ----------
+    aileron, symmetric : float
+        Antisymmetric and symmetric deflection now, rad.
+    commands, dt, limits
+        As in `deflected`.
+
+    Returns
+    -------
+    aileron, symmetric : float
+        After dt, rad.
+    """
+    largest, way = limits.deflection[0], limits.rate[0] * dt
+    rolling = float(np.clip(commands.aileron, -largest, largest))
+    room = min(limits.symmetric_aileron, largest - abs(rolling))
+    lifting = float(np.clip(commands.symmetric_aileron, -room, room))
+    port, starboard = (
+        now + float(np.clip(target - now, -way, way))
+        for now, target in (
+            (symmetric + aileron, lifting + rolling),
+            (symmetric - aileron, lifting - rolling),
+        )
+    )
+    return (port - starboard) / 2, (port + starboard) / 2

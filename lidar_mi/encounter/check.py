@@ -6,11 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_mi.encounter.air import air_along_path, described
-from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
+from lidar_mi.encounter.aircraft import AircraftModel, RisingAircraft, loads_in_wind
 from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
-from lidar_mi.encounter.wake import encounter_of, vortices_in_plane
+from lidar_mi.encounter.wake import described_wake, encounter_of, vortices_in_plane
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import silent
@@ -49,9 +49,11 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     if encounter.control.mode == "feedforward":
         _check_latency(experiment, gates)
     found = _without_effect(experiment, gates)
-    strength = _strongest(experiment, aircraft or aircraft_of(encounter))
+    model = aircraft or aircraft_of(encounter)
+    strength = _strongest(experiment, model)
     has_wake = encounter.air is None or encounter.air.wake
-    if strength < _MISSED:
+    # other air may lift an aircraft without rolling it
+    if strength < _MISSED and (has_wake or not isinstance(model, RisingAircraft)):
         found.append(
             "encounter.path: the flight misses the wake: its largest rolling moment is "
             f"{strength:.1%} of the ailerons'; expected a smaller miss or a smaller crossing angle"
@@ -112,6 +114,7 @@ def sections(
             f"{_strongest(experiment, aircraft_of(encounter)):.0%} of the ailerons'",
         ),
     ]
+    rows += described_wake(experiment)
     if encounter.air is not None:
         rows += described(encounter.air, path)
     has_wake = encounter.air is None or encounter.air.wake

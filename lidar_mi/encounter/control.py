@@ -9,9 +9,24 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import nnls
 
-from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Commands, deflected
+from lidar_mi.encounter.aircraft import (
+    AircraftModel,
+    AircraftState,
+    Commands,
+    RisingAircraft,
+    ailerons_deflected,
+    deflected,
+)
+from lidar_mi.encounter.load_plan import load_plan
+from lidar_mi.encounter.planning import (
+    HORIZON,
+    INTERVAL,
+    KNOTS,
+    TRAVEL,
+    least_squares,
+    least_travel,
+)
 from lidar_mi.encounter.strips import Loads
 
 Preview = Callable[[ArrayLike], Loads]
@@ -22,9 +37,6 @@ Controller = Callable[[Preview, AircraftState], Commands]
 
 Transfer = Callable[[Preview | None, AircraftState], Preview]
 """The preview to steer by, from the present one (None: there is none) and the state."""
-
-HORIZON, KNOTS = 2.0, 16
-"""Time for which the aileron is planned (s), and intervals of it."""
 
 RATE_TIME = 0.5
 """A roll rate counts as much as the bank angle that it makes in this time, s."""
@@ -63,7 +75,7 @@ def bumpless_transfer() -> Transfer:
 def _fraction_of(preview: Preview, fraction: float) -> Preview:
     def expected(time: ArrayLike) -> Loads:
         loads = preview(time)
-        return Loads(fraction * loads.force, fraction * loads.moment)
+        return Loads(*(fraction * one for one in (loads.force, loads.moment, loads.bending)))
 
     return expected
 
@@ -99,51 +111,85 @@ def feedforward(aircraft: AircraftModel) -> Controller:
     commanded, and all are planned again at the next call. Elevator and rudder cancel, as in
     `cancelling`; the rudder's rolling moment is part of the plan.
 
+    Of a `RisingAircraft` elevator and symmetric ailerons are planned against loads (`load_plan`),
+    with the travel of the ailerons that the plan of roll leaves.
+
     A preview of no loads makes it an autopilot that holds the wings level as well as the ailerons
-    can.
+    can, and the path.
 
     Parameters
     ----------
     aircraft : AircraftModel
     """
-    cancel = cancelling(aircraft, None)
     limits, moments = aircraft.limits, aircraft.control_moments
+    rising = aircraft if isinstance(aircraft, RisingAircraft) else None
+    cancel = cancelling(aircraft, None)
+    rolls = bool(moments[0, 0] and limits.deflection[0] and limits.rate[0])
     # without an aileron that moves there is no roll to plan
-    if not (moments[0, 0] and limits.deflection[0] and limits.rate[0]):
+    if not (rolls or rising):
         return cancel
-    has_others = bool(moments[:, 1:].any())
-    dt = HORIZON / KNOTS
-    middles = (np.arange(KNOTS) + 0.5) * dt
-    from_rate, rolls, rates = _roll_mode(aircraft, dt)
-    effort = _EFFORT * np.eye(KNOTS)
-    matrix = np.concatenate([rolls * moments[0, 0], RATE_TIME * rates * moments[0, 0], effort])
-    turns = np.eye(KNOTS) - np.eye(KNOTS, k=-1)
-    allowed = np.concatenate([np.eye(KNOTS), -np.eye(KNOTS), turns, -turns])
-    largest, reach = limits.deflection[0], limits.rate[0] * dt
-    last, before, deflection = Commands(), np.nan, np.zeros(3)
+    roll = _roll_plan(aircraft) if rolls else None
+    loads = load_plan(rising.heave, limits) if rising else None
+    has_others = bool(moments[:, 2 if rising else 1 :].any())
+    trim = _heave_state(aircraft.state)
+    middles = (np.arange(KNOTS) + 0.5) * INTERVAL
+    last, before, deflection, symmetric = Commands(), np.nan, np.zeros(3), 0.0
 
     def controller(preview: Preview, state: AircraftState) -> Commands:
-        nonlocal last, before, deflection
+        nonlocal last, before, deflection, symmetric
         # the controls follow this controller's commands alone: where they are is known
         if state.time > before:
-            deflection, _ = deflected(deflection, last, state.time - before, limits)
+            dt, aileron = state.time - before, deflection[0]
+            deflection, _ = deflected(deflection, last, dt, limits)
+            deflection[0], symmetric = ailerons_deflected(aileron, symmetric, last, dt, limits)
         before = state.time
         others = cancel(preview, state) if has_others else Commands()
-        expected = preview(state.time + middles).moment[:, 0]
-        wake = expected + moments[0, 1:] @ others.array[1:]
-        start = from_rate * state.roll_rate + [[state.roll], [0.0]]
-        target = -np.concatenate(
-            [start[0] + rolls @ wake, RATE_TIME * (start[1] + rates @ wake), np.zeros(KNOTS)]
-        )
-        now = np.zeros(KNOTS)
-        now[0] = np.clip(deflection[0], -largest, largest)
-        least = np.concatenate([np.full(2 * KNOTS, -largest), now - reach, -now - reach])
-        aileron = _least_squares(matrix, target, allowed, least)[0]
-        aileron = float(np.clip(aileron, -largest, largest))
-        last = Commands(aileron, others.elevator, others.rudder)
+        expected = preview(state.time + middles)
+        ailerons = np.zeros(KNOTS)
+        if roll:
+            wind = expected.moment[:, 0] + moments[0, 1:] @ others.array[1:]
+            ailerons = roll(state, wind, deflection[0])
+        elevator, lifting = others.elevator, 0.0
+        if loads:
+            wind = np.stack([expected.force[:, 2], expected.moment[:, 1]], -1)
+            bending = np.broadcast_to(expected.bending.sum(-1), (KNOTS,))
+            planned = loads(
+                _heave_state(state) - trim,
+                wind,
+                bending,
+                np.array([deflection[1], symmetric]),
+                np.array([deflection[0], *ailerons]),
+            )
+            elevator, lifting = map(float, planned)
+        last = Commands(float(ailerons[0]), elevator, others.rudder, lifting)
         return last
 
     return controller
+
+
+def _heave_state(state: AircraftState) -> np.ndarray:
+    return np.array([state.vertical_speed, state.pitch, state.pitch_rate])
+
+
+def _roll_plan(aircraft: AircraftModel) -> Callable[[AircraftState, np.ndarray, float], np.ndarray]:
+    """The ailerons (rad) of the intervals, for moments expected in them and the deflection now."""
+    largest, reach = aircraft.limits.deflection[0], aircraft.limits.rate[0] * INTERVAL
+    from_rate, rolls, rates = _roll_mode(aircraft, INTERVAL)
+    power, effort = aircraft.control_moments[0, 0], _EFFORT * np.eye(KNOTS)
+    matrix = np.concatenate([rolls * power, RATE_TIME * rates * power, effort])
+    solved = least_squares(matrix, TRAVEL)
+
+    def plan(state: AircraftState, wind: np.ndarray, now: float) -> np.ndarray:
+        start = from_rate * state.roll_rate + [[state.roll], [0.0]]
+        target = -np.concatenate(
+            [start[0] + rolls @ wind, RATE_TIME * (start[1] + rates @ wind), np.zeros(KNOTS)]
+        )
+        least = least_travel(
+            float(np.clip(now, -largest, largest)), np.full(KNOTS, largest), np.full(KNOTS, reach)
+        )
+        return np.clip(solved(target, least), -largest, largest)
+
+    return plan
 
 
 def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Controller:
@@ -201,22 +247,3 @@ def _roll_mode(aircraft: AircraftModel, dt: float) -> tuple[np.ndarray, np.ndarr
         all_of_them.append(now)
     rolls, rates = np.swapaxes(all_of_them, 0, 1)
     return np.stack([rolls[:, -1], rates[:, -1]]), rolls[:, :-1], rates[:, :-1]
-
-
-def _least_squares(
-    matrix: np.ndarray, target: np.ndarray, allowed: np.ndarray, least: np.ndarray
-) -> np.ndarray:
-    """The x that minimises |matrix x - target| where allowed x >= least.
-
-    As a least distance problem, solved by non-negative least squares (Lawson and Hanson 1995,
-    chapter 23). The matrix has full rank, and some x is allowed.
-    """
-    q, r = np.linalg.qr(matrix)
-    inverse, free = np.linalg.inv(r), q.T @ target
-    distance = allowed @ inverse
-    dual = np.vstack([distance.T, least - distance @ free])
-    goal = np.zeros(len(dual))
-    goal[-1] = 1.0
-    weights, _ = nnls(dual, goal)
-    residual = dual @ weights - goal
-    return inverse @ (free - residual[:-1] / residual[-1])

@@ -16,7 +16,7 @@ from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProces
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import retrieval_device, window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
-from lidar_mi.retrieval.vortices.image_fit import fit_vortices, started_fit
+from lidar_mi.retrieval.vortices.image_fit import detected_fit, started_fit
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
@@ -114,7 +114,7 @@ class Estimator:
         dt : float
             s.
         noise : float or DataArray, optional
-            As `fit_vortices` takes it.
+            As `detected_fit` takes it.
         expected : VortexPairFit, optional
             The pair expected at mid-time, with its covariance. With slopes and a telescope the fit
             is corrected for the motion in oblique beams by wind along x.
@@ -138,7 +138,7 @@ class Estimator:
         # submitted before this process fits: the other one works at the same time
         prepared = self._winds.prepare(first, self._last) if self._winds else None
         fit: Callable[[xr.DataArray], VortexPairFit] = partial(
-            fit_vortices,
+            detected_fit,
             image1,
             dt=dt,
             noise=noise,

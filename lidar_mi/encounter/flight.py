@@ -18,7 +18,13 @@ from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.atmosphere.air.along_path import AirAlongPath
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.air import air_along_path
-from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
+from lidar_mi.encounter.aircraft import (
+    AircraftModel,
+    AircraftState,
+    ailerons_deflected,
+    deflected,
+    loads_in_wind,
+)
 from lidar_mi.encounter.control import (
     Controller,
     Preview,
@@ -27,6 +33,7 @@ from lidar_mi.encounter.control import (
     no_loads,
     wings_level,
 )
+from lidar_mi.encounter.heave_model import HeaveModel
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.scan_store import ScanStore
@@ -78,6 +85,8 @@ def aircraft_of(encounter: Encounter) -> AircraftModel:
     """The aircraft of an encounter at its start."""
     if encounter.aircraft.model == "roll":
         return RollModel(encounter.aircraft, encounter.path)
+    if encounter.aircraft.model == "heave":
+        return HeaveModel(encounter.aircraft, encounter.path)
     return JSBSimAircraft(encounter.aircraft, encounter.path)
 
 
@@ -195,7 +204,8 @@ def simulate_flight(
     period = 1 / encounter.rate
     a_scan = math.ceil(period / _STEP)
     dt, count = period / a_scan, round(duration(encounter) / period) * a_scan
-    record, deflection, transfer = FlightRecorder(), np.zeros(3), bumpless_transfer()
+    record, transfer = FlightRecorder(), bumpless_transfer()
+    deflection, symmetric, limits = np.zeros(3), 0.0, aircraft.limits
     for step in range(count + 1):
         state = aircraft.state
         if step % a_scan == 0:
@@ -204,11 +214,14 @@ def simulate_flight(
         loads = loads_in_wind(aircraft.strips, state, wake.wind, aircraft.density)
         predicted = preview(state.time) if preview else None
         commands = controller(transfer(preview, state), state)
-        record.add(state, loads, predicted, commands, deflection, aircraft.control_moments)
+        moments = aircraft.control_moments
+        record.add(state, loads, predicted, commands, deflection, moments, symmetric)
         if step < count:
             aircraft.step(dt, loads, commands)
             # models need not tell where their controls are: the record follows them by the limits
-            deflection, _ = deflected(deflection, commands, dt, aircraft.limits)
+            aileron = deflection[0]
+            deflection, _ = deflected(deflection, commands, dt, limits)
+            deflection[0], symmetric = ailerons_deflected(aileron, symmetric, commands, dt, limits)
     most = abs(aircraft.control_moments[0, 0]) * aircraft.limits.deflection[0]
     about = {"units": "N m", "long_name": "rolling moment of the ailerons at full deflection"}
     return record.dataset().assign(largest_control_roll_moment=((), most, about))

@@ -19,7 +19,7 @@ from lidar_mi.encounter.folder import EncounterFolder
 from lidar_mi.encounter.preview import Lidar
 from lidar_mi.encounter.replay import recorded_flight, recorded_lidar, with_recorded
 from lidar_mi.encounter.report import answer, write_report
-from lidar_mi.encounter.wake import encounter_of
+from lidar_mi.encounter.wake import described_wake, encounter_of
 from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.device import devices_in_words, on_its_device
 from lidar_mi.experiment.folder.records import REPORT
@@ -202,6 +202,8 @@ def fly(
         log.path = results.log
         log(f"lidar-mi {__version__}, flight {experiment.name}, seed {experiment.seed}")
         log(devices_in_words(experiment))
+        for name, text in described_wake(experiment):
+            log(f"{name}: {text}")
         # the record names no lidar, aircraft or controller of one's own: their flights are not
         # recognised in a folder
         reusable = not (lidar or aircraft or controller)

@@ -29,7 +29,7 @@ from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.io.text import encoded
 from lidar_mi.io.yaml import to_yaml
 
-ANIMATION, SCANS = "approach.gif", "scans"
+ANIMATION, VIDEO, SCANS = "approach.gif", "approach.mp4", "scans"
 
 
 class EncounterFolder:
@@ -46,7 +46,7 @@ class EncounterFolder:
         self.figures, self.log = self.path / FIGURES, self.path / LOG
         self.record = new_record(experiment, experiment.folder)
         # trajectories depend on the version of JSBSim, where it is used
-        if encounter_of(experiment).aircraft.model != "roll":
+        if encounter_of(experiment).aircraft.model not in ("roll", "heave"):
             self.record["versions"]["jsbsim"] = version("jsbsim")
         self.made_by = made_by(self.record)
         self.scans = ScanStore(self.path / SCANS, self.made_by)
@@ -82,7 +82,7 @@ class EncounterFolder:
                     f"{self.path}: holds the experiment that this one was made from; expected "
                     "another folder (-o DIR)"
                 )
-        names = (METRICS, REPORT, SUMMARY, LOG, ANIMATION, *FILES.values())
+        names = (METRICS, REPORT, SUMMARY, LOG, ANIMATION, VIDEO, *FILES.values())
         old = [self.path / name for name in names]
 
         def remove_old() -> None:
@@ -118,7 +118,7 @@ class EncounterFolder:
 
     def data_files(self) -> list[str]:
         """Names of the files that the report links to."""
-        names = (*FILES.values(), ANIMATION)
+        names = (*FILES.values(), VIDEO, ANIMATION)
         there = [name for name in names if (self.path / name).is_file()]
         return [*there, METRICS, SUMMARY, RECORD, LOG]
 

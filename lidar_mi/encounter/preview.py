@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Wind, loads_in_wind
 from lidar_mi.encounter.arrivals import Arrival, wing_places
-from lidar_mi.encounter.control import HORIZON, Preview
+from lidar_mi.encounter.control import Preview
 from lidar_mi.encounter.estimate import Estimate
+from lidar_mi.encounter.planning import HORIZON
 from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.wind_ahead import WindAhead
 from lidar_mi.retrieval.vortices.model import widened

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lidar_mi.assessment.figures.encounter import draw_all
-from lidar_mi.assessment.figures.encounter_film import MOST_FRAMES, film
+from lidar_mi.assessment.figures.encounter_film import RATE, film, frame_times
 from lidar_mi.assessment.metrics.encounter import (
     CONTROLLER,
     MET,
@@ -18,13 +18,23 @@ from lidar_mi.assessment.report.encounter import encounter_answer, encounter_cha
 from lidar_mi.assessment.report.page import Film, page
 from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import FlightData, aircraft_of
-from lidar_mi.encounter.folder import ANIMATION, EncounterFolder
+from lidar_mi.encounter.folder import ANIMATION, VIDEO, EncounterFolder
 from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import dump
-from lidar_mi.io.film import frame_as_webp, write_gif
+from lidar_mi.io.atomic import write_atomically
+from lidar_mi.io.film import VIDEO_EXTRA, as_mp4, frame_as_webp, write_gif
+
+# Frames of a report without a video.
+_SLIDER_FRAMES = 40
+_FILM = "The flight, in real time"
+_FILM_CAPTION = (
+    "Above: backscatter and wind of the slab that was delivered last, true cores (crosses) and "
+    "tracked ones, and the wings of the aircraft at this moment. Middle: from above, what the "
+    "lidar looks at while it scans. Below: roll angles."
+)
 
 
 def write_report(
@@ -84,25 +94,28 @@ def judged(
 
 
 def _film(folder: EncounterFolder, data: FlightData, span: float, log: Log) -> Film | None:
-    """Frames for the report; the same as an animation in the folder."""
+    """A video for the report and the folder, or frames with a slider; an animation beside them."""
     pixels: list[np.ndarray] = []
-    frames: list[tuple[bytes, str]] = []
-    times: list[float] = []
-    for frame in film(data.series, data.track, data.slabs, span):
-        log.bar("drawing the animation", len(frames) / MOST_FRAMES)
-        pixels.append(frame.pixels)
-        frames.append((frame_as_webp(frame.pixels), frame.caption))
-        times.append(frame.time)
-    if len(frames) < 2:
+    captions: list[str] = []
+    number = len(frame_times(data.series, data.track, data.slabs))
+    if number < 2:
         return None
-    # half the speed of the flight: the wake is crossed in a second or two
-    seconds = 2 * (times[-1] - times[0]) / (len(times) - 1)
-    write_gif(folder.path / ANIMATION, pixels, seconds)
-    return Film(
-        "The flight",
-        "Above: backscatter of the slab that is seen now, true cores (crosses) and tracked ones, "
-        "and the wings of the aircraft at this moment. Middle: from above, what the lidar looks "
-        "at. Below: roll angles.",
-        frames,
-        seconds,
-    )
+    for frame in film(data.series, data.track, data.slabs, span):
+        if len(pixels) % RATE == 0:
+            log.bar("drawing the animation", len(pixels) / number)
+        pixels.append(frame.pixels)
+        captions.append(frame.caption)
+    log.bar("writing the animation", None)
+    # half of the frames, as GIF hardly compresses them
+    write_gif(folder.path / ANIMATION, pixels[::2], 2 / RATE)
+    video = as_mp4(pixels, 1 / RATE)
+    if video:
+        write_atomically(folder.path / VIDEO, video)
+        # one frame is shown before the video plays
+        every, chosen = number, [number // 2]
+    else:
+        log(VIDEO_EXTRA)
+        every = max(1, round(number / _SLIDER_FRAMES))
+        chosen = list(range(0, number, every))
+    frames = [(frame_as_webp(pixels[k]), captions[k]) for k in chosen]
+    return Film(_FILM, _FILM_CAPTION, frames, every / RATE, video, ANIMATION)

@@ -50,8 +50,10 @@ class ScanStore:
     folder: Path
     made_by: str
 
-    def read(self, number: int, pose: AircraftPose) -> Scan | None:
-        """The scan of this number, if it is stored and was made from this pose."""
+    def read(
+        self, number: int, pose: AircraftPose, window: tuple[float, float] = (0.0, 0.0)
+    ) -> Scan | None:
+        """The scan of this number, if it was made from this pose about this middle (y, z)."""
         path = self._path(number)
         if not path.is_file():
             return None
@@ -59,9 +61,12 @@ class ScanStore:
             found = read_netcdf(path)
         except InputError:  # damaged: it is rendered again
             return None
-        about = asdict(pose)
+        about = _about(pose, window)
         if found.attrs.get(MADE_BY) != self.made_by or not np.allclose(
-            [found.attrs[name] for name in about], list(about.values()), rtol=0, atol=_ROUNDING
+            [found.attrs.get(name, np.nan) for name in about],
+            list(about.values()),
+            rtol=0,
+            atol=_ROUNDING,
         ):
             return None
         return Scan(
@@ -71,14 +76,16 @@ class ScanStore:
             )
         )
 
-    def write(self, number: int, pose: AircraftPose, scan: Scan) -> None:
+    def write(
+        self, number: int, pose: AircraftPose, scan: Scan, window: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
         """Write a scan."""
         make_folder(self.folder)
         images = {
             name: getattr(scan, name).rename({axis: f"{gate}_{axis}" for axis in "zy"})
             for name, gate in _PARTS
         }
-        about = {MADE_BY: self.made_by, **asdict(pose)}
+        about = {MADE_BY: self.made_by, **_about(pose, window)}
         write_netcdf(xr.Dataset(images, attrs=about), self._path(number))
 
     @property
@@ -92,3 +99,8 @@ class ScanStore:
 
     def _path(self, number: int) -> Path:
         return self.folder / f"scan_{number:04d}.nc"
+
+
+def _about(pose: AircraftPose, window: tuple[float, float]) -> dict[str, float]:
+    """What the images of a scan depend on, by name."""
+    return asdict(pose) | {"window_y": window[0], "window_z": window[1]}

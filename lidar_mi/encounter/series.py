@@ -43,6 +43,10 @@ _STATES: dict[str, tuple[str, str]] = {
     "yaw_rate": ("rad s-1", "yaw rate"),
     "airspeed": ("m s-1", "true airspeed"),
     "departed": ("1", "1 from the moment at which the aircraft is upset"),
+    "vertical_speed": ("m s-1", "vertical speed across the path"),
+    "load_factor": ("1", "vertical load factor"),
+    "port_bending": ("N m", "bending moment of the port wing root, change from trim, tip up"),
+    "starboard_bending": ("N m", "bending moment of the starboard wing root, likewise"),
 }
 _LOADS = {
     "force_x": ("N", "force of the wind forward"),
@@ -52,8 +56,12 @@ _LOADS = {
     "pitch_moment": ("N m", "pitching moment of the wind, nose down"),
     "yaw_moment": ("N m", "yawing moment of the wind, nose to port"),
 }
-_COMMANDS = {name: ("rad", f"{name} asked for") for name in ("aileron", "elevator", "rudder")}
-_DEFLECTION = ("rad", "aileron as deflected")
+_CONTROLS = ("aileron", "elevator", "rudder", "symmetric_aileron")
+_COMMANDS = {name: ("rad", f"{name.replace('_', ' ')} asked for") for name in _CONTROLS}
+_DEFLECTIONS = {
+    f"{name}_deflection": ("rad", f"{name.replace('_', ' ')} as deflected")
+    for name in ("aileron", "elevator", "symmetric_aileron")
+}
 _CONTROL = ("N m", "rolling moment of the controls")
 
 
@@ -71,6 +79,7 @@ class FlightRecorder:
         commands: Commands,
         deflection: np.ndarray,
         control_moments: np.ndarray,
+        symmetric: float = 0.0,
     ) -> None:
         """Record one instant: deflections in rad, moments per deflection in N m per rad."""
         row = {field.name: float(getattr(state, field.name)) for field in fields(state)}
@@ -79,7 +88,8 @@ class FlightRecorder:
         nothing = Loads(np.full(3, np.nan), np.full(3, np.nan))
         row |= _named(predicted or nothing, "predicted_")
         row |= {name: float(getattr(commands, name)) for name in _COMMANDS}
-        row["aileron_deflection"] = float(deflection[0])
+        deflections = (deflection[0], deflection[1], symmetric)
+        row |= {name: float(v) for name, v in zip(_DEFLECTIONS, deflections, strict=True)}
         row["control_roll_moment"] = float(control_moments[0] @ deflection)
         self._rows.append(row)
 
@@ -90,7 +100,7 @@ class FlightRecorder:
             **_LOADS,
             **{f"predicted_{name}": (u, f"predicted {text}") for name, (u, text) in _LOADS.items()},
             **_COMMANDS,
-            "aileron_deflection": _DEFLECTION,
+            **_DEFLECTIONS,
             "control_roll_moment": _CONTROL,
         }
         time = np.array([row["time"] for row in self._rows])

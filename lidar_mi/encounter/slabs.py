@@ -13,6 +13,7 @@ from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.encounter.air import air_along_path
 from lidar_mi.encounter.pointing import check_reported
+from lidar_mi.encounter.scan_window import window_reach
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
@@ -71,8 +72,10 @@ class Gates:
         """Middle along x of the slab in the last gate of scan ``number``, m."""
         return number * self.stride + self.look_ahead + self.depth / 2
 
-    def plan(self, ahead: float = 0.0) -> ScanPlan:
+    def plan(self, ahead: float = 0.0, window: tuple[float, float] = (0.0, 0.0)) -> ScanPlan:
         """A scan by an aircraft that is ``ahead`` (m) of its nominal place.
+
+        The middle of the last gate's image is at ``window``: y and z about the aircraft, m.
 
         Raises
         ------
@@ -88,14 +91,18 @@ class Gates:
         stop = start + (self.between + 1) * self.depth
         # beams are aimed at the middle of all gates, where the last gate's image is smaller
         scale = (start + stop) / 2 / (stop - self.depth / 2)
-        return ScanPlan(
-            self.y * scale, self.z * scale, start, stop, "planar", self.between + 1, ahead
+        y, z = (
+            (axis + offset) * scale - offset
+            for axis, offset in zip((self.y, self.z), window, strict=True)
         )
+        aside = -window[0], -window[1]
+        return ScanPlan(y, z, start, stop, "planar", self.between + 1, ahead, aside=aside)
 
     def axes(self, plan: ScanPlan, gate: int) -> tuple[np.ndarray, np.ndarray]:
         """y and z of a gate's image, m, about the aircraft."""
         middle = plan.gate_start + (gate % plan.gate_count + 0.5) * self.depth
-        return plan.y * middle / plan.centre, plan.z * middle / plan.centre
+        y, z = plan.y - plan.aside[0], plan.z - plan.aside[1]
+        return y * middle / plan.centre, z * middle / plan.centre
 
 
 def gates_of(experiment: Experiment) -> Gates:
@@ -183,6 +190,7 @@ class Air:
         place: tuple[float, float],
         ahead: float = 0.0,
         misalignment: Rotation | None = None,
+        window: tuple[float, float] = (0.0, 0.0),
     ) -> xr.DataArray:
         """Extinction (m^-1) in all gates of a scan, about an aircraft at ``place`` (y, z in m).
 
@@ -198,11 +206,14 @@ class Air:
             Of its nominal place, m.
         misalignment : Rotation, optional
             True attitude of the lidar relative to the one by which its beams are aimed.
+        window : (float, float)
+            Middle of the scan about the aircraft, y and z in m.
 
         Returns
         -------
         xarray.DataArray, dims (x, y, z)
-            x from the nominal place of the aircraft, y and z from its own; all scans on one grid.
+            x from the nominal place of the aircraft, y and z from the middle of the scan; all scans
+            on one grid.
         """
         gates = self.gates
         cells = gates.planes
@@ -214,7 +225,7 @@ class Air:
             _extended(axis, margin)
             for axis, margin in zip((gates.y, gates.z), self.margin, strict=True)
         )
-        at_x, at_y, at_z = np.meshgrid(x - ahead, y, z, indexing="ij")
+        at_x, at_y, at_z = np.meshgrid(x - ahead, y + window[0], z + window[1], indexing="ij")
         if misalignment is not None:
             at_x, at_y, at_z = np.einsum(
                 "ij,j...->i...", misalignment.as_matrix(), np.stack([at_x, at_y, at_z])
@@ -284,11 +295,14 @@ def air_of(experiment: Experiment, gates: Gates) -> Air:
     assert wake is not None  # `air_along_path` refuses its absence
     reach = beam_reach(experiment.lidar, gates.look_ahead + 2 * gates.depth)
     spacing = float(gates.y[1] - gates.y[0])
+    encounter = encounter_of(experiment)
+    # oblique beams are not at the same place in both gates
+    reach += window_reach(encounter) * (gates.stride + 2 * gates.depth) / gates.look_ahead
     margin = (reach + spacing, reach + spacing)
     step = gates.depth / gates.planes
     # images at both edges must not show the same texture: an outer scale apart
     width, height = (float(np.ptp(axis)) + wake.texture.outer_scale for axis in (gates.y, gates.z))
-    path = encounter_of(experiment).path
+    path = encounter.path
     flight = path.start + path.beyond + gates.look_ahead
     longest = _TEXTURE_NODES * step / ((width / spacing + 1) * (height / spacing + 1))
     texture = periodic_texture(

@@ -15,7 +15,7 @@ forces in a surface's plane.
 Body frame: x forward, y left, z up, from the centre of gravity.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +23,9 @@ from numpy.typing import ArrayLike
 from lidar_mi.errors import InputError
 
 STRIPS = 40
+
+TAIL_ASPECT_RATIO, FIN_ASPECT_RATIO = 4.0, 1.6
+"""Usual for transport aircraft (Raymer 2018, table 4.3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +39,14 @@ class Loads:
     moment : ndarray, shape (..., 3)
         N m, right-handed about each axis: positive with the port wing up, the nose down, the nose
         to port.
+    bending : ndarray, shape (..., 2)
+        Bending moments of the port and the starboard wing at the plane of symmetry, N m, positive
+        with the tip up. Default: none are known, 0.
     """
 
     force: np.ndarray
     moment: np.ndarray
+    bending: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +61,8 @@ class Strips:
         m^2.
     slopes, roll_slopes : ndarray, shape (n,)
         Lift slope of forces, and of moments about the body's x axis, per rad.
+    bends : ndarray of bool, shape (n,)
+        Strips of the wing: they bend its roots.
     """
 
     places: np.ndarray
@@ -61,6 +70,7 @@ class Strips:
     areas: np.ndarray
     slopes: np.ndarray
     roll_slopes: np.ndarray
+    bends: np.ndarray
 
 
 def finite_span_slope(section_slope: float, aspect_ratio: float, mode: int = 1) -> float:
@@ -156,9 +166,18 @@ def in_downwash(tail: Strips, section_slope: float, aspect_ratio: float) -> Stri
     )
 
 
+def as_wing(surface: Strips) -> Strips:
+    """A surface whose loads bend the roots of the wing, at the plane of symmetry.
+
+    Bending by wind that is uniform or linear across the span is that of the lifting line, to the
+    quadrature of the kink at the root; all that both wings have in common has the slope of lift.
+    """
+    return replace(surface, bends=np.ones(len(surface.areas), bool))
+
+
 def joined(*surfaces: Strips) -> Strips:
     """Strips of several surfaces."""
-    names = ("places", "normals", "areas", "slopes", "roll_slopes")
+    names = ("places", "normals", "areas", "slopes", "roll_slopes", "bends")
     return Strips(*(np.concatenate([getattr(one, name) for one in surfaces]) for name in names))
 
 
@@ -183,7 +202,11 @@ def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float)
     moment = lift @ arms
     # the second mode of the loading, whose slope is smaller
     moment[..., 0] = (pressure * strips.roll_slopes) @ arms[:, 0]
-    return Loads(lift @ strips.normals, moment)
+    # what both wings have in common has the first slope, their difference the second
+    across = np.where(strips.bends, strips.places[:, 1], 0.0)
+    both, difference = lift @ np.abs(across), (pressure * strips.roll_slopes) @ across
+    bending = np.stack([both + difference, both - difference], -1) / 2
+    return Loads(lift @ strips.normals, moment, bending)
 
 
 def roll_damping(strips: Strips, airspeed: float, density: float) -> float:
@@ -225,4 +248,5 @@ def _surface(
         area * weights / weights.sum(),
         finite_span_slope(lift_slope, aspect_ratio) * ones,
         finite_span_slope(lift_slope, aspect_ratio, mode=2) * ones,
+        np.zeros(len(places), bool),
     )

@@ -17,6 +17,7 @@ from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.pointing import pointing_error
 from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.scan_store import Scan, ScanStore
+from lidar_mi.encounter.scan_window import ScanWindow
 from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
@@ -66,7 +67,8 @@ class VirtualLidar:
     Every step renders one scan of consecutive gates. The slab in the last gate of one scan is that
     in the first gate of the next, so every scan completes a pair of images of one slab; wind and
     vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
-    the number of the scan and the pose alone: a step that is repeated gives the same images bit for
+    the number of the scan and the pose alone, with `encounter.window.follow` on the estimates
+    before as well: a step that is repeated gives the same images bit for
     bit, and the same estimate but for rounding, where it starts from nothing; several lidars in one
     process do not disturb each other. Nothing is written but to `scans`.
 
@@ -122,6 +124,8 @@ class VirtualLidar:
         self._doppler = doppler_scans(experiment, self.gates)
         speeds = LineSpeeds(self._doppler) if self._doppler else None
         self._estimator = Estimator(experiment, processes=processes, speeds=speeds)
+        sizes = float(np.ptp(self.gates.y)), float(np.ptp(self.gates.z))
+        self._window = ScanWindow(self.encounter, sizes)
         self._poses: dict[int, AircraftPose] = {}
         self._renderer: ScanRenderer | None = None
         self._scans: dict[int, Scan] = {}
@@ -161,11 +165,12 @@ class VirtualLidar:
         """
         number = self._number(t)
         pose = pose or AircraftPose(number * self.gates.stride)
-        scan = self._store.read(number, pose) if self._store else None
+        window = self._window.at(number, (pose.y, pose.z), expected)
+        scan = self._store.read(number, pose, window) if self._store else None
         if scan is None:
-            scan = self._scanned(number, pose)
+            scan = self._scanned(number, pose, window)
             if self._store:
-                self._store.write(number, pose, scan)
+                self._store.write(number, pose, scan, window)
         before, came_from = self._scans.get(number - 1), self._poses.get(number - 1)
         # this scan for the next slab, the one before for a step that is repeated
         self._scans = {number: scan} | ({number - 1: before} if before else {})
@@ -192,6 +197,7 @@ class VirtualLidar:
             complete=complete if self._doppler or complete.by_pointing else None,
             telescope=(midway.place[0] - x, midway.place[1], midway.place[2]),
         )
+        self._window.add(number, found.pair)
         pair = found.pair.with_common_error(
             complete.common, complete.common, complete.rotation, complete.roll_axis
         )
@@ -232,13 +238,13 @@ class VirtualLidar:
             )
         return number
 
-    def _scanned(self, number: int, pose: AircraftPose) -> Scan:
+    def _scanned(self, number: int, pose: AircraftPose, window: tuple[float, float]) -> Scan:
         """Both images of a scan with the detector's noise."""
         experiment, gates = self.experiment, self.gates
         ahead = pose.x - number * gates.stride
-        plan = gates.plan(ahead)
+        plan = gates.plan(ahead, window)
         misalignment = pointing_error(experiment, number, number * gates.period)
-        air = self.air.at_scan(number, (pose.y, pose.z), ahead, misalignment)
+        air = self.air.at_scan(number, (pose.y, pose.z), ahead, misalignment, window)
         # a lidar of another variant may have been stepped meanwhile
         use_variant(experiment.render.variant)
         if self._renderer is None:

@@ -8,8 +8,10 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, Rings, find_cores, ring_averages
 from lidar_mi.atmosphere.vortex import Vortex
-from lidar_mi.atmosphere.wake_path import PairAlongPath, WakeAlongPath
-from lidar_mi.atmosphere.wake_volume import VolumeAlongPath, one_period
+from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.atmosphere.wake_period import Closing, Ends, one_period
+from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
+from lidar_mi.encounter.aged_wake import analytic_wake, described_pair
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.schema.encounter import Encounter
@@ -53,21 +55,7 @@ def wake_along_path(experiment: Experiment) -> WakeAlongPath:
             f"wake: {found} is not allowed in an encounter, as it is not known along the wake's "
             "axis; expected wake.vortex_pair or wake.file"
         )
-    pair, path = wake.vortex_pair, encounter.path
-    return PairAlongPath(
-        pair.circulation,
-        pair.separation,
-        pair.core_radius,
-        pair.model,
-        crossing_angle=path.crossing_angle,
-        climb_angle=path.climb_angle,
-        x_c=path.start,
-        t_c=path.start / path.speed,
-        miss=(path.miss.y, path.miss.z),
-        decay_time=encounter.wake.decay_time,
-        crow_amplitude=encounter.wake.crow.amplitude,
-        crow_wavelength=encounter.wake.crow.wavelength,
-    )
+    return analytic_wake(wake.vortex_pair, encounter)
 
 
 def vortices_in_plane(wake: WakeAlongPath, x: float, time: float) -> tuple[Vortex, Vortex] | None:
@@ -87,7 +75,9 @@ def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> Vol
         value = wake.second if wake.stored is None else f"{wake.stored:g} s"
         raise InputError(f"wake.second: {value} is not allowed in an encounter; expected advect")
     for key, given in (
+        ("age", encounter.wake.age),
         ("decay_time", encounter.wake.decay_time),
+        ("dissipation_rate", encounter.wake.dissipation_rate),
         ("crow.amplitude", encounter.wake.crow.amplitude),
     ):
         if given:
@@ -95,9 +85,7 @@ def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> Vol
                 f"encounter.wake.{key}: {given:g} is not allowed with wake.file; expected "
                 "wake.vortex_pair"
             )
-    path = find_file(file, folder, "wake.file")
-    # its time of change: a file that is written anew is read anew
-    flow, cores, drift = _volume(path, path.stat().st_mtime_ns, wake.model_dump_json())
+    flow, cores, drift, _ = _period_of(wake, file, encounter, folder)
     port, starboard = (tuple(_vortex(*one) for one in side) for side in cores)
     both = [*port, *starboard]
     middle = np.mean([one.y for one in both]), np.mean([one.z for one in both])
@@ -119,6 +107,54 @@ def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> Vol
     )
 
 
+def _period_of(
+    wake: Wake, file: str, encounter: Encounter, folder: Path
+) -> tuple[xr.Dataset, "Sides", tuple[float, float], Closing]:
+    path = find_file(file, folder, "wake.file")
+    # its time of change: a file that is written anew is read anew
+    stamp, ends = path.stat().st_mtime_ns, encounter.wake
+    return _volume(path, stamp, wake.model_dump_json(), ends.ends, ends.ends_length)
+
+
+def described_wake(experiment: Experiment) -> list[tuple[str, str]]:
+    """The wake of an encounter, if any, in words: a name and a line for each property.
+
+    Raises
+    ------
+    InputError
+        As of `wake_along_path`.
+    """
+    encounter, wake = encounter_of(experiment), experiment.wake
+    if encounter.air is not None and not encounter.air.wake:
+        return []
+    if wake is not None and wake.vortex_pair is not None:
+        return described_pair(wake.vortex_pair, encounter)
+    along = wake_along_path(experiment)
+    assert wake is not None and wake.file and isinstance(along, VolumeAlongPath)
+    _, sides, _, closing = _period_of(wake, wake.file, encounter, experiment.folder)
+    strength = [np.array([abs(circulation) for _, circulation in side]) for side in sides]
+    mean = float(np.mean(strength))
+    rows = [("vortices when met", f"{mean:.4g} m^2/s, of {wake.file}, frozen in this state")]
+    if closing.how == "uniform":
+        return [*rows, ("wake along its axis", "uniform: one plane, extruded")]
+    text = f"{closing.how}: a period of {closing.period:.4g} m, repeated"
+    rows.append(("wake along its axis", text))
+    if closing.changed:
+        # a mirror leaves the flow in the planes across the axis
+        kept = "as in the file"
+        if closing.how == "blend":
+            changed = np.isin(np.arange(len(strength[0])), closing.changed)
+            ratios = [float(one[changed].mean() / one[~changed].mean()) for one in strength]
+            kept = f"{max(abs(ratio - 1) for ratio in ratios):.1%} off that elsewhere"
+        text = (
+            f"changed over {encounter.wake.ends_length:g} m: divergence {closing.divergence:.2g} "
+            f"of the gradients there ({closing.divergence_before:.2g} in the file), circulation "
+            f"{kept}"
+        )
+        rows.append(("ends of the volume", text))
+    return rows
+
+
 _OUTER = (15.0, 12.0, 10.0, 8.0)
 """Outer radius of the rings over which circulation and drift of a vortex are averaged, m."""
 
@@ -132,8 +168,10 @@ Sides = tuple[list[Section], list[Section]]
 
 # check, flight and report need it again: cores in every plane take seconds to find
 @lru_cache(maxsize=2)
-def _volume(path: Path, stamp: int, keys: str) -> tuple[xr.Dataset, Sides, tuple[float, float]]:
-    """One period of a file's wake with its extinction, its cores plane by plane, its drift."""
+def _volume(
+    path: Path, stamp: int, keys: str, ends: Ends, length: float
+) -> tuple[xr.Dataset, Sides, tuple[float, float], Closing]:
+    """One period of a file's wake with its extinction, its cores by plane, its drift, its ends."""
     wake = Wake.model_validate_json(keys)
     needed, names = tracers_of(wake)
     plane = wake.x if wake.depth == "plane" else None
@@ -143,7 +181,7 @@ def _volume(path: Path, stamp: int, keys: str) -> tuple[xr.Dataset, Sides, tuple
             f"wake.x: missing; {path.name} has {flow.sizes['x']} planes, expected one of "
             f"{float(flow['x'][0]):g} to {float(flow['x'][-1]):g} m (or wake.depth: volume)"
         )
-    flow = one_period(flow)
+    flow, closing = one_period(flow, ends, length)
     field = extinction_of(flow, wake.extinction, flow, None)
     flow = flow[[n for n in "uvw" if n in flow]].assign(extinction=field)
     sides: Sides = ([], [])
@@ -168,7 +206,7 @@ def _volume(path: Path, stamp: int, keys: str) -> tuple[xr.Dataset, Sides, tuple
             side.append((core, rings.circulation))
             drifts.append((rings.v, rings.w))
     v, w = np.mean(drifts, axis=0)
-    return flow, sides, (float(v), float(w))
+    return flow, sides, (float(v), float(w)), closing
 
 
 def _rings(section: xr.Dataset, core: Core, partner: Core) -> Rings | None:

@@ -55,6 +55,8 @@ def sections(
         ".cdf": _netcdf,
         ".txt": _table_file,
         ".json": _vortices,
+        ".hpl": _lines_of_sight,
+        ".csv": _lines_of_sight,
     }
     if named:
         wavelength = wavelength or 532e-9
@@ -64,8 +66,8 @@ def sections(
             yield _scatterer(what, aerosol_table(what, wavelength, notice))
     elif not path.exists():
         raise InputError(
-            f"{what}: no such file; expected .exr, .nc, .txt, .json, a run folder, {MOLECULES} or "
-            f"one of the aerosols {', '.join(AEROSOLS)}"
+            f"{what}: no such file; expected .exr, .nc, .hpl, .csv, .txt, .json, a run folder, "
+            f"{MOLECULES} or one of the aerosols {', '.join(AEROSOLS)}"
         )
     elif path.is_dir():
         yield from _folder(path)
@@ -77,8 +79,8 @@ def sections(
         raise InputError(f"{path}: an experiment, not a result; expected lidar-mi check {path}")
     else:
         raise InputError(
-            f"{path}: unknown kind of file; expected .exr, .nc, .txt (scattering table), "
-            ".json (vortex pairs) or a run folder"
+            f"{path}: unknown kind of file; expected .exr, .nc, .hpl or .csv (lines of sight), "
+            ".txt (scattering table), .json (vortex pairs) or a run folder"
         )
 
 
@@ -144,8 +146,14 @@ def _image(path: Path) -> Iterator[Section]:
 def _netcdf(path: Path) -> Iterator[Section]:
     import xarray as xr
 
+    from lidar_mi.io.lines_of_sight.read import is_lines_of_sight
     from lidar_mi.io.netcdf import load_variable, open_netcdf
 
+    if is_lines_of_sight(path):
+        try:
+            yield from _lines_of_sight(path)
+        except InputError as error:
+            yield f"{path}: lines of sight", [("not read", str(error))]
     with open_netcdf(path) as data:
         rows = []
         for name, variable in data.variables.items():
@@ -158,6 +166,39 @@ def _netcdf(path: Path) -> Iterator[Section]:
             rows.append((str(name), shape, span, str(variable.attrs.get("units", ""))))
         yield str(path), rows
         yield "attributes", [(key, _short(value)) for key, value in data.attrs.items()]
+
+
+def _lines_of_sight(path: Path) -> Iterator[Section]:
+    """Where a Doppler lidar looked, how much of it is valid, what is unusual."""
+    from lidar_mi.io.lines_of_sight.read import read_lines_of_sight
+
+    data = read_lines_of_sight(path)
+    time, flag = data["time"].values, data["flag"].values
+    seconds = float((time[-1] - time[0]) / np.timedelta64(1, "s"))
+    about = data.attrs
+    rows = [
+        ("instrument", str(about.get("instrument", "unknown"))),
+        ("scan, as the file says", str(about.get("scan_type", "")) or "unknown"),
+        ("lines", f"{time.size}, {seconds:.4g} s"),
+        ("first line", f"{str(time[0])[:23].replace('T', ' ')} UTC"),
+    ]
+    for name in ("azimuth", "elevation", "range"):
+        values = data[name].values
+        span = _span(float(values.min()), float(values.max()))
+        one = f"{values[0]:.4g}" if np.ptp(values) < 0.05 else span
+        unit = "degrees" if name != "range" else f"m, {values.size} gates"
+        rows.append((name, f"{one} {unit}"))
+    values = data["radial_velocity"].values[flag == 0]
+    if values.size:
+        span = _span(float(values.min()), float(values.max()))
+        rows.append(("radial velocity (valid)", f"{span} m/s, positive away"))
+    rows.append(("valid", f"{100 * values.size / flag.size:.1f} %"))
+    words = data["flag"].attrs
+    for name, mask in zip(words["flag_meanings"].split(), words["flag_masks"], strict=True):
+        if part := float(((flag & mask) > 0).mean()):
+            rows.append((name.replace("_", " "), f"{100 * part:.1f} %"))
+    rows += [("remark", text) for text in about["remarks"].splitlines()]
+    yield f"{path}: lines of sight, {about['kind']}, {about['scan']}", rows
 
 
 def _span(low: float, high: float) -> str:

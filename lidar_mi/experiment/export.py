@@ -75,7 +75,10 @@ def export(
     >>> lm.export("outputs/wake_sensor", "csv")            # doctest: +SKIP
     """
     if format not in FORMATS:
-        raise InputError(f"format: {format!r} is not allowed; expected one of {', '.join(FORMATS)}")
+        raise InputError(
+            f"format: {format!r} is not allowed; expected one of {', '.join(FORMATS)}, or control, "
+            "of flights (lm.export_control)"
+        )
     folder = Path(folder)
     if (folder / STUDY).is_file():
         raise InputError(f"{folder}: a folder of several runs; expected one of them, {folder}/...")

@@ -113,6 +113,9 @@ class ScanPlan:
         gates are fixed.
     beams : Beams, optional
         Time and pose of every beam. None: all at once, from one place, to the nodes (y, z).
+    aside : (float, float)
+        y and z of the telescope where there are no `beams`: of a scan about another direction than
+        straight ahead, whose nodes are about its own middle.
     """
 
     y: np.ndarray
@@ -123,6 +126,7 @@ class ScanPlan:
     gate_count: int
     position: float
     beams: Beams | None = None
+    aside: tuple[float, float] = (0.0, 0.0)
 
     @property
     def centre(self) -> float:
@@ -132,7 +136,8 @@ class ScanPlan:
     def directions(self) -> np.ndarray:
         """Unit vectors of the beams, (rows * columns, 3), row by row from the top left."""
         # film order begins at the top left of the pilot's view, where y and z are largest
-        vertical, lateral = np.meshgrid(self.z[::-1], self.y[::-1], indexing="ij")
+        y, z = self.y - self.aside[0], self.z - self.aside[1]
+        vertical, lateral = np.meshgrid(z[::-1], y[::-1], indexing="ij")
         beams = np.stack([np.full_like(lateral, self.centre), lateral, vertical], -1)
         beams = beams.reshape(-1, 3)
         return beams / np.linalg.norm(beams, axis=1, keepdims=True)
@@ -145,9 +150,8 @@ class ScanPlan:
         """
         if self.beams is not None:
             return self.as_image(1 / self.beams.reported_direction[:, 0])
-        return np.sqrt(
-            1 + (self.y[None, :] / self.centre) ** 2 + (self.z[:, None] / self.centre) ** 2
-        )
+        y, z = self.y[None, :] - self.aside[0], self.z[:, None] - self.aside[1]
+        return np.sqrt(1 + (y / self.centre) ** 2 + (z / self.centre) ** 2)
 
     def ranges(self) -> np.ndarray:
         """Middle of every gate along every beam from its own origin, m, (gates, rows, columns)."""

@@ -44,8 +44,10 @@ _LIBRARY = "netCDF4"
 """Reads files that h5py and SciPy do not, where it is installed."""
 
 
-def open_netcdf(path: str | Path) -> xr.Dataset:
+def open_netcdf(path: str | Path, group: str | None = None) -> xr.Dataset:
     """A NetCDF-4 or NetCDF-3 file, its times as numbers, its values read when they are asked for.
+
+    With a ``group``, the variables of that group of a NetCDF-4 file (`groups`).
 
     Values are unpacked and missing ones NaN, as CF says: ``_FillValue``, ``missing_value`` and,
     without ``_FillValue``, what the library writes into cells that were never written. The limits
@@ -61,7 +63,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         # several values may stand for missing ones
         warnings.simplefilter("ignore", xr.SerializationWarning)
         try:
-            raw = _open(path, decode_cf=False)
+            raw = _open(path, group, decode_cf=False)
             for variable in raw.variables.values():
                 _mark_missing(variable)
             return xr.decode_cf(raw, decode_times=False)
@@ -71,7 +73,21 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
             raise _damaged(path, error) from None
 
 
-def _open(path: str | Path, **how: Any) -> xr.Dataset:
+def groups(path: str | Path) -> list[str]:
+    """Names of the groups at the top of a NetCDF file; errors as in `open_netcdf`."""
+    import h5py
+
+    path = Path(path)
+    if _kind(path) != "HDF5":
+        return []
+    try:
+        with h5py.File(path, "r") as file:
+            return [name for name, one in file.items() if isinstance(one, h5py.Group)]
+    except Exception as error:
+        raise _damaged(path, error) from None
+
+
+def _open(path: str | Path, group: str | None = None, **how: Any) -> xr.Dataset:
     """The data set of a file, by the library that reads its kind."""
     path = Path(path)
     kind = _kind(path)
@@ -79,7 +95,7 @@ def _open(path: str | Path, **how: Any) -> xr.Dataset:
     if kind == "CDF-5":
         unread = f"is NetCDF of 64-bit data (CDF-5); {_convert('nccopy -k nc4 {0} out.nc', path)}"
     elif kind == "HDF5":
-        found, filters = _declared(path)
+        found, filters = _declared(path, group)
         for what, size in found:
             check_size(path, size, what)
         if filters:
@@ -92,7 +108,8 @@ def _open(path: str | Path, **how: Any) -> xr.Dataset:
     unnamed: dict[str, Any] = {"phony_dims": "access"} if engine == "h5netcdf" else {}
     try:
         # absolute, as xarray takes ~ for a home and a:// for the network
-        return xr.open_dataset(os.path.abspath(path), engine=engine, **unnamed, **how)
+        within: dict[str, Any] = {} if group is None else {"group": group}
+        return xr.open_dataset(os.path.abspath(path), engine=engine, **within, **unnamed, **how)
     except Exception as error:  # any exception of the libraries in a damaged file
         if unread:
             raise InputError(f"{path}: {unread}") from None
@@ -136,7 +153,7 @@ def _convert(command: str, path: Path, wanted: str = "NetCDF-4 or NetCDF-3 class
     return f"expected {wanted}: {command.format(shlex.quote(str(path)))}"
 
 
-def _declared(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
+def _declared(path: Path, group: str | None) -> tuple[list[tuple[str, int]], list[str]]:
     """Bytes read on opening and the largest chunk read for a value; filters that are missing."""
     import h5py
 
@@ -145,8 +162,9 @@ def _declared(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
     try:
         with h5py.File(path, "r") as file:
             file.attrs.get("_nc3_strict")  # h5netcdf could not even be closed without
-            groups = [name for name, one in file.items() if isinstance(one, h5py.Group)]
-            for name, variable in file.items():
+            within = file if group is None else file[group]
+            inner = [name for name, one in within.items() if isinstance(one, h5py.Group)]
+            for name, variable in within.items():
                 if isinstance(variable, h5py.Dataset):
                     axis = variable.shape if variable.ndim == 1 else None
                     for shape in (axis, variable.chunks):
@@ -155,10 +173,10 @@ def _declared(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
                     filters |= _missing_filters(variable)
     except Exception as error:
         raise _damaged(path, error) from None
-    if groups and not found:
-        command = f"ncks -G : -g {shlex.quote(groups[0])} {{0}} out.nc"
+    if inner and not found:
+        command = f"ncks -G : -g {shlex.quote(inner[0])} {{0}} out.nc"
         raise InputError(
-            f"{path}: has all variables in groups ({', '.join(groups)}); "
+            f"{path}: has all variables in groups ({', '.join(inner)}); "
             f"{_convert(command, path, 'them outside')}"
         )
     return found, list(filters.values())

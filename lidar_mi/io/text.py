@@ -6,6 +6,7 @@ import shlex
 import stat
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
@@ -90,3 +91,12 @@ def append_line(path: str | Path, line: str) -> None:
 def encoded(text: str) -> bytes:
     """Text as UTF-8; of names of files, bytes that are not UTF-8 are spelled out."""
     return text.encode("utf-8", "backslashreplace")
+
+
+def as_text(value: Any) -> str:
+    """Text of an attribute or of a variable: bytes are decoded, characters of an array joined."""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace").strip("\0 ")
+    if getattr(getattr(value, "dtype", None), "kind", "") == "S":
+        return str(value.tobytes().decode("utf-8", "replace")).replace("\0", "").strip()
+    return str(value).strip()

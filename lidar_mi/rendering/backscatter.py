@@ -264,6 +264,7 @@ def scene_dict(
             "covariance": mi.is_polarized,
             "shares": True,
             "estimator": settings.estimator,
+            "candidates": settings.candidates,
             "samples_per_pass": samples_at_once(
                 settings.given_per_pass, settings.memory, mi.variant()
             ),
@@ -278,7 +279,7 @@ def scene_dict(
             "gate_stop": plan.gate_stop,
             "gate_count": plan.gate_count,
             "beams": mi.TensorXf(_beams(plan)),
-            "to_world": mi.ScalarTransform4f().translate([plan.position, 0, 0]),
+            "to_world": mi.ScalarTransform4f().translate([plan.position, *plan.aside]),
             "laser": {
                 "type": "laser",
                 "beam_radius": lidar.beam_radius,
@@ -335,7 +336,7 @@ def _move(
     """Update the telescope, its beams and the air in the slab to a later scan."""
     import mitsuba as mi
 
-    parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
+    parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, *plan.aside])
     beams = _beams(plan)
     parameters["sensor.origins"] = mi.Float(beams[:, :3].ravel())
     parameters["sensor.directions"] = mi.Float(beams[:, 3:6].ravel())

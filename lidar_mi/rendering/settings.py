@@ -55,6 +55,13 @@ class RenderSettings(Description):
         description="forced collisions in the gates, or analog sampling, which needs a thousand "
         "times as many samples or more for the same noise",
     )
+    candidates: Annotated[int, Within(1, 1024, "more cost time and hardly lower the noise")] = (
+        Field(
+            1,
+            description="places in gate and pulse, of which the single scattering of a sample "
+            "takes one by its contribution",
+        )
+    )
     samples_per_pass: _PerPass = Field(
         1 << 22,
         description="traced at once, fewer if memory does not hold them; by default on a GPU as "

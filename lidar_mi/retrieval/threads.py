@@ -2,11 +2,12 @@
 
 A step of a retrieval takes some 0.1 ms on an image of the paper's size. The synchronisation of
 threads then takes longer than their work, the more so on a machine with other load. Parts of a
-large image that do not depend on each other are worked on by one thread each (`mapped`): threads
-that wait for nothing but the last part lose nothing on a busy machine.
+large image that do not depend on each other are worked on by one thread each (`mapped`), and so are
+small images (`in_turn`): threads that wait for nothing but the last part lose nothing on a busy
+machine.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -50,15 +51,23 @@ def _libraries() -> ThreadpoolController:
 
 def mapped(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> list[_Result]:
     """The function of every part, each computed by one of as many threads as torch was given."""
+    return list(in_turn(function, parts))
+
+
+def in_turn(
+    function: Callable[[_Part], _Result], parts: Iterable[_Part]
+) -> Generator[_Result, None, None]:
+    """What `mapped` returns, in the parts' order, each as soon as it is there."""
     parts = list(parts)
     before = torch.get_num_threads()
     number = min(len(parts), _AVAILABLE.get() or before)
     if number < 2:
-        return [function(part) for part in parts]
+        yield from map(function, parts)
+        return
     # modes are of a thread
     alike = torch.inference_mode(torch.is_inference_mode_enabled())(function)
     try:
         with ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(alike, parts))
+            yield from pool.map(alike, parts)
     finally:
         torch.set_num_threads(before)

@@ -1,7 +1,7 @@
 """Volumes repeated along a wake's axis, against the analytic wake that they were sampled from.
 
 Physics tier. Detects: a wrong turn or place of the volume, a seam, a period that is off by a plane,
-an exhaust that moves otherwise than the wake, a volume that is not periodic but repeated.
+an exhaust that moves otherwise than the wake.
 """
 
 import math
@@ -9,11 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from lidar_mi.atmosphere.wake_path import PairAlongPath
-from lidar_mi.atmosphere.wake_volume import VolumeAlongPath, one_period
-from lidar_mi.errors import InputError
+from lidar_mi.atmosphere.wake_period import one_period
+from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from tests.support.wake_volumes import SEPARATION, crow_volume
 
 PAIR = PairAlongPath(
@@ -97,27 +96,7 @@ def test_wind_outside_is_that_of_a_straight_pair(volume):
 def test_a_plane_is_uniform_along_the_wake():
     flow = crow_volume(waves=1, amplitude=0.0).isel(x=[0])
     straight = replace(PAIR, crow_amplitude=0.0)
-    wake = placed(one_period(flow), straight)
+    wake = placed(one_period(flow)[0], straight)
     place = np.array([[600.0, 400.0], [10.0, -80.0], [5.0, 8.0]])
     np.testing.assert_allclose(wake.wind(*place, 8.0), straight.wind(*place, 8.0), atol=0.02)
     assert wake.vortices(400.0, 8.0)[0].y == pytest.approx(straight.vortices(400.0, 8.0)[0].y)
-
-
-def test_a_last_plane_that_repeats_the_first_is_left_out():
-    flow = crow_volume(waves=2, amplitude=3.0)
-    step = float(flow["x"][1] - flow["x"][0])
-    closing = flow.isel(x=[0]).assign_coords(x=flow["x"].values[-1:] + step)
-    assert one_period(xr.concat([flow, closing], "x")).sizes["x"] == flow.sizes["x"]
-    assert one_period(flow).sizes["x"] == flow.sizes["x"]
-
-
-@pytest.mark.parametrize(
-    ("planes", "what"),
-    [(slice(0, 20), "step"), (slice(0, 26), "curvature"), (slice(0, 3), "3 planes")],
-)
-def test_what_is_not_periodic_is_refused(planes, what):
-    """A part of a wave; half a wave of it, which ends where it began, with a bend; too few."""
-    # u changes its sign from half a wave to the next, a step
-    flow = crow_volume(waves=1, amplitude=3.0).drop_vars("u")
-    with pytest.raises(InputError, match=rf"wake\.depth: volume is not allowed.*{what}"):
-        one_period(flow.isel(x=planes))

@@ -6,12 +6,14 @@ place or sign of a vector.
 How fast anything is, is not tested: that depends on the machine.
 """
 
+import inspect
 import io
 import json
 import math
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +31,8 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import __main__ as command
 from benchmarks import (
+    batch,
+    candidates,
     cases,
     estimators,
     fringes,
@@ -36,6 +40,7 @@ from benchmarks import (
     growth,
     measure,
     methods,
+    page,
     rendered,
     renderer,
     report,
@@ -161,6 +166,48 @@ def test_command_continues_after_a_failure_and_reports_it(monkeypatch, tmp_path,
     assert command.main(["velocimetry", "-o", str(out)]) == 0
 
 
+def test_all_comparisons_make_the_page_and_those_named_do_not(monkeypatch, tmp_path):
+    """Ratios, absent peers, device and versions below the mark; what is above it stays."""
+    made = (report.row("a | b", "time", "s", [2.0, 2.0], [3.0, 5.0], "lower", "remark"),)
+    found = {
+        "growth": report.Comparison("Growth", "we", "they", made, ("A note.",)),
+        "gpu": report.Comparison("GPU", "we", "they", reason="skipped: none"),
+    }
+
+    def compare(name):
+        return SimpleNamespace(compare=lambda repeats, **_: found[name.split(".")[1]])
+
+    written = tmp_path / "performance.md"
+    written.write_text(f"# By hand\n\n{page.MARK}\nold\n")
+    monkeypatch.setattr(page, "PAGE", written)
+    monkeypatch.setattr(page, "QUICK", {name: page.QUICK[name] for name in found})
+    monkeypatch.setattr(command, "import_module", compare)
+    monkeypatch.setattr(command, "fresh_process", lambda: ThreadPoolExecutor(1))
+    out = ["-o", str(tmp_path / "benchmarks.json")]
+    assert command.main(["growth", "--quick", *out]) == 0
+    assert written.read_text().endswith("old\n")
+    assert command.main(["--quick", *out]) == 0
+    text = written.read_text()
+    assert text.startswith(f"# By hand\n\n{page.MARK}\n") and "old" not in text
+    assert "| a / b | time, s | 2 | 4 | 2 | 1.5 to 2.5 | remark |" in text
+    for part in ("### Growth", "A note.", "Skipped: none.", "make bench ARGS=--quick", "torch 2"):
+        assert part in text, part
+    assert f"{os.cpu_count()} cores" in text and "- GPU: " in text
+
+
+def test_every_comparison_of_a_quick_page_takes_its_arguments():
+    for name, options in page.QUICK.items():
+        inspect.signature(import_module(f"benchmarks.{name}").compare).bind(2, **options)
+    assert set(page.QUICK) <= set(command.COMPARISONS)
+
+
+@pytest.mark.slow
+def test_pairs_at_once_have_the_same_winds():
+    found = batch.compare(1, 48, 40, 2)
+    assert [line.case for line in found.rows] == list(batch.METHODS)
+    assert all(line.ratio > 0 and "at most 0e+00 m/s" in line.note for line in found.rows)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"), [(["speed"], "'speed' is none of"), (["-n", "0"], "--repeats: 0")]
 )
@@ -218,6 +265,13 @@ def test_fraction_of_contributing_analog_samples_is_the_optical_depth_of_the_gat
     ]
     assert parts[2].other == pytest.approx(parts[0].other * parts[1].other, rel=0.5)
     assert len({name for name, _ in found}) == 4
+
+
+def test_candidates_lower_the_variance(variant):
+    found = lines(candidates.compare(2, 64, 15, 9))
+    for order in (1, 4):
+        case = f"orders up to {order}, 64 samples per beam"
+        assert found[case, "relative variance of a pixel"].ratio > 1.5
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def in_order(page):
 
 DOCS = ROOT / "docs"
 EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experiments").glob("*.md"))
-ACCURACY_PAGES = ("accuracy", "accuracy_doppler", "computing_time", "settings", "standard_errors")
+ACCURACY_PAGES = ("accuracy", "accuracy_doppler", "performance", "settings", "standard_errors")
 GUIDE = tuple(
     f"docs/guide/{name}.md"
     for name in ("index", *in_order((DOCS / "guide" / "index.md").read_text()))
@@ -188,9 +188,12 @@ def _unit(field):
             (units.AngularAcceleration, "rad/s²"),
             (units.Speed, "m/s"),
             (units.Time, "s"),
+            (units.Mass, "kg"),
             (units.Energy, "J"),
             (units.Extinction, "1/m"),
             (units.Circulation, "m²/s"),
+            (units.DissipationRate, "m²/s³"),
+            (units.Mass, "kg"),
             (units.Frequency, "Hz"),
             (units.Shear, "1/s"),
             (units.SpectralRadiance, "W/m³/sr"),

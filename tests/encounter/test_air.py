@@ -269,6 +269,9 @@ def test_warnings_name_the_air():
     seeing = in_air(wake=False, turbulence={}, control={"mode": "feedforward"})
     assert any(text.startswith("encounter.air.wake: false leaves") for text in geometry(seeing))
     assert not any("misses the wake" in text for text in geometry(calm) + geometry(seeing))
+    # a gust lifts an aircraft that rises
+    lifting = in_air(wake=False, gusts=[{}], aircraft={"model": "heave"})
+    assert not any("rolling moment" in text for text in geometry(lifting))
 
 
 @pytest.mark.parametrize(

@@ -139,3 +139,22 @@ def test_an_upset_is_a_result():
     assert found["encounter.perfect.departed"] == 1 == found["encounter.perfect.hazardous"]
     assert perfect["departed"][-1] == 1 and np.isfinite(perfect["roll"]).all()
     assert perfect.sizes["time"] == flights.series.sizes["time"]
+
+
+def test_an_aircraft_that_rises_in_a_gust():
+    """With the true wind its load factor changes by half as much; rolling is as without a gust."""
+    gust = {"gradient": "50 m", "start": "150 m", "speed": "8 m/s"}
+    path = {"start": "200 m", "beyond": "125 m", "climb_angle": 0}
+    keys = encounter_keys(
+        control={"mode": "perfect"},
+        aircraft={"model": "heave"},
+        air={"wake": False, "gusts": [gust]},
+        path=path,
+    )
+    series = simulate_flights(check(keys, "test"), silent).series
+    found = encounter_metrics(series, None)
+    off, ours = (found[f"encounter.{mode}.largest_load_increment"] for mode in ("off", "perfect"))
+    assert off > 0.25 and ours < 0.5 * off
+    assert np.abs(series["roll"]).max() < 1e-9
+    assert series["elevator_deflection"].sel(flight="perfect").max() > 0.05
+    assert found["encounter.off.largest_bending_increment"] > 1e5

@@ -72,7 +72,7 @@ def test_folder_holds_the_flight(tmp_path):
 
 def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     monkeypatch.setattr("lidar_mi.encounter.report.draw_all", lambda *_: [])
-    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.MOST_FRAMES", 2)
+    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 2)
     one = experiment()
     flight = lm.fly(one, tmp_path, lidar=SyntheticLidar(wake_along_path(one)), notice=silent)
     assert (tmp_path / "summary.txt").read_text().split("\n")[:-1] == flight.answer

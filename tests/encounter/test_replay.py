@@ -30,7 +30,7 @@ def flown(tmp_path_factory):
     """A flight whose lidar is blind at the fifth scan, and its folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lidar_mi.encounter.report.draw_all", lambda *_: [])
-        patch.setattr("lidar_mi.assessment.figures.encounter_film.MOST_FRAMES", 2)
+        patch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 2)
         folder = tmp_path_factory.mktemp("flight") / "flown"
         lidar = SyntheticLidar(wake_along_path(experiment()), latency=0.12, blind=lambda n: n == 5)
         return lm.fly(experiment(), folder, lidar=lidar, notice=silent), folder

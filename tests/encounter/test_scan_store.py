@@ -51,6 +51,7 @@ def test_scans_of_others_do_not_count(tmp_path, scan):
     store.write(3, POSE, scan)
     for axis in ("x", "y", "z", "roll", "pitch", "yaw"):
         assert store.read(3, replace(POSE, **{axis: getattr(POSE, axis) + 1e-4})) is None
+    assert store.read(3, POSE, (0.0, 1e-4)) is None
     assert store.read(2, POSE) is None
     assert ScanStore(tmp_path, "another").read(3, POSE) is None
     (tmp_path / "scan_0003.nc").write_bytes(b"\x89HDF\r\n\x1a\n damaged")
@@ -63,11 +64,11 @@ def test_a_flight_that_was_stopped_goes_on(tmp_path, monkeypatch):
     experiment = small_encounter(path={"start": "170 m", "beyond": "10 m"})
     made, render = [], VirtualLidar._scanned
 
-    def stopped(lidar, number, pose):
+    def stopped(lidar, number, *where):
         if number == stop:
             raise KeyboardInterrupt
         made.append(number)
-        return render(lidar, number, pose)
+        return render(lidar, number, *where)
 
     monkeypatch.setattr(VirtualLidar, "_scanned", stopped)
     stop = 3

@@ -25,12 +25,15 @@ def wake():
 
 def recorded(roll):
     """Two instants: the second with a prediction."""
-    record, moments = FlightRecorder(), np.diag([2.0, 3.0, 5.0])
+    record = FlightRecorder()
     loads = Loads(np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]))
     for k, predicted in enumerate((None, Loads(10 * loads.force, 10 * loads.moment))):
-        state = AircraftState(time=0.1 * k, x=7.5 * k, roll=roll, pitch_rate=0.3)
-        deflection = np.array([0.5, 0.0, 0.0])
-        record.add(state, loads, predicted, Commands(0.1, 0.2, 0.3), deflection, moments)
+        state = AircraftState(
+            time=0.1 * k, x=7.5 * k, roll=roll, pitch_rate=0.3, load_factor=1.5, port_bending=7.0
+        )
+        deflection = np.array([0.5, 0.6, 0.0])
+        commands = Commands(0.1, 0.2, 0.3, 0.4)
+        record.add(state, loads, predicted, commands, deflection, np.diag([2.0, 3, 5]), 0.7)
     return record.dataset()
 
 
@@ -49,7 +52,13 @@ def test_every_number_is_under_its_name():
         "predicted_force_y": [np.nan, 20],
         "aileron": 0.1,
         "rudder": 0.3,
+        "symmetric_aileron": 0.4,
         "aileron_deflection": 0.5,
+        "elevator_deflection": 0.6,
+        "symmetric_aileron_deflection": 0.7,
+        "load_factor": 1.5,
+        "port_bending": 7.0,
+        "starboard_bending": np.nan,
         "control_roll_moment": 1.0,
     }
     for name, values in expected.items():

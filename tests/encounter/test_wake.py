@@ -14,7 +14,7 @@ from lidar_mi.atmosphere.wake_path import PairAlongPath
 from lidar_mi.encounter.aircraft import loads_in_wind
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import aircraft_of
-from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
+from lidar_mi.encounter.wake import described_wake, encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
 from tests.support.encounters import small_encounter
 from tests.support.wake_volumes import SEPARATION, crow_volume
@@ -50,8 +50,9 @@ def test_decay_and_deformation_reach_the_wake():
     assert wake.crow_amplitude == 2 and wake.crow_wavelength == 200
 
 
-def from_file(file, path=None, **wake):
+def from_file(file, path=None, ends=None, **wake):
     """The small encounter in the wake of a file."""
+    encounter = {"path": {"start": "190 m", "crossing_angle": "0 deg", "climb_angle": "0 deg"}}
     return small_encounter(
         wake={
             "vortex_pair": None,
@@ -61,7 +62,7 @@ def from_file(file, path=None, **wake):
             "texture": {"rms": 0},
         }
         | wake,
-        path=path,
+        encounter={"path": encounter["path"] | (path or {}), "wake": ends or {}},
     )
 
 
@@ -132,12 +133,35 @@ def test_what_is_not_known_along_the_axis_is_refused(crow_file, tmp_path):
     part = tmp_path / "part.nc"
     crow_volume(waves=1, amplitude=3.0).isel(x=slice(0, 20)).to_netcdf(part)
     with pytest.raises(InputError, match="not periodic along x"):
-        wake_along_path(from_file(part))
+        wake_along_path(from_file(part, ends={"ends": "refuse"}))
     calm = tmp_path / "calm.nc"
     flow = crow_volume(waves=1, amplitude=0.0).isel(x=slice(0, 8))
     flow.assign({n: flow[n].copy(data=0.01 * flow[n].values) for n in "uvw"}).to_netcdf(calm)
     with pytest.raises(InputError, match="has 0 vortices in the plane"):
         wake_along_path(from_file(calm))
+
+
+def test_a_part_of_a_wave_is_closed_and_described(tmp_path):
+    """The vortices of both vortices' planes are the file's, then those of its mirror image."""
+    part = tmp_path / "part.nc"
+    crow_volume(waves=1, amplitude=3.0).isel(x=slice(0, 20)).to_netcdf(part)
+    step = 8.6 * SEPARATION / 52
+    mirrored = from_file(part, x=f"{9.5 * step} m")
+    wake = wake_along_path(mirrored)
+    assert wake.period == pytest.approx(38 * step)
+    pair = PairAlongPath(300.0, SEPARATION, crow_amplitude=3.0)
+    for plane, image in ((4, 34), (15, 23)):
+        truth = pair.vortices(plane * step, 0.0)[0]
+        for place in (plane, image):
+            x = 190.0 + (place - 9.5) * step
+            found, _ = wake.vortices(x, 190 / 75)
+            assert found.y == pytest.approx(truth.y, abs=0.15)
+    rows = dict(described_wake(mirrored))
+    assert rows["wake along its axis"].startswith("mirror: a period of 150.8 m")
+    assert "circulation as in the file" in rows["ends of the volume"]
+    blended = dict(described_wake(from_file(part, ends={"ends": "blend", "ends_length": "12 m"})))
+    assert blended["wake along its axis"].startswith("blend: a period of 67.48 m")
+    assert "% off that elsewhere" in blended["ends of the volume"]
 
 
 def test_decay_of_a_file_is_refused(crow_file):

@@ -547,12 +547,12 @@ def test_nothing_is_freed_while_kernels_are_recorded(world, monkeypatch):
     )
     render = type(scene.integrator()).render
     lidar = render.__globals__["Lidar"]
-    forced, collecting = lidar.forced, []
+    single, collecting = lidar.single, []
 
     def watched(*arguments):
         collecting.append(gc.isenabled())
-        return forced(*arguments)
+        return single(*arguments)
 
-    monkeypatch.setattr(lidar, "forced", watched)
+    monkeypatch.setattr(lidar, "single", watched)
     mi.render(scene, spp=4)
     assert collecting == [False] and gc.isenabled()

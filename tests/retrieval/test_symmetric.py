@@ -1,4 +1,4 @@
-"""Largest eigenvalues of small matrices. Unit tier.
+"""Eigenvalues of small matrices. Unit tier.
 
 Detects a closed form that loses digits where both eigenvalues are alike, far apart or very large or
 small, and a batch that a solver refuses.
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lidar_mi.retrieval import symmetric
-from lidar_mi.retrieval.symmetric import largest_eigenvalue
+from lidar_mi.retrieval.symmetric import eigenvalues, largest_eigenvalue
 
 EPS = 2.0**-52
 
@@ -67,3 +67,10 @@ def test_solvers_get_no_more_than_they_take(monkeypatch):
         largest_eigenvalue(given[:, :2, :2])[:5], largest_eigenvalue(given[:5, :2, :2])
     )
     assert sum(sizes) == 70_000
+
+
+def test_both_of_two_by_two_are_those_of_lapack():
+    given = matrices(20_000, 2, 3)
+    expected = torch.linalg.eigvalsh(given)
+    found = torch.stack(eigenvalues(given[:, 0, 0], given[:, 1, 0], given[:, 1, 1]), 1)
+    assert ((found - expected).abs() <= 4 * EPS * given.abs().amax((1, 2))[:, None]).all()

@@ -8,6 +8,7 @@ from tests.support import accepted
 from tests.support import hostile_calls as calls
 from tests.support import hostile_experiments as experiments
 from tests.support import hostile_files as files
+from tests.support import hostile_lines as lines
 
 KINDS: dict[str, Callable[[], SearchStrategy]] = {
     "experiment": experiments.experiments,
@@ -16,6 +17,7 @@ KINDS: dict[str, Callable[[], SearchStrategy]] = {
     "exr": files.exr_cases,
     "image": files.image_cases,
     "netcdf": files.wake_cases,
+    "lines": lines.line_cases,
     "xml": files.scene_cases,
     "text": files.text_cases,
     "folder": files.folder_cases,

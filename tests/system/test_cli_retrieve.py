@@ -173,6 +173,7 @@ def test_shells_complete_commands_and_experiments(here, monkeypatch):
         "encounter",
         "encounter_sensor",
         "gust",
+        "real_wakes",
         "wake_mine.yaml",
         "sub/",
     ]

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from lidar_mi.assessment.described import Progress
+from lidar_mi.assessment.figures.encounter_loads import load_factor
 from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
@@ -79,6 +80,8 @@ def draw_all(
     plates.append(("fig35_commands", "The ailerons", _commands(series)))
     if series.attrs.get(MET) == "air":
         plates.append(("fig36_loads", "Loads by the wind", _loads(series)))
+    if np.isfinite(series["load_factor"]).any():
+        plates.append(("fig37_load_factor", "Load factor and bending", load_factor(series, _lines)))
     return save_all(folder, plates, log)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.encounter_hazard import is_hazardous, roll_control_ratio
+from lidar_mi.assessment.metrics.load_increments import INCREMENTS, load_increments
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
 from lidar_mi.assessment.metrics.wind_ahead import wind_ahead_metrics
 
@@ -68,9 +69,10 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
         found[f"{key}.largest_lift"] = _largest(one["force_z"])
         found[f"{key}.residual_moment"] = residual_moment(one)
         found[f"{key}.roll_control_ratio"] = roll_control_ratio(one["roll_moment"].values, largest)
+        found |= {f"{key}.{name}": value for name, value in load_increments(one).items()}
         found[f"{key}.departed"] = float(one["departed"].max())
         found[f"{key}.hazardous"] = float(is_hazardous(roll) or one["departed"].max() > 0)
-    for quantity in ("largest_roll", "largest_roll_rate"):
+    for quantity in ("largest_roll", "largest_roll_rate", *INCREMENTS):
         found |= _removed(found, quantity)
     if track is not None:
         more = _tracking(series, track) | wind_ahead_metrics(track)

@@ -8,6 +8,7 @@ from lidar_mi.assessment.digits import fixed, percent, three
 from lidar_mi.assessment.metrics.encounter import AFTER, MODES, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK, ACCEPTED_RATIO
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, fulfilled
+from lidar_mi.assessment.report.encounter_loads import loads_answer
 from lidar_mi.tables import Table
 
 if TYPE_CHECKING:
@@ -24,6 +25,8 @@ _OF_A_FLIGHT = (
     ("residual_moment", "rolling moment felt over the {met}'s (rms)", "", 1.0),
     ("roll_control_ratio", "largest moment of the {met} over the controls'", "", 1.0),
     ("largest_lift", "largest vertical force by the {met}'s wind", "kN", 1e-3),
+    ("largest_load_increment", "largest change of the load factor", "", 1.0),
+    ("largest_bending_increment", "largest change of a wing root's bending", "kN m", 1e-3),
 )
 _OF_THE_LIDAR = (
     ("lead_time", "from the first usable track to the wake", "s", 1.0),
@@ -157,7 +160,8 @@ def encounter_answer(
     if largest < _NO_ROLL:
         return [
             f"No flight rolls by more than {three(math.degrees(_NO_ROLL))} degrees: the {met} is "
-            "missed, or both wings meet the same wind, as in a wake across the path."
+            "missed, or both wings meet the same wind, as in a wake across the path.",
+            *loads_answer(metrics),
         ]
     answer = f"Without control, the {met} rolls the aircraft by {_degrees(off)}"
     if _lost(metrics, "off"):
@@ -191,7 +195,7 @@ def encounter_answer(
     # the rating is of wakes
     rated = f"; pilots rate encounters of up to {ACCEPTED_RATIO:g} times as uncritical"
     answer += rated + "." if met == "wake" else "."
-    lead = [answer]
+    lead = [answer, *loads_answer(metrics)]
     if "encounter.lead_time" in metrics:
         lead.append(
             f"The track is usable after "

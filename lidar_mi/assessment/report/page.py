@@ -32,21 +32,27 @@ class Tables(NamedTuple):
 
 
 class Film(NamedTuple):
-    """Frames with a slider.
+    """A video, or frames with a slider.
 
     Attributes
     ----------
     title, caption : str
     frames : sequence of (bytes, str)
-        WebP images and what each shows.
+        WebP images and what each shows; of a video, the one shown before it plays.
     seconds : float
         For which each is shown.
+    video : bytes, optional
+        MP4.
+    animation : str
+        Name of a file beside the report, for browsers that do not play the video.
     """
 
     title: str
     caption: str
     frames: Sequence[tuple[bytes, str]]
     seconds: float
+    video: bytes | None = None
+    animation: str = ""
 
 
 class Picture(NamedTuple):
@@ -163,6 +169,8 @@ def _packed(film: Film) -> dict[str, Any]:
         "first": f"data:image/webp;base64,{frames[middle]['data']}",
         "now": frames[middle]["caption"],
         "milliseconds": round(1000 * film.seconds),
+        "video": base64.b64encode(film.video).decode() if film.video else "",
+        "animation": film.animation,
     }
 
 

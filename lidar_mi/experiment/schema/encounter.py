@@ -6,11 +6,13 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from lidar_mi.experiment.schema.air import Air
+from lidar_mi.experiment.schema.heave import HeaveKeys
 from lidar_mi.experiment.schema.section import Section
 from lidar_mi.units import (
     Angle,
     AngularRate,
     Area,
+    DissipationRate,
     Frequency,
     Inertia,
     Length,
@@ -69,23 +71,51 @@ class Path(Section):
 
 
 class Crow(Section):
-    """Sinusoidal deformation of both vortices, in planes inclined by 45 degrees (Crow 1970)."""
+    """Sinusoidal deformation of both vortices (Crow 1970)."""
 
+    model: Literal["tangents", "filaments"] = Field(
+        "tangents",
+        description="tangents: the flow of straight lines that touch the bent ones, which do not "
+        "grow; filaments: Biot-Savart's law, growth with the wake's age, rings once linked",
+    )
     amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = Field(
-        0.0, description="of the deformation"
+        0.0, description="of the deformation; of filaments that at age 0"
     )
     wavelength: Annotated[Length, Within(1, 100000, "8.6 separations")] | None = Field(
         None, description="default: 8.6 separations"
+    )
+    phase: Annotated[Angle, Within(-6.2832, 6.2832, "one wave")] = Field(
+        0.0, description="of the sine at the wake's centre, along its axis"
     )
 
 
 class WakeInTime(Section):
     """How the wake changes in time and along its axis, in addition to its drift."""
 
+    age: Annotated[Time, Within(0, 1e5, "a wake's life")] = Field(
+        0.0, description="of the wake at the start of the flight"
+    )
     decay_time: Annotated[Time, Within(1, 1e9, "a wake's life")] | None = Field(
         None, description="in which circulation falls to 1/e; default: it stays"
     )
+    dissipation_rate: (
+        Annotated[DissipationRate, Within(0, 1, "from calm air to a thunderstorm")] | None
+    ) = Field(None, description="of turbulence, in which circulation decays (Sarpkaya 2000)")
     crow: Crow = Crow()
+    ends: Literal["mirror", "blend", "refuse"] = Field(
+        "mirror",
+        description="of a simulated volume that is not periodic: mirrored at its ends, its ends "
+        "blended into each other, or refused",
+    )
+    ends_length: Annotated[Length, Within(0.1, 10000, "part of a volume")] = Field(
+        5.0, description="over which ends are blended, or u falls to 0 at a mirror"
+    )
+
+    @model_validator(mode="after")
+    def _one_decay(self) -> "WakeInTime":
+        if self.decay_time is not None and self.dissipation_rate is not None:
+            raise ValueError("expected one of decay_time and dissipation_rate")
+        return self
 
 
 class Aircraft(Section):
@@ -98,7 +128,8 @@ class Aircraft(Section):
     """
 
     model: str = Field(
-        "roll", description="roll: rigid, rolls only; else an aircraft of JSBSim, such as 737"
+        "roll",
+        description="roll: rolls only; heave: rises and pitches, too; else of JSBSim, such as 737",
     )
     span: Annotated[Length, Within(1, 200, "aircraft")] = Field(28.9, description="of the wing")
     wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = Field(
@@ -119,6 +150,7 @@ class Aircraft(Section):
     aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
         0.1, description="rolling moment coefficient per rad of deflection"
     )
+    heave: HeaveKeys = HeaveKeys()
 
     @field_validator("model", mode="before")
     @classmethod
@@ -150,6 +182,17 @@ class Control(Section):
         return "off" if value is False else value
 
 
+class Window(Section):
+    """Where the scan of the backscatter lidar looks."""
+
+    follow: bool = Field(
+        False, description="its middle follows the pair; else it is straight ahead"
+    )
+    reach: Annotated[Angle, Within(0, 0.8, "a scanner")] = Field(
+        quantity("20 deg"), description="of its middle from straight ahead"
+    )
+
+
 class Encounter(Section):
     """A flight through the wake of the experiment."""
 
@@ -163,4 +206,5 @@ class Encounter(Section):
     look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
         150.0, description="range of the farther gate's start"
     )
+    window: Window = Window()
     control: Control = Control()

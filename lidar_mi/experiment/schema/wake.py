@@ -4,11 +4,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from lidar_mi.atmosphere.aircraft_wake import TYPES, aircraft_type, wake_of
 from lidar_mi.experiment.schema.section import Section
 from lidar_mi.units import (
     Circulation,
     Extinction,
     Length,
+    Mass,
     Number,
     Speed,
     Time,
@@ -25,10 +27,24 @@ _Moment = Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")
 
 
 class VortexPair(Section):
-    """An analytic vortex pair in place of a simulation."""
+    """An analytic vortex pair in place of a simulation; that of an aircraft from its lift."""
 
     model: Literal["lamb_oseen", "burnham_hallock"] = Field(
         "lamb_oseen", description="swirl profile"
+    )
+    aircraft: str | None = Field(
+        None,
+        description="ICAO type that left the pair, such as A343: circulation, separation and core "
+        "radius follow where they are not given",
+    )
+    mass: Annotated[Mass, Within(1, 2e6, "aircraft")] | None = Field(
+        None, description="of that aircraft; default: its largest at landing"
+    )
+    speed: Annotated[Speed, Within(10, 350, "from a glider to the speed of sound")] = Field(
+        75.0, description="true airspeed of that aircraft"
+    )
+    altitude: Annotated[Length, Within(0, 20000, "aircraft")] = Field(
+        300.0, description="of that aircraft above sea level, for the density of the air"
     )
     circulation: Annotated[
         Circulation, Within(1e-6, 10000, "the largest aircraft have 1000 m^2/s")
@@ -41,6 +57,33 @@ class VortexPair(Section):
     ] = Field(3.0, description="radius of the largest tangential speed")
     width: _Extent = Field(109.0, description="extent of the domain in y")
     height: _Extent = Field(69.0, description="extent of the domain in z")
+
+    @field_validator("aircraft")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        if value is not None and value not in TYPES:
+            raise ValueError(f"{value!r} is not allowed; expected one of {', '.join(TYPES)}")
+        return value
+
+    @model_validator(mode="after")
+    def _of_the_aircraft(self) -> Self:
+        if self.aircraft is None:
+            for name in ("mass", "speed", "altitude"):
+                # a description that was saved has all defaults
+                if getattr(self, name) != type(self).model_fields[name].default:
+                    raise ValueError(f"{name}: not allowed without aircraft")
+            return self
+        # loaded only where it is needed
+        from ambiance import Atmosphere
+
+        kind = aircraft_type(self.aircraft)
+        mass = kind.landing_mass if self.mass is None else self.mass
+        density = float(Atmosphere(self.altitude).density[0])
+        for name, value in wake_of(kind.span, mass, self.speed, density)._asdict().items():
+            if name not in self.model_fields_set:
+                # the section is frozen from here on
+                object.__setattr__(self, name, value)
+        return self
 
 
 class Turbine(Section):

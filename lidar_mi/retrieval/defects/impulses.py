@@ -1,6 +1,7 @@
 """Pixels that stand out of all around them, as no image of air does that a beam or a lens blurs."""
 
 from collections.abc import Callable
+from functools import reduce
 
 import numpy as np
 import torch
@@ -42,10 +43,37 @@ def threshold(number: int) -> float:
 
 def height(image: torch.Tensor) -> torch.Tensor:
     """Pixels less the median of their known neighbours; NaN where unknown, or all of these are."""
-    ranked = _neighbours(image).sort(dim=0).values  # NaN last
+    near = _neighbours(image)
+    if not bool(near.isnan().any()):
+        return image - _median_of_eight(near)
+    ranked = near.sort(dim=0).values  # NaN last
     number = (~ranked.isnan()).sum(0, keepdim=True)
     middle = torch.cat([(number - 1).clamp(min=0) // 2, (number // 2).clamp(max=7)])
     return image - ranked.gather(0, middle).mean(0)
+
+
+def _median_of_eight(values: torch.Tensor) -> torch.Tensor:
+    """Mean of the middle two of (8, ...) numbers, by exchanges of pairs: a third of a sort's time.
+
+    The merge of Batcher (1968, AFIPS Spring Joint Computer Conference 32, 307-314) of two sorted
+    fours ends with the larger of the lower half and the smaller of the upper one.
+    """
+    four, other = (_sorted_four(*values[k : k + 4]) for k in (0, 4))
+    # of sorted a and b the four smallest of all are the smaller ones of a[i] and b[3 - i]
+    pairs = list(zip(four, reversed(other), strict=True))
+    low = reduce(torch.maximum, (torch.minimum(*pair) for pair in pairs))
+    high = reduce(torch.minimum, (torch.maximum(*pair) for pair in pairs))
+    return torch.stack([low, high]).mean(0)
+
+
+def _sorted_four(
+    a: torch.Tensor, b: torch.Tensor, c: torch.Tensor, d: torch.Tensor
+) -> tuple[torch.Tensor, ...]:
+    a, b = torch.minimum(a, b), torch.maximum(a, b)
+    c, d = torch.minimum(c, d), torch.maximum(c, d)
+    a, c = torch.minimum(a, c), torch.maximum(a, c)
+    b, d = torch.minimum(b, d), torch.maximum(b, d)
+    return a, torch.minimum(b, c), torch.maximum(b, c), d
 
 
 def unresolved(image: torch.Tensor, over: torch.Tensor) -> torch.Tensor:

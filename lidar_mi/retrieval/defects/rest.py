@@ -269,9 +269,16 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         change = (values[1] - values[0]).nan_to_num(0.0).abs()
         return _Field(values, change if same is None else change.minimum(same), size, marked)
 
+    last: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def heights_of(found: torch.Tensor) -> torch.Tensor:
+        if not (last and torch.equal(last[0][0], found)):
+            heights = torch.stack([impulses.height(image) for image in known(found)])
+            last[:] = [(found, heights)]
+        return last[0][1]
+
     def pixels(found: torch.Tensor) -> _Field:
-        images = known(found)
-        heights = torch.stack([impulses.height(image) for image in images])
+        images, heights = known(found), heights_of(found)
         soft = [~impulses.unresolved(i, h) for i, h in zip(images, heights, strict=True)]
         field = of(heights, 1, lambda new: new, same)
         change = field.change.masked_fill(torch.stack(soft).any(0), torch.inf)
@@ -281,7 +288,7 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
     for axis in (-1, -2):
 
         def lines(found: torch.Tensor, axis: int = axis) -> _Field:
-            means = _along(pixels(found).pair, axis)
+            means = _along(heights_of(found), axis)
             return of(means, 3, lambda new: _along(new.double(), axis) > 0)
 
         yield lines
@@ -323,7 +330,8 @@ def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
     for of in _fields(pair):
         field = of(found)
-        alike = _beyond_chance(_alike(field, _least(field)), field, _least(field))
+        least = _least(field)
+        alike = _beyond_chance(_alike(field, least), field, least)
         found = found | field.marked(alike)
     return _closed(found, _GAP)
 

@@ -44,26 +44,47 @@ def form(
     return found
 
 
-def spread(
-    band: torch.Tensor,
-    mesh: Mesh,
-    first: tuple[int, ...] = (0, 0),
-    second: tuple[int, ...] = (0, 0),
-    cells: slice | None = None,
-) -> torch.Tensor:
-    """Covariance (..., *mesh.shape) of two derivatives of components, from `Band.covariance`.
+def spread(band: torch.Tensor, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
+    """Covariance (2, 2, *mesh.shape) of the components, as a factor gives it.
 
     Of a band of the knots of some cells along z (see `form`) at the nodes in these cells.
     """
+    middle = along_z(band, mesh, 0, 0, cells)
+    own = along_y(middle[..., :1, :], mesh, 0, 0)
+    ahead = along_y(middle[..., 1:, :], mesh, 0, 0, first_shift=1)
+    # shifts back along y are those ahead with the components exchanged
+    return own + ahead + ahead.transpose(0, 1)
+
+
+def along_z(
+    band: torch.Tensor, mesh: Mesh, first: int, second: int, cells: slice | None = None
+) -> torch.Tensor:
+    """A covariance (..., shift z, knot z, shift y, knot y) at nodes z: (..., z, shift y, knot y).
+
+    Of derivatives of these orders in z; of some cells along z as `form`.
+    """
     cells = cells or slice(0, mesh.axes[0].cells)
-    rows, places = mesh.within(0, cells)
-    along_z = mesh.products(0, first[0], second[0])[:, rows, places].flatten(0, 1)
-    along_y = mesh.products(1, first[1], second[1])
-    middle = along_z.T @ band.flatten(-4, -3).flatten(-2, -1)
-    middle = middle.unflatten(-1, band.shape[-2:])
-    found = middle.new_zeros(*middle.shape[:-2], along_y.shape[-1])
+    _, places = mesh.within(0, cells)
+    products, sizes = mesh.products(0, first, second), band.shape[-2:]
+    found = band.new_empty(*band.shape[:-4], places.stop - places.start, *sizes)
+    for knots, nodes in mesh.groups(0, cells):
+        here = slice(knots.start - cells.start, knots.stop - cells.start)
+        there = slice(nodes.start - places.start, nodes.stop - places.start)
+        part = products[:, knots, nodes].flatten(0, 1).T
+        of_group = part @ band[..., here, :, :].flatten(-4, -3).flatten(-2)
+        found[..., there, :, :] = of_group.unflatten(-1, sizes)
+    return found
+
+
+def along_y(
+    middle: torch.Tensor, mesh: Mesh, first: int, second: int, first_shift: int = 0
+) -> torch.Tensor:
+    """The sum over shifts along y, from this one on, of what `along_z` gives: (..., z, y)."""
+    shifts = slice(REACH + first_shift, REACH + first_shift + middle.shape[-2])
+    products = mesh.products(1, first, second)[shifts]
+    found = middle.new_empty(*middle.shape[:-2], products.shape[-1])
     for knots, nodes in mesh.groups(1):
-        part = along_y[:, knots, nodes].flatten(0, 1)
+        part = products[:, knots, nodes].flatten(0, 1)
         found[..., nodes] = middle[..., knots].flatten(-2) @ part
     return found
 
@@ -87,6 +108,10 @@ class Band:
 
     def factor(self, form: torch.Tensor) -> Factor:
         """Factor of the matrices of quadratic forms, bands of shape (..., 2, 2, 7, Z, 4, Y)."""
+        return factor(self.columns_of(form))
+
+    def columns_of(self, form: torch.Tensor) -> torch.Tensor:
+        """The blocks A[k + j, k] of forms (..., 2, 2, 7, Z, 4, Y): (knots y, ..., 4 n, n)."""
         knots, batch = self.rows, form.shape[:-6]
         # (knot y, ..., shift y, component, knot z there, component, knot z here)
         columns = form.new_zeros(self.columns, *batch, REACH + 1, 2, knots, 2, knots)
@@ -96,48 +121,39 @@ class Band:
             rows = slice(max(0, -shift), knots - max(0, shift))
             columns.diagonal(-shift, -3, -1).copy_(form[..., REACH + shift, rows])
         # (.., shift y, component there, knot z there, component here, knot z here)
-        return factor(columns.flatten(-2).flatten(-4, -2))
+        return columns.flatten(-2).flatten(-4, -2)
 
     def solve(self, root: Factor, right: torch.Tensor) -> torch.Tensor:
-        """Coefficients that solve the systems, from the right hand sides (..., 2, Z, Y)."""
-        found = root.solve(right.movedim(-1, 0).flatten(-2))
-        return found.unflatten(-1, (2, self.rows)).movedim(0, -1)
+        """Coefficients that solve the systems, of some right hand sides (n, ..., 2, Z, Y) each."""
+        found = root.solve(right.movedim((0, -1), (-1, 0)).flatten(-3, -2))
+        return found.unflatten(-2, (2, self.rows)).movedim((0, -1), (-1, 0))
 
-    def covariance(self, root: Factor) -> torch.Tensor:
-        """The inverse within the band, all shifts: (..., 2, 2, 7, Z, 7, Y)."""
-        knots = self.rows
-        columns = root.inverse()
-        batch = columns.shape[1:-2]
+    def form_of(self, columns: torch.Tensor) -> torch.Tensor:
+        """The transpose of `columns_of`: a form from its blocks."""
+        knots, batch = self.rows, columns.shape[1:-2]
         columns = columns.unflatten(-1, (2, knots)).unflatten(-3, (REACH + 1, 2, knots))
-        shifts = 2 * REACH + 1
-        band = columns.new_zeros(*batch, 2, 2, shifts, knots, shifts, self.columns)
+        band = columns.new_zeros(*batch, 2, 2, 2 * REACH + 1, knots, REACH + 1, self.columns)
         for shift in range(-REACH, REACH + 1):
             rows = slice(max(0, -shift), knots - max(0, shift))
             # (knot y, ..., shift y, component there, component here, knot z)
             part = columns.diagonal(-shift, -3, -1).movedim(0, -1).movedim(-5, -2)
             for ahead in range(REACH + 1):
                 here = part[..., ahead, : self.columns - ahead].transpose(-4, -3)
-                band[..., REACH + shift, rows, REACH + ahead, : self.columns - ahead] = here
-        for ahead in range(1, REACH + 1):
-            for shift in range(-REACH, REACH + 1):
-                rows = slice(max(0, -shift), knots - max(0, shift))
-                there = slice(max(0, shift), knots - max(0, -shift))
-                mirrored = band[..., REACH + shift, rows, REACH + ahead, : self.columns - ahead]
-                band[..., REACH - shift, there, REACH - ahead, ahead:] = mirrored.transpose(-4, -3)
+                band[..., REACH + shift, rows, ahead, : self.columns - ahead] = here
         return band
 
     def apply(self, band: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-        """The form's matrix times coefficients (2, Z, Y)."""
+        """The form's matrix times coefficients (..., 2, Z, Y)."""
         reach = REACH
         padded = pad(coefficients, (reach,) * 4)
-        _, rows, columns = coefficients.shape
+        rows, columns = coefficients.shape[-2:]
         total = torch.zeros_like(padded)
         here = slice(reach, reach + rows), slice(reach, reach + columns)
         for i in range(2 * reach + 1):
             for j in range(reach + 1):
                 there = slice(i, i + rows), slice(reach + j, reach + j + columns)
                 part = band[:, :, i, :, j]
-                total[:, *here] += (part * padded[None, :, *there]).sum(1)
+                total[..., *here] += (part * padded[..., None, :, *there]).sum(-3)
                 if j:
-                    total[:, *there] += (part * coefficients[:, None]).sum(0)
-        return total[:, *here]
+                    total[..., *there] += (part * coefficients[..., None, :, :]).sum(-4)
+        return total[..., *here]

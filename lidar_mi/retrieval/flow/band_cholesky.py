@@ -2,21 +2,22 @@
 
 With the coefficients in the order (knot along y, knot along z, component) a form (see `band.Band`)
 is a band matrix. Its factor takes a third of the operations of that of blocks
-(`block_banded.factor`), which serves many forms at once, and any device.
+(`block_banded.factor`). Other devices have `cyclic_reduction`.
 """
 
-from functools import lru_cache
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import as_strided
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from lidar_mi.retrieval.flow.block_banded import Factor
-from lidar_mi.retrieval.flow.flow_spline import REACH, Mesh
+from lidar_mi.retrieval.flow.flow_spline import REACH
 
 
-class BandCholesky(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class BandCholesky:
     """Lower Cholesky factor of a form, in the form's precision.
 
     Attributes
@@ -32,31 +33,96 @@ class BandCholesky(NamedTuple):
     columns: int
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Coefficients that solve the system, from a right hand side (2, Z, Y) and in its type."""
-        (solve,) = get_lapack_funcs(("pbtrs",), (self.lower,))
-        values = right.detach().cpu().permute(2, 1, 0).reshape(-1, 1).numpy()
-        found, _ = solve(self.lower, values.astype(self.lower.dtype), lower=True)
-        return torch.as_tensor(found).reshape(self.columns, self.rows, 2).permute(2, 1, 0).to(right)
+        """Coefficients that solve the system, of right hand sides (..., 2, Z, Y), in their type."""
+        ordered = right.detach().cpu().transpose(-1, -3)
+        values = ordered.reshape(-1, self.lower.shape[1]).numpy().astype(self.lower.dtype)
+        if len(values) > 1:
+            # LAPACK takes one right hand side after the other
+            found = self._solved(np.ascontiguousarray(values.T)).T
+        else:
+            (solve,) = get_lapack_funcs(("pbtrs",), (self.lower,))
+            found, _ = solve(self.lower, values.T, lower=True)
+        return torch.as_tensor(found).reshape(ordered.shape).transpose(-1, -3).to(right)
+
+    def single(self) -> "BandCholesky":
+        """The same in single precision."""
+        return BandCholesky(self.lower.astype(np.float32), self.rows, self.columns)
 
     def covariance(self) -> torch.Tensor:
-        """The inverse within the band: (2, 2, 7, Z, 4, Y), shifts as in `band.Band`."""
+        """The inverse within the band, as a form is held: (2, 2, 7, Z, 4, Y)."""
+        there, _ = _places(self.rows, self.columns)
+        inverse = torch.as_tensor(self._inverse())
+        found = torch.index_select(inverse.reshape(-1), 0, there.reshape(-1))
+        return found.reshape(there.shape)
+
+    @cached_property
+    def _blocks(self) -> tuple[np.ndarray, np.ndarray]:
+        """A = (I + G) D (I + G)^T by blocks of size n, one for every knot along y.
+
+        The inverse of the Cholesky factor of each block of D, (blocks, n, n), and the transposed
+        blocks of G below each diagonal one, (blocks, n, 3 n).
+        """
         n, below = 2 * self.rows, len(self.lower) - 1
         # in memory an element of the matrix is followed by that below it, and that to its right
         # comes a column less one element later: block columns are views, here with their columns
         # as rows, where columns end in as many zeros as others may begin above their diagonal
-        width, kind = below + 1 + n, torch.as_tensor(self.lower[:1, :1]).dtype
-        padded = torch.zeros((self.columns + REACH + 1) * n, width, dtype=kind)
-        padded[: self.lower.shape[1], : below + 1] = torch.as_tensor(self.lower.T)
-        blocks = padded.as_strided((self.columns, n, (1 + REACH) * n), (n * width, width - 1, 1))
-        own, others = blocks[..., :n], blocks[..., n:]
+        width, kind = below + 1 + n, self.lower.dtype
+        padded = np.zeros(((self.columns + REACH + 1) * n, width), kind)
+        padded[: self.lower.shape[1], : below + 1] = self.lower.T
+        steps = [kind.itemsize * step for step in (n * width, width - 1, 1)]
+        blocks = as_strided(padded, (self.columns, n, (1 + REACH) * n), steps)
         (invert,) = get_lapack_funcs(("trtri",), (self.lower,))
-        roots = np.stack([invert(block.T, lower=True)[0] for block in own.numpy()])
-        root = torch.as_tensor(roots)
-        ratio = root.mT @ others
-        inverse = Factor(root, ratio.mT).inverse()
-        there, _ = _places(self.rows, self.columns)
-        found = torch.index_select(inverse.reshape(-1), 0, there.reshape(-1))
-        return found.reshape(there.shape)
+        roots = np.empty((self.columns, n, n), kind)
+        ratios = np.empty((self.columns, n, REACH * n), kind)
+        for block, root, ratio in zip(blocks, roots, ratios, strict=True):
+            root[:] = invert(block[:, :n].T, lower=True)[0]
+            np.dot(root.T, block[:, n:], out=ratio)
+        return roots, ratios
+
+    def _solved(self, right: np.ndarray) -> np.ndarray:
+        """The solutions of right hand sides (coefficients, number)."""
+        roots, ratios = self._blocks
+        n = roots.shape[-1]
+        # blocks beyond the last one, which count nothing, spare the loops their exceptions
+        found = np.concatenate([right, np.zeros((REACH * n, right.shape[1]), right.dtype)])
+        parts = [found[k * n : (k + 1) * n] for k in range(self.columns)]
+        ahead = [found[(k + 1) * n : (k + 1 + REACH) * n] for k in range(self.columns)]
+        for ratio, part, others in zip(ratios, parts, ahead, strict=True):
+            others -= ratio.T @ part
+        found[len(right) :] = 0.0
+        for k in range(self.columns - 1, -1, -1):
+            parts[k][:] = roots[k].T @ (roots[k] @ parts[k]) - ratios[k] @ ahead[k]
+        return found[: len(right)]
+
+    def _inverse(self) -> np.ndarray:
+        """The inverse's blocks on and below the diagonal, (blocks, n, 4 n), transposed.
+
+        From the last block upwards (Takahashi et al. 1973, Proc. 8th PICA Conf., 63-69). The
+        inverse of the blocks behind is held in a ring: each takes the place of the one that is no
+        longer needed.
+        """
+        roots, ratios = self._blocks
+        n = roots.shape[-1]
+        found = np.empty((self.columns, n, (1 + REACH) * n), roots.dtype)
+        around = np.zeros((REACH * n, REACH * n), roots.dtype)
+        for k in range(self.columns - 1, -1, -1):
+            turned = (k + 1) % REACH * n
+            ratio = _turned(ratios[k], turned)
+            below = ratio @ around
+            here = roots[k].T @ roots[k] + below @ ratio.T
+            # what is not symmetric by rounding would grow
+            here = (here + here.T) / 2
+            own = slice(k % REACH * n, (k % REACH + 1) * n)
+            np.negative(below, out=below)
+            around[own], around[:, own] = below, below.T
+            around[own, own] = here
+            found[k, :, :n], found[k, :, n:] = here, _turned(below, REACH * n - turned)
+        return found
+
+
+def _turned(row: np.ndarray, by: int) -> np.ndarray:
+    """Columns moved to the right, the last ones to the front."""
+    return np.concatenate([row[:, -by:], row[:, :-by]], 1) if by % row.shape[1] else row
 
 
 def packed(form: torch.Tensor) -> np.ndarray:
@@ -119,19 +185,6 @@ def solved_near(
     return None
 
 
-def spread_half(band: torch.Tensor, mesh: Mesh) -> torch.Tensor:
-    """Covariance (2, 2, *mesh.shape) of the components, from `BandCholesky.covariance`."""
-    along_z = mesh.products(0, 0, 0).flatten(0, 1)
-    along_y = mesh.products(1, 0, 0)[REACH:]
-    middle = along_z.T @ band.flatten(2, 3).flatten(-2)
-    own, others = (
-        middle[..., : along_y.shape[1]] @ along_y[0],
-        middle[..., along_y.shape[1] :] @ along_y[1:].flatten(0, 1),
-    )
-    # shifts back along y are those ahead with the components exchanged
-    return own + others + others.transpose(0, 1)
-
-
 def _bandwidth(rows: int) -> int:
     """Largest distance of two coupled coefficients."""
     return 2 * (REACH * rows + REACH) + 1
@@ -148,7 +201,7 @@ def _places(rows: int, columns: int) -> tuple[torch.Tensor, tuple[np.ndarray, np
     other = z + shift_z - REACH
     n, below = 2 * rows, _bandwidth(rows)
     in_block = 2 * (shift_y * rows + other.clip(0, rows - 1)) + b
-    blocks = torch.as_tensor((y * (1 + REACH) * n + in_block) * n + 2 * z + a).int()
+    blocks = torch.as_tensor((y * n + 2 * z + a) * (1 + REACH) * n + in_block).int()
     below_diagonal = 2 * (shift_y * rows + shift_z - REACH) + b - a
     known = (other >= 0) & (other < rows) & (y + shift_y < columns) & (below_diagonal >= 0)
     known = np.broadcast_to(known, sizes)

@@ -1,4 +1,4 @@
-"""Symmetric positive definite block banded matrices: solution and inverse within the band.
+"""Symmetric positive definite block banded matrices: their solution.
 
 A block is coupled to some before and as many behind it.
 """
@@ -6,9 +6,6 @@ A block is coupled to some before and as many behind it.
 from typing import NamedTuple
 
 import torch
-
-# Blocks by which an inverse grows before it is moved: what it needs stays near the cache.
-_GROWTH = 6
 
 
 class Factor(NamedTuple):
@@ -26,13 +23,13 @@ class Factor(NamedTuple):
     ratio: torch.Tensor
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """The solution x of A x = right, both of shape (blocks, ..., n)."""
-        blocks, n = len(right), right.shape[-1]
+        """The solutions x of A x = right, both of shape (blocks, ..., n, number)."""
+        blocks, n, number = len(right), *right.shape[-2:]
         rows = self.ratio.shape[-2]
         ratios = self.ratio.reshape(blocks, -1, rows, n)
         # blocks beyond the last one, which count nothing, spare the loop its exceptions
         some = torch.cat([right, right.new_zeros(rows // n, *right.shape[1:])])
-        some = some.reshape(len(some), -1, n).transpose(0, 1).flatten(1)[..., None].contiguous()
+        some = some.reshape(len(some), -1, n, number).transpose(0, 1).flatten(1, 2).contiguous()
         parts = [some[:, k * n : (k + 1) * n] for k in range(blocks)]
         beyond = [some[:, (k + 1) * n : (k + 1) * n + rows] for k in range(blocks)]
         for ratio, part, ahead in zip(ratios, parts, beyond, strict=True):
@@ -44,41 +41,8 @@ class Factor(NamedTuple):
         some[:, blocks * n :] = 0.0
         for k in range(blocks - 1, -1, -1):
             parts[k].baddbmm_(ratios[k].mT, beyond[k], alpha=-1)
-        found = some[:, : blocks * n, 0].unflatten(-1, (blocks, n)).transpose(0, 1)
+        found = some[:, : blocks * n].unflatten(1, (blocks, n)).transpose(0, 1)
         return found.reshape(right.shape)
-
-    def inverse(self) -> torch.Tensor:
-        """The inverse's blocks on and below the diagonal, (blocks, ..., (1 + reach) n, n).
-
-        By the recursion of Takahashi from the last block upwards: as much work as the factor.
-        """
-        shape = self.ratio.shape[:-2]
-        rows, n = self.ratio.shape[-2:]
-        roots = self.root.reshape(shape[0], -1, n, n)
-        ratios = self.ratio.reshape(shape[0], -1, rows, n)
-        found = ratios.new_empty(*ratios.shape[:2], n + rows, n)
-        found[..., :n, :] = roots.mT @ roots
-        # the inverse of the blocks behind grows to the upper left of a larger matrix, and moves
-        # back to its lower right once it has reached the other end
-        most = _GROWTH * n
-        around = found.new_zeros(ratios.shape[1], most + rows, most + rows)
-        first = most
-        for k in range(len(found) - 1, -1, -1):
-            if not first:
-                around[:, most:, most:] = around[:, :rows, :rows].clone()
-                first = most
-            own, rest = slice(first - n, first), slice(first, first + rows)
-            here, below = found[k, :, :n], found[k, :, n:]
-            torch.bmm(around[:, rest, rest], ratios[k], out=below)
-            whole = torch.baddbmm(here, ratios[k].mT, below)
-            # what is not symmetric by rounding would grow
-            torch.add(whole, whole.mT, out=here).mul_(0.5)
-            below.neg_()
-            around[:, rest, own] = below
-            around[:, own, rest] = below.mT
-            around[:, own, own] = here
-            first -= n
-        return found.reshape(*shape, n + rows, n)
 
 
 def factor(columns: torch.Tensor) -> Factor:

@@ -12,7 +12,7 @@ zero-mean Gaussian field: its covariance is known but for one amplitude.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import combinations_with_replacement, pairwise
 
 import numpy as np
@@ -31,9 +31,10 @@ from lidar_mi.retrieval.images.band_limit import (
 from lidar_mi.retrieval.images.spline import Spline, filter_of, finite, spectrum_of, transform_sizes
 from lidar_mi.retrieval.images.windows import averaged, separable, working
 from lidar_mi.retrieval.reml import most_likely
+from lidar_mi.retrieval.symmetric import eigenvalues
 
 Response = Callable[[torch.Tensor], torch.Tensor]
-"""From a gradient of the log-likelihood (components, knots) to the flow's change."""
+"""From gradients of the log-likelihood (n, components, knots) to the flow's changes."""
 
 _DRAWS = {2: 4, 3: 2}
 """Random fields of each component, by dimensions: a mean square over all places is known to 2 %."""
@@ -43,6 +44,9 @@ _REGION = 8
 """Standard deviation of the Gaussian mean of the squares, and the separation of its places, px."""
 _TAPER = 4.0
 """Standard deviation, px, of the Gaussian by which spectra fade next to invalid pixels."""
+_STORED = 1 << 20
+"""Random numbers of a field that is stored for the next time: to draw them takes as long as the
+transforms of a small image."""
 _RATIO_OF_TWO = (2 - 3**0.5) ** 2
 """Median ratio of the eigenvalues of the structure tensor of two independent slopes."""
 _LEAST_DENSITY = 1e-6
@@ -271,11 +275,9 @@ def without_texture(images: Images, template: int) -> torch.Tensor:
         averaged((one * other).mean(0), valid, 0.5 * template)
         for one, other in combinations_with_replacement(slopes, 2)
     )
-    radius = ((zz - yy).square() / 4 + zy.square()).sqrt()
     # slopes of white noise by central differences have half of its variance
     noisy = images.noise**2 / 2 / working(images.weight)
-    mean = (zz + yy) / 2 - noisy
-    strong, weak = mean + radius, mean - radius
+    weak, strong = (part - noisy for part in eigenvalues(zz, zy, yy))
     # where the slopes are of noise nothing is said, and next to none is none
     told = strong > (2 * noisy).clamp(min=_LEAST_MOTION**2 * float(strong[valid].mean()))
     single = told & (weak < _RATIO_OF_TWO * strong)
@@ -286,8 +288,17 @@ def without_texture(images: Images, template: int) -> torch.Tensor:
 
 def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:
     """Independent standard normal numbers, the same on every device."""
+    known = math.prod(shape) <= _STORED
+    draw = _normal_fields if known else _normal_fields.__wrapped__
+    return draw(tuple(shape), like.dtype, like.device, seed)
+
+
+@lru_cache(maxsize=16)
+def _normal_fields(
+    shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, seed: int
+) -> torch.Tensor:
     random = torch.Generator().manual_seed(seed)
-    return torch.randn(tuple(shape), generator=random, dtype=like.dtype).to(like.device)
+    return torch.randn(shape, generator=random, dtype=dtype).to(device)
 
 
 def _texture_density(images: Images, linear: Linear) -> torch.Tensor:
@@ -386,11 +397,9 @@ def _residual_operator(
     def left(differences: torch.Tensor) -> torch.Tensor:
         if response is None:
             return differences * linear.valid
-        rests = []
-        for one in working(differences) * linear.valid:
-            change = response(mesh.transposed(-one * slope * weight))
-            rests.append((one + (slope * mesh.field(change)).sum(0)) * linear.valid)
-        return torch.stack(rests)
+        differences = working(differences) * linear.valid
+        changes = response(mesh.transposed(-differences[:, None] * (slope * weight)))
+        return (differences + (slope * mesh.field(changes)).sum(1)) * linear.valid
 
     return left
 
@@ -405,14 +414,17 @@ def _flows_left(
     weights = prior.weights
     drawn = weights.sqrt() * normal_fields((_DRAWS[mesh.dims], *weights.shape), weights, 5)
     flows = prior.rates_transposed(drawn)
-    return torch.stack([(slope * mesh.field(response(one))).sum(0) * linear.valid for one in flows])
+    return (slope * mesh.field(response(flows))).sum(1) * linear.valid
 
 
 class _Squares:
-    """Mean squares of fields (n, ...) by scale and place: (n, scales, places ...)."""
+    """Mean squares of fields (n, ...) by scale and place: (n, scales, places ...).
+
+    Summed in single precision: they scatter by more than 1e-2.
+    """
 
     def __init__(self, valid: torch.Tensor):
-        like = torch.empty(0, dtype=torch.float64, device=valid.device)
+        like = torch.empty(0, dtype=torch.float32, device=valid.device)
         self.shape = valid.shape
         self._means = [[_gaussian(n, n, 1, width, like) for n in valid.shape] for width in _SCALES]
         self._region = [_gaussian(-(-n // _REGION), n, _REGION, _REGION, like) for n in valid.shape]
@@ -425,7 +437,7 @@ class _Squares:
         means = [fields, *(separable(fields, mean) for mean in self._means)]
         bands = [*(a - b for a, b in pairwise(means)), means[-1]]
         square = torch.stack(bands, 1) * self._valid
-        return separable(square.square(), self._region) / self._share.clamp(min=1e-3)
+        return working(separable(square.square(), self._region) / self._share.clamp(min=1e-3))
 
     def on_pixels(self, values: torch.Tensor) -> torch.Tensor:
         """Positive values at the places, at the pixels."""

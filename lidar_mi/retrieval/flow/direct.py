@@ -2,60 +2,110 @@
 
 from collections.abc import Sequence
 from functools import reduce
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]  # not in torch's own list
 
-from lidar_mi.retrieval.flow.band import Band, form, spread
+from lidar_mi.retrieval.flow import cyclic_reduction
+from lidar_mi.retrieval.flow.band import Band, along_y, along_z, form, spread
 from lidar_mi.retrieval.flow.band_cholesky import BandCholesky, cholesky, solved_near
 from lidar_mi.retrieval.flow.block_banded import Factor
 from lidar_mi.retrieval.flow.flow_spline import REACH, Mesh
 from lidar_mi.retrieval.flow.likelihood import Linear
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
+from lidar_mi.retrieval.images.windows import working
 
 # Relative rounding error of a factorisation: fifty times that of one entry.
 _ROUNDING = 1e-14
 
 # Residual over the right hand side that a step with a factor in single precision may leave.
 _SINGLE = 1e-3
+# Of a covariance in single precision, how much a diagonal element of its product with the form may
+# differ from 1: degrees of freedom of a coefficient.
+_INVERSE = 1e-3
 # Products with a form until conjugate gradients from a similar one are given up.
 _MOST_PRODUCTS = 12
+
+
+class Root(Protocol):
+    """Factor of a form: what every solver gives."""
+
+    def solve(self, right: torch.Tensor) -> torch.Tensor:
+        """Coefficients that solve the system, of right hand sides (..., 2, Z, Y)."""
+
+    def covariance(self) -> torch.Tensor:
+        """The inverse within the band, as a form is held: (2, 2, 7, Z, 4, Y)."""
 
 
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, and the factor of the posterior's precision there.
 
-    `stiff` is the prior's part of it, a band.
+    Attributes
+    ----------
+    coefficients : torch.Tensor, shape (2, Z, Y)
+    whole : torch.Tensor, shape (2, 2, 7, Z, 4, Y)
+        That precision, a band.
+    root, before : Root
+        Of it, and of the prior's part of it.
+    prior : Prior
     """
 
     coefficients: torch.Tensor
-    band: Band
-    root: Factor
+    whole: torch.Tensor
+    root: Root
+    before: Root
     prior: Prior
-    stiff: torch.Tensor
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow."""
-        before = self.band.covariance(self.band.factor(self.stiff))
-        removed = before - self.band.covariance(self.root)
+        after = covariance_near(self.root, self.whole)
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
         # at the largest evidence the two are equal (MacKay's fixed point)
-        return variances(removed, self.prior), energy
+        return variances(self.before.covariance() - after, self.prior), energy
 
-    def response(self, gradient: torch.Tensor) -> torch.Tensor:
-        """Change of the coefficients by a gradient (components, knots) of the log-likelihood."""
-        return self.band.solve(self.root, gradient)
+    def response(self, gradients: torch.Tensor) -> torch.Tensor:
+        """Changes of the coefficients by gradients (..., components, knots)."""
+        return self.root.solve(gradients)
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before."""
         mesh = Mesh(self.prior.mesh.axes, places)
-        after, before = (
-            spread(self.band.covariance(root), mesh)
-            for root in (self.root, self.band.factor(self.stiff))
-        )
+        after, before = (spread(root.covariance(), mesh) for root in (self.root, self.before))
         return after, before
+
+
+def factored(forms: torch.Tensor) -> Sequence[Root]:
+    """Factors of forms (n, 2, 2, 7, Z, 4, Y) in double precision.
+
+    By LAPACK, or at once on any other device.
+
+    Raises
+    ------
+    torch.linalg.LinAlgError
+        One is not positive definite.
+    """
+    if by_lapack(forms):
+        return [_in_double(form) for form in forms]
+    return cyclic_reduction.factored(working(forms))
+
+
+def by_lapack(form: torch.Tensor) -> bool:
+    """Whether a form is factored on the processor: where it is."""
+    return form.device.type == "cpu"
+
+
+def covariance_near(root: Root, form: torch.Tensor) -> torch.Tensor:
+    """That of a form's factor to `_INVERSE`, where it is, in single precision."""
+    if isinstance(root, BandCholesky):
+        found = root.single().covariance().to(form)
+        band = Band(form.shape[3], form.shape[5])
+        # the product of both matrices has ones on its diagonal
+        ones = band.apply(found * form, form.new_ones(2, form.shape[3], form.shape[5]))
+        if bool(((ones - 1).abs() < _INVERSE).all()):
+            return found
+    return root.covariance()
 
 
 def solved(
@@ -67,10 +117,10 @@ def solved(
     iteration: int,
 ) -> Posterior:
     """One Gauss-Newton step; `iteration` is for `iterative` only."""
-    band = _band(mesh)
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
-    root = band.factor(data_form(linear, mesh) + stiff)
-    return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+    whole = data_form(linear, mesh) + stiff
+    root, before = factored(torch.stack([whole, stiff]))
+    return Posterior(coefficients + root.solve(gradient), whole, root, before, prior)
 
 
 class PriorTerm(NamedTuple):
@@ -103,17 +153,19 @@ def solved_in_single(
     mesh: Mesh,
     coefficients: torch.Tensor,
     prior_term: PriorTerm,
-    near: BandCholesky | None = None,
+    near: Root | None = None,
 ) -> torch.Tensor:
     """Coefficients after a step in single precision; its residual is looked at in double precision.
 
     By conjugate gradients from the factor of a form that is `near` the step's own, or by the factor
     of that. Where there is no such factor, or the residual is not small, all is in double
-    precision.
+    precision; so it is on another device than the processor.
     """
     gradient = mesh.transposed(linear.gradient) + prior_term.gradient
     whole = data_form(linear, mesh) + prior_term.whole
-    if near is not None:
+    if not by_lapack(whole):
+        return coefficients + factored(whole[None])[0].solve(gradient)
+    if isinstance(near, BandCholesky):
         step = solved_near(near, whole, gradient, _SINGLE, _MOST_PRODUCTS)
         if step is not None:
             return coefficients + step
@@ -126,8 +178,10 @@ def solved_in_single(
     return coefficients + _in_double(whole).solve(gradient)
 
 
-def factor_in_single(form: torch.Tensor) -> BandCholesky:
-    """Factor of a form in single precision, or in double where there is none."""
+def factor_in_single(form: torch.Tensor) -> Root:
+    """Factor of a form in single precision; in double where there is none, and on other devices."""
+    if not by_lapack(form):
+        return factored(form[None])[0]
     return cholesky(form.float()) or _in_double(form)
 
 
@@ -191,21 +245,38 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
     # the integral over the plane is a sum over the cells of the mesh
     weight = prior.cell * prior.local
     for (first, second), members in pairs.items():
-        parts = form(weight, mesh, first, second, cells)
+        kinds = sorted({kind for kind, *_ in members})
+        parts = form(weight[kinds], mesh, first, second, cells)
         for kind, a, b, scale in members:
-            total[a, b].add_(parts[kind], alpha=scale)
+            total[a, b].add_(parts[kinds.index(kind)], alpha=scale)
     return total
 
 
 def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None) -> torch.Tensor:
     """Variance of each kind of motion (kinds, ...) on the prior's mesh, from a band's."""
+    mesh = prior.mesh
+    # shifts back along y are those ahead with the derivatives exchanged, which is another summand
+    covariance = covariance.clone()
+    covariance[..., 1:, :] *= 2
+    # motions share derivatives: each is taken once
+    middles: dict[tuple[int, ...], torch.Tensor] = {}
+    found: dict[tuple[int, int, tuple[int, ...], tuple[int, ...]], torch.Tensor] = {}
+
+    def of(a: int, b: int, first: tuple[int, ...], second: tuple[int, ...]) -> torch.Tensor:
+        key = a, b, first[0], second[0]
+        if key not in middles:
+            middles[key] = along_z(covariance[a, b], mesh, first[0], second[0], cells)
+        if (a, b, first, second) not in found:
+            found[a, b, first, second] = along_y(middles[key], mesh, first[1], second[1])
+        return found[a, b, first, second]
+
     return prior.by_kind(
         torch.stack(
             [
                 reduce(
                     torch.add,
                     (
-                        one * other * spread(covariance[a, b], prior.mesh, first, second, cells)
+                        one * other * of(a, b, first, second)
                         for a, first, one in terms
                         for b, second, other in terms
                     ),
@@ -216,16 +287,16 @@ def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None
     )
 
 
-def with_diagonal(form: torch.Tensor, value: float) -> None:
+def with_diagonal(form: torch.Tensor, value: float | torch.Tensor) -> None:
     """Add a number to the diagonal, as the ridge that keeps the variance of rigid motion finite."""
     for a in (0, 1):
         form[a, a, REACH, :, 0] += value
 
 
-def rounding(form: torch.Tensor) -> float:
+def rounding(form: torch.Tensor) -> torch.Tensor:
     """What keeps a quadratic form positive in spite of rounding; this only shortens the steps.
 
     Noise-free images of a flow without any vorticity make the prior stronger than the ridge by
     more than the floating-point precision.
     """
-    return _ROUNDING * float(form.amax())
+    return _ROUNDING * form.amax()

@@ -12,8 +12,9 @@ from lidar_mi.retrieval.images.windows import linear_weights, separable
 
 REACH = 3
 """Knots further apart than this have no common support."""
-# Cells along an axis that are multiplied at once: a spline is zero beyond four of them.
-_CELLS = 12
+# Cells along an axis that are multiplied at once: a spline is zero beyond four of them. Devices
+# other than the processor take as long for a small product as for a larger one.
+_CELLS, _CELLS_OF_DEVICE = 12, 64
 
 
 @dataclass(frozen=True)
@@ -127,9 +128,10 @@ class Mesh:
         cells = cells or slice(0, self.axes[axis].cells)
         key = axis, cells.start, cells.stop
         if key not in self._groups:
+            step = _CELLS if self.places[axis].device.type == "cpu" else _CELLS_OF_DEVICE
             self._groups[key] = [
-                self.within(axis, slice(start, min(start + _CELLS, cells.stop)))
-                for start in range(cells.start, cells.stop, _CELLS)
+                self.within(axis, slice(start, min(start + step, cells.stop)))
+                for start in range(cells.start, cells.stop, step)
             ]
         return self._groups[key]
 

@@ -63,6 +63,8 @@ class Images(NamedTuple):
         Whether that is the noise; else it is a lower limit.
     noise_updated : bool
         Whether noise and weight are those of `components.differences`.
+    all_usable : bool
+        Whether all pixels are usable.
     """
 
     spline: Spline
@@ -78,6 +80,7 @@ class Images(NamedTuple):
     chosen: Filter
     noise_known: bool = True
     noise_updated: bool = False
+    all_usable: bool = False
 
     def single(self) -> "Images":
         """The same to be warped in single precision: places to 1e-5 px."""
@@ -116,7 +119,7 @@ class Linear(NamedTuple):
         Of the log-likelihood with respect to the flow at each pixel.
     weight : torch.Tensor
         Of the products of slopes in the information.
-    variance : float
+    variance : float or torch.Tensor, shape ()
         Of the noise.
     smooth : torch.Tensor, shape (images, ...)
         The images at mid-time, equal in brightness, after the filter of their slopes.
@@ -131,7 +134,7 @@ class Linear(NamedTuple):
     slope: torch.Tensor
     gradient: torch.Tensor
     weight: torch.Tensor
-    variance: float
+    variance: float | torch.Tensor
     smooth: torch.Tensor
     warped: torch.Tensor
     valid: torch.Tensor
@@ -174,6 +177,7 @@ def prepared(
         known_noise,
         chosen,
         noise_known,
+        all_usable=bool(known_at.all()),
     )
 
 
@@ -199,7 +203,10 @@ def linearised_there(
     square over the variance of the differences' white noise, for waves of every length.
     """
     value, smooth, *slopes = sampled
-    valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
+    # numbers stay on the device: to wait for one takes as long there as to compute with it
+    valid = images.spline.holds(*places).all(0)
+    if not images.all_usable:
+        valid = valid & nearest(images.usable, places).all(0)
     # over air that is in all images: bright air that enters would change the brightness of all
     smooth, _ = normalised_intensity(smooth, images.weight * valid)
     value, gain = normalised_intensity(value, images.weight * valid)
@@ -208,9 +215,9 @@ def linearised_there(
     passed = max(images.spline.passed, 1e-6)
     misfit = residual.square().sum(0)
     # what no flow explains counts as noise: images are never taken to be better than they fit
-    variance = max(images.noise**2, 1e-30)
+    variance = misfit.new_full((), max(images.noise**2, 1e-30))
     if not images.noise_updated:
-        variance = max(variance, misfit_variance(misfit[valid], len(value)) / passed)
+        variance = variance.maximum(misfit_variance(misfit, valid, len(value)) / passed)
     off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
     # beyond `robust` standard deviations residuals enter linearly (Huber)
     regular = settings.robust / off.clamp(min=settings.robust)
@@ -282,8 +289,8 @@ def _fraction_of_texture(
     power = averaged(slope.square().sum(0), valid, _width(mesh)).clamp(min=1e-30)
     noisy = more * images.smooth.noisy_slopes / images.weight
     fraction = (1 - noisy / power).clamp(min=0.0)
-    mean = (fraction * power)[valid].sum() / power[valid].sum() if bool(valid.any()) else 1.0
-    return fraction / max(float(mean), 1e-6)
+    power = power * valid
+    return fraction / ((fraction * power).sum() / power.sum().clamp(min=1e-30)).clamp(min=1e-6)
 
 
 def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int) -> torch.Tensor:

@@ -7,10 +7,11 @@ from functools import lru_cache
 import torch
 
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.flow.band_cholesky import BandCholesky, spread_half
+from lidar_mi.retrieval.flow.band import spread
 from lidar_mi.retrieval.flow.direct import (
     Posterior,
     PriorTerm,
+    Root,
     factor_in_single,
     form_of_slopes,
     prior_term_of,
@@ -167,7 +168,7 @@ class ExpectedFlow:
     first : tuple of torch.Tensor, shape (1, z, y)
         Value and slopes of the first image there.
     prior_term : PriorTerm
-    root : BandCholesky
+    root : Root
         Factor of the precision of the flow, by the information that the first image shows.
     covariance : torch.Tensor, shape (2, 2, *windows.count)
         Of the flow by it, px^2.
@@ -182,7 +183,7 @@ class ExpectedFlow:
     places: torch.Tensor
     first: tuple[torch.Tensor, ...]
     prior_term: PriorTerm
-    root: BandCholesky
+    root: Root
     covariance: torch.Tensor
     information: torch.Tensor
 
@@ -203,7 +204,7 @@ def expected_flow(
     # the recursion for the inverse damps rounding: 1e-5 in single precision
     inverse = root.covariance().float()
     at_centres = _of_centres(axes, start.windows, inverse)
-    covariance = spread_half(inverse, at_centres).to(start.coefficients)
+    covariance = spread(inverse, at_centres).to(start.coefficients)
     near = information_near(slope, information, mesh)
     return ExpectedFlow(
         start, placed, mesh, images, places, sampled, prior_term, root, covariance, near
@@ -325,6 +326,7 @@ def _prepared(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | No
         spline=spline,
         smooth=smooth,
         usable=known,
+        all_usable=bool(known.all()),
         time=start.images.time.float(),
         weight=(weight * start.local).float(),
         stack=image,
@@ -344,6 +346,7 @@ def _completed(
         spline=images.spline.stacked_with(spline),
         smooth=images.smooth.stacked_with(smooth),
         usable=known,
+        all_usable=bool(known.all()),
         stack=pair,
     )
 
@@ -365,5 +368,5 @@ def _misfit(linear: Linear, step: torch.Tensor, images: Images) -> float:
     along = (linear.slope * step.to(linear.slope)).sum(0)
     residual = linear.warped + images.time.reshape(-1, 1, 1) * along
     residual = (residual - residual.mean(0)) * images.weight.sqrt()
-    square = misfit_variance(residual.square().sum(0)[linear.valid].double(), len(residual))
-    return square / (max(images.spline.passed, 1e-6) * linear.variance)
+    square = misfit_variance(residual.square().sum(0), linear.valid, len(residual))
+    return float(square / (max(images.spline.passed, 1e-6) * linear.variance))

@@ -202,7 +202,7 @@ class Prior(NamedTuple):
         whole = known.flatten(1).sum(1).clamp(min=1e-3)
         spent = (square * change).flatten(1).sum(1).clamp(min=1e-6)
         for kind, of in DIVERGENT[self.mesh.dims]:
-            ratio = float((self.local[kind] / self.local[of]).mean())
+            ratio = (self.local[kind] / self.local[of]).mean()
             whole[kind] += settings.modes
             spent[kind] += settings.modes * ratio / settings.ratio
         step = change * (whole / spent).reshape(-1, *[1] * self.mesh.dims)
@@ -254,8 +254,9 @@ def _gamma_mean(known: torch.Tensor, square: torch.Tensor) -> torch.Tensor:
         rate = shape / ((shape + half) / (rate + energy)).mean(1, keepdim=True)
     likelihood = shape * rate.log() - torch.lgamma(shape) + torch.lgamma(shape + half)
     likelihood = likelihood - (shape + half) * (rate + energy).log()
-    best = int(likelihood.mean(1).argmax())
-    return ((shape[best] + half[0]) / (rate[best] + energy[0])).reshape(known.shape)
+    best = likelihood.mean(1).argmax()[None]
+    shape, rate = shape.index_select(0, best), rate.index_select(0, best)
+    return ((shape + half) / (rate + energy)).reshape(known.shape)
 
 
 def _cells(mesh: Mesh) -> float:

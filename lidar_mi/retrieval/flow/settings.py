@@ -57,8 +57,8 @@ class StripSettings:
         they are too large by up to 24 %.
     solved_core, solved_overlap : int
         The same for the preconditioner.
-    at_once, solved_at_once : int
-        Strips that one thread works on together, for the prior's strength and the preconditioner.
+    solved_at_once : int
+        Strips of the preconditioner that one thread works on together.
     tolerance : float
         Residual over the first one at which conjugate gradients end: each round solves again.
     loose : float
@@ -72,7 +72,6 @@ class StripSettings:
     largest: int = 64
     core: int = 12
     overlap: int = 10
-    at_once: int = 1
     final_core: int = 15
     final_overlap: int = 12
     solved_core: int = 14

@@ -13,7 +13,9 @@ import torch
 from lidar_mi.retrieval.flow.band import Band, spread
 from lidar_mi.retrieval.flow.block_banded import Factor
 from lidar_mi.retrieval.flow.direct import (
+    covariance_near,
     data_form,
+    factored,
     in_single,
     prior_and_gradient,
     prior_form,
@@ -51,8 +53,8 @@ class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, with the posterior's precision there.
 
     `stiff` is the prior's part of it, `both` all of it: bands. `images` is the
-    likelihood that they are of, and its mesh. `response` gives the change of the coefficients by a
-    gradient (components, knots) of the log-likelihood, to `StripSettings.loose`.
+    likelihood that they are of, and its mesh. `response` gives the changes of the coefficients
+    by gradients (n, components, knots) of the log-likelihood, to `StripSettings.loose`.
     """
 
     coefficients: torch.Tensor
@@ -70,20 +72,16 @@ class Posterior(NamedTuple):
         """
         prior, solver = self.prior, self.settings.strips
 
-        def informed(part: list[Strip]) -> torch.Tensor:
-            found = _covariances(torch.stack([self._alone(strip) for strip in part]))
-            return torch.cat(
-                [
-                    variances(s.of_core(before - after), prior, s.core)
-                    for s, (before, after) in zip(part, found, strict=True)
-                ],
-                1,
-            )
+        def informed(strip: Strip) -> torch.Tensor:
+            forms = self._alone(strip)
+            before, root = factored(forms)
+            removed = before.covariance() - covariance_near(root, forms[1])
+            return variances(strip.of_core(removed), prior, strip.core)
 
         energy = prior.by_kind(prior.rates(self.coefficients).square())
         # with half of this overlap the variances are 2 to 3 % too large in the middle of a strip
         cut = strips(prior.mesh.axes[0].cells, solver.core, solver.overlap)
-        return torch.cat(mapped(informed, _grouped(cut, solver.at_once)), 1), energy
+        return torch.cat(mapped(informed, cut), 1), energy
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before.
@@ -95,7 +93,7 @@ class Posterior(NamedTuple):
         mesh = Mesh(prior.mesh.axes, places)
 
         def after(strip: Strip) -> torch.Tensor:
-            covariance = _covariances(self._alone(strip)[1])
+            covariance = factored(self._alone(strip)[1:])[0].covariance()
             return spread(strip.of_core(covariance), mesh, cells=strip.core)
 
         # information beyond a strip is missing in it: errors come out too large
@@ -141,12 +139,6 @@ def _grouped(cut: list[Strip], at_once: int) -> list[list[Strip]]:
     return [cut[i : i + at_once] for i in range(0, len(cut), at_once)]
 
 
-def _covariances(forms: torch.Tensor) -> torch.Tensor:
-    """The inverses within the band of the matrices of forms (..., 2, 2, 7, Z, 4, Y)."""
-    band = Band(forms.shape[-3], forms.shape[-1])
-    return band.covariance(band.factor(forms))
-
-
 def solved(
     linear: Linear,
     mesh: Mesh,
@@ -172,29 +164,25 @@ def solved(
     def inverse(part: tuple[list[Strip], Factor], right: torch.Tensor) -> torch.Tensor:
         members, root = part
         band = Band(root.root.shape[-1] // 2, whole.columns)
-        right = torch.stack([right[:, s.knots] for s in members]).to(root.root)
+        right = torch.stack([right[..., s.knots, :] for s in members], 1).to(root.root)
         return band.solve(root, right).to(coefficients)
 
     def preconditioned(right: torch.Tensor) -> torch.Tensor:
         total = torch.zeros_like(right)
-        found = mapped(lambda part: inverse(part, right[0]), list(zip(some, roots, strict=True)))
+        found = mapped(lambda part: inverse(part, right), list(zip(some, roots, strict=True)))
         for members, parts in zip(some, found, strict=True):
-            for strip, part in zip(members, parts, strict=True):
-                total[0, :, strip.knots] += part
+            for strip, part in zip(members, parts.unbind(1), strict=True):
+                total[..., strip.knots, :] += part
         return total
 
     def response(right: torch.Tensor, tolerance: float) -> torch.Tensor:
-        (change,) = conjugate_gradients(
-            lambda c: whole.apply(both, c[0])[None],
-            right[None],
-            preconditioned,
-            tolerance,
-            solver.steps,
+        return conjugate_gradients(
+            lambda c: whole.apply(both, c), right, preconditioned, tolerance, solver.steps
         )
-        return change
 
     # a loose solution suffices: the next round takes another step
-    change, loose = response(gradient, solver.tolerance), partial(response, tolerance=solver.loose)
+    (change,) = response(gradient[None], solver.tolerance)
+    loose = partial(response, tolerance=solver.loose)
     return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, loose)
 
 
@@ -227,5 +215,4 @@ def _before(mesh: Mesh, prior: Prior, settings: VariationalSettings) -> torch.Te
     # uniform flow has the same ridge in spite of fewer coefficients
     with_diagonal(form, settings.ridge * fine_rows * fine_columns / (rows * columns))
     with_diagonal(form, rounding(form))
-    band = Band(rows, columns)
-    return spread(band.covariance(band.factor(form)), Mesh(axes, mesh.places))
+    return spread(factored(form[None])[0].covariance(), Mesh(axes, mesh.places))

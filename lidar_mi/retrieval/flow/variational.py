@@ -162,8 +162,9 @@ def variational_and_flow(
         image_pair(stack[0], image, (2, 3))
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
-    images = given = prepared(stack, noise, blur, settings)
+    images = prepared(stack, noise, blur, settings)
     like = images.spline.coefficients[:0]
+    bare = without_texture(images, windows.template).to(like) if windows.dims == 2 else None
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.smooth, windows, Grid(windows.shape, 0.0, like))
     prior: Prior | None = None
@@ -184,7 +185,7 @@ def variational_and_flow(
         in_single = images.single()
         for iteration in range(rounds):
             if posterior is not None and iteration in noise_rounds:
-                linear = linearised(images, mesh, coefficients, settings)
+                linear = linearised(in_single, single, coefficients.float(), settings)
                 found = differences(
                     images, linear, mesh, coefficients, prior, windows.template, posterior.response
                 )
@@ -211,9 +212,8 @@ def variational_and_flow(
     additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
     covariance = covariance + additional
     result = result._replace(covariance=covariance)
-    if windows.dims > 2:
+    if bare is None:
         return result, None
-    bare = without_texture(given, windows.template).to(like)
     bare = interpolated(bare, pixels, centres) > 0.5
     flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * bare).short()
     result = result._replace(flag=flag)

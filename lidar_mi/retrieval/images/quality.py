@@ -11,7 +11,7 @@ from torch.nn.functional import max_pool2d, max_pool3d
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.windows import Windows, working
-from lidar_mi.retrieval.symmetric import largest_eigenvalue
+from lidar_mi.retrieval.symmetric import eigenvalues, largest_eigenvalue
 
 
 class Flag(enum.IntFlag):
@@ -110,11 +110,8 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
     gradient = spatial_gradient(image[None, None], mode="sobel")[0, 0]
     along_y, along_z = windows.of_templates(gradient.square())
     across = windows.of_templates(gradient[0] * gradient[1])
-    # eigenvalues of the mean product of the slopes: half its trace -+ the radius
-    half_trace = (along_y + along_z) / 2
-    radius = torch.hypot((along_y - along_z) / 2, across)
-    weakest = (half_trace - radius).clamp(min=0).sqrt()
-    strongest = (half_trace + radius).sqrt()
+    squares = eigenvalues(along_y, across, along_z)
+    weakest, strongest = (square.clamp(min=0).sqrt() for square in squares)
     mean = windows.of_templates(image)
     some = weakest > 0
     return Texture(
@@ -241,13 +238,14 @@ def worst_variance(covariance: torch.Tensor) -> torch.Tensor:
     return torch.where(known, largest_eigenvalue(matrices), torch.inf)
 
 
-def misfit_variance(misfit: torch.Tensor, number: int) -> float:
+def misfit_variance(misfit: torch.Tensor, valid: torch.Tensor, number: int) -> torch.Tensor:
     """Variance of white noise from its sums of squares about the mean of `number` values each.
 
-    Their median over that of chi-square with number - 1 degrees of freedom: a few places where
-    more than noise differs change it little. 0 without any sum.
+    The median of valid ones over that of chi-square with number - 1 degrees of freedom: a few
+    places where more than noise differs change it little. 0 without any sum; of shape ().
     """
-    return float(misfit.median()) / chdtri(number - 1, 0.5) if misfit.numel() else 0.0
+    median = torch.where(valid, misfit, torch.nan).nanmedian()
+    return median.nan_to_num(0.0) / chdtri(number - 1, 0.5)
 
 
 def non_finite(images: Sequence[torch.Tensor], windows: Windows) -> torch.Tensor:

@@ -218,15 +218,9 @@ def window_sums(
 
 def averaged(field: torch.Tensor, known: torch.Tensor, width: float) -> torch.Tensor:
     """Gaussian mean of a field where it is known; the mean of all of it where nothing is near."""
-    if bool(known.all()):
-        # the weight of what is known is a product of those along the axes
-        number = torch.ones((), dtype=field.dtype, device=field.device)
-        for n in field.shape:
-            number = number[..., None] * _gaussian_sums(field.new_ones(1, n), width)[0]
-        return _gaussian_sums(field[None], width)[0] / number
     both = torch.stack([torch.where(known, field, 0.0), known.to(field)])
     total, number = _gaussian_sums(both, width)
-    mean = field[known].mean() if bool(known.any()) else 0.0
+    mean = both[0].sum() / both[1].sum().clamp(min=1)
     return torch.where(number > 1e-3, total / number.clamp(min=1e-3), mean)
 
 

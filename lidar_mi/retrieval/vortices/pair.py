@@ -31,7 +31,8 @@ class VortexPairFit(Tabular):
     ----------
     parameters : ndarray, shape (10,)
         In the order of `lidar_mi.retrieval.vortices.model.PARAMETERS`; NaN where there is no fit at
-        all. Port is the vortex that rotates from +y towards +z (circulation > 0).
+        all, or those that a fit was tried from, without a covariance. Port is the vortex that
+        rotates from +y towards +z (circulation > 0).
     covariance : ndarray, shape (10, 10)
         Of the parameters: from the noise and from the flow's departure from the model.
     profile : {"lamb_oseen", "burnham_hallock"}
@@ -52,6 +53,9 @@ class VortexPairFit(Tabular):
         Why the fit is not accepted; empty if it is.
     from_start : bool
         Whether it was found from an expected pair, without a search.
+    probability : float
+        That the images show a vortex, by `lidar_mi.retrieval.vortices.detection`, whether the fit
+        is accepted or not; NaN where it was not asked for.
     turned : ndarray, shape (10,), optional
         Change of the parameters per rad/s by which the observations rotate about y = z = 0 between
         the scans, from +y towards +z: by an unknown roll.
@@ -71,6 +75,7 @@ class VortexPairFit(Tabular):
     model_error_length: float
     reasons: tuple[str, ...] = ()
     from_start: bool = False
+    probability: float = np.nan
     turned: np.ndarray | None = None
     inclined: np.ndarray | None = None
     slopes: np.ndarray | None = None

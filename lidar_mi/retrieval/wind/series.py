@@ -1,6 +1,7 @@
 """From many images to the wind in time: pair by pair, one CF data set out."""
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from itertools import pairwise
 from typing import Any
 
@@ -10,8 +11,10 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import positive
+from lidar_mi.retrieval.device import device_of
 from lidar_mi.retrieval.images.common_grid import all_on_one_grid
 from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.threads import SMALL, in_turn, threads_for
 from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
@@ -22,32 +25,37 @@ _PER_PAIR = "identical_images", "fixed_pattern", "illumination"
 @with_old_keywords
 @checked_arguments
 def retrieve_winds(
-    images: Sequence[xr.DataArray],
+    images: Sequence[xr.DataArray] | xr.DataArray,
     dt: float | Sequence[float],
     pairs: Sequence[tuple[int, int]] | None = None,
     *,
-    noise: float | Sequence[float | xr.DataArray | None] | None = None,
+    noise: float | Sequence[float | xr.DataArray | None] | xr.DataArray | None = None,
     beam_times: Sequence[xr.DataArray] | None = None,
     notice: Callable[[str, float], object] | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    """Wind in the image plane from each pair of a sequence of images.
+    """Wind in the image plane from each pair of a sequence or a stack of images.
+
+    Each pair has the wind that `retrieve_wind` gives. Pairs of small images (up to 2^18 px) are
+    retrieved at the same time, one on each thread that torch may use.
 
     Parameters
     ----------
-    images : sequence of xr.DataArray, dims (z, y)
+    images : sequence of xr.DataArray, dims (z, y), or one of dims (any, z, y)
         In the order of their times, of one size. Images on different grids are resampled onto one,
         which covers what all of them cover (`on_one_grid`).
     dt : float or sequence of float
         Time from each image to the next, s: one for all, or one for each step.
     pairs : sequence of (int, int), optional
-        Which images make a pair, from 0, the earlier first. Default: each with the next.
-    noise : float, or sequence of float, xr.DataArray or None, optional
-        Standard deviation of the noise, as of `retrieve_wind`: one for all images, or one an image.
+        Which images make a pair, from 0, the earlier first. Default: each with the next. Of a stack
+        of pairs: ``[(0, 1), (2, 3), ...]``.
+    noise : float, sequence of float, xr.DataArray or None, or xr.DataArray, optional
+        Standard deviation of the noise, as of `retrieve_wind`: one for all images, or one an image,
+        also as a stack.
     beam_times : sequence of xr.DataArray, optional
         When each pixel of each image was seen, as ``times`` of `retrieve_wind`.
     notice : callable, optional
-        Called with a text and the fraction done (0 to 1) before each pair.
+        Called with a text and the fraction done (0 to 1) for each pair, before its wind is there.
     **options
         Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``windows``,
         ``validation`` and so on.
@@ -83,6 +91,7 @@ def retrieve_winds(
     >>> [f"{speed:.0f}" for speed in winds["v"].median(("z", "y")).values]
     ['10', '15']
     """
+    images = _unstacked("images", images)
     chosen = _checked_pairs(pairs, len(images))
     times = _reference_times(dt, len(images))
     if "more" in options or "times" in options:
@@ -91,6 +100,8 @@ def retrieve_winds(
         raise InputError(
             f"beam_times: {len(beam_times)} are not allowed; expected {len(images)}, one an image"
         )
+    if isinstance(noise, xr.DataArray):
+        noise = _unstacked("noise", noise)
     levels: list[float | xr.DataArray | None] = (
         list(noise) if isinstance(noise, Sequence) else [noise] * len(images)
     )
@@ -103,19 +114,28 @@ def retrieve_winds(
     if any(one is not other for one, other in zip(shared, images, strict=True)):
         # noise cannot be interpolated: its median is used
         levels = [float(n.median()) if isinstance(n, xr.DataArray) else n for n in levels]
-    found: list[xr.Dataset | InputError] = []
-    for number, (first, second) in enumerate(chosen):
-        if notice is not None:
-            notice(f"images {first}-{second}", number / len(chosen))
+
+    def of_pair(pair: tuple[int, int]) -> xr.Dataset | InputError:
+        first, second = pair
         when = None if seen is None else [seen[first], seen[second]]
         step = times[second] - times[first]
         try:
-            wind = retrieve_wind(
+            return retrieve_wind(
                 shared[first], shared[second], step, times=when, noise=levels[first], **options
             )
-            found.append(wind)
         except InputError as error:
-            found.append(error)
+            return error
+
+    pixels = shared[0].size
+    # threads share what a device other than the processor does
+    side_by_side = pixels <= SMALL and device_of(options.get("device", "cpu")).type == "cpu"
+    found: list[xr.Dataset | InputError] = []
+    each = in_turn(of_pair, chosen) if side_by_side else (of_pair(pair) for pair in chosen)
+    with threads_for(pixels), closing(each):
+        for number, (first, second) in enumerate(chosen):
+            if notice is not None:
+                notice(f"images {first}-{second}", number / len(chosen))
+            found.append(next(each))
     winds = [wind for wind in found if isinstance(wind, xr.Dataset)]
     if not winds:
         raise InputError(f"images {chosen[0][0]}-{chosen[0][1]}: {found[0]}")
@@ -140,6 +160,18 @@ def retrieve_winds(
         ),
         remark=("time", [_remark(wind) for wind in found], {"long_name": "remark on the images"}),
     )
+
+
+def _unstacked(name: str, images: Sequence[xr.DataArray] | xr.DataArray) -> Sequence[xr.DataArray]:
+    """Images one by one: those of a stack along its first dimension."""
+    if not isinstance(images, xr.DataArray):
+        return images
+    if images.dims[1:] != ("z", "y"):
+        raise InputError(
+            f"{name}: dimensions {', '.join(map(str, images.dims))} are not allowed; expected any, "
+            "z, y, or a sequence"
+        )
+    return list(images.drop_vars([images.dims[0]], errors="ignore"))
 
 
 def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[tuple[int, int]]:

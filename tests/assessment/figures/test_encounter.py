@@ -46,6 +46,21 @@ def test_loads_of_the_air_are_drawn(tmp_path):
     assert imread(drawn[-1].path).std() > 0.05
 
 
+def test_loads_of_an_aircraft_that_rises_are_drawn(tmp_path):
+    alone = made_up_flights().series.sel(flight=["off"])
+    changed = {
+        name: alone["roll"] * factor
+        for name, factor in (
+            ("load_factor", 2.0),
+            ("port_bending", 1e5),
+            ("starboard_bending", 1e5),
+        )
+    }
+    drawn = draw_all(tmp_path, alone.assign(changed), None, None, SPAN, Log())
+    assert [one.path.stem for one in drawn] == ["fig30_roll", "fig35_commands", "fig37_load_factor"]
+    assert imread(drawn[-1].path).std() > 0.05
+
+
 def test_cockpit_is_the_pilots_view():
     """Port, positive y, is on the left; cores are where the data set has them."""
     found = made_up_flights()
@@ -65,13 +80,33 @@ def test_cockpit_is_the_pilots_view():
 
 
 def test_film_shows_the_flight(monkeypatch):
-    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.MOST_FRAMES", 3)
+    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 4)
     found = made_up_flights()
     frames = list(film(found.series, found.track, found.slabs, SPAN))
-    assert len(frames) == 3 and len({frame.pixels.shape for frame in frames}) == 1
+    assert len({frame.pixels.shape for frame in frames}) == 1
     assert all(frame.pixels.dtype == np.uint8 and frame.pixels.std() > 10 for frame in frames)
-    last = found.series.isel(time=-1)
+    assert not any(n % 2 for n in frames[0].pixels.shape[:2])
+    # the film's time is that of the flight, from the first delivery to the end
+    start, end = float(found.slabs["delivered"].min()), float(found.series["time"].max())
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(start, end + 1e-6, 0.25))
+    last = found.series.interp(time=frames[-1].time)
     angle = np.degrees(float(last["roll"].sel(flight="off")))
     assert f"without control {angle:+.1f}°" in frames[-1].caption
-    assert frames[0].time < frames[1].time < frames[2].time
     assert list(film(found.series, None, None, SPAN)) == []
+
+
+def test_film_shows_beams_only_while_the_lidar_scans(monkeypatch):
+    """Cyan beams from above: as long from frame to frame, gone after the last scan."""
+    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 4)
+    found = made_up_flights()
+    last_scan = float(found.slabs["time"].max()) + 0.05
+    areas = []
+    for frame in film(found.series, found.track, found.slabs, SPAN):
+        red, green, blue = (frame.pixels[460:, :, k].astype(int) for k in range(3))
+        # a quarter of cyan on white
+        beams = (abs(red - 197) < 4) & (abs(green - 239) < 4) & (abs(blue - 243) < 4)
+        areas.append((frame.time, int(beams.sum())))
+    during = [area for time, area in areas if time < last_scan - 0.01]
+    after = [area for time, area in areas if time > last_scan + 0.01]
+    assert len(during) >= 2 and after and max(after) == 0
+    assert min(during) > 2000 and max(during) < 1.2 * min(during)

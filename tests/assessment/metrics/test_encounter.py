@@ -141,3 +141,21 @@ def test_rows_of_the_requirements(series, track):
     assert found["slabs_per_second"] == 10 and found["points_per_slab"] == 63
     assert found["range"] == pytest.approx(0.88 * 75)
     assert (found["error_v"], found["error_w"]) == pytest.approx((0.3, 0.4))
+
+
+def test_load_increments(series):
+    """From the trim, to the larger side; bending of the larger wing; shares as of the roll."""
+    peaks = xr.DataArray([0.8, -0.5, 0.3, 0.7], dims="flight")
+    bump = xr.DataArray(np.sin(np.pi * TIME / 4), dims="time")
+    loads = {
+        "load_factor": 0.996 + peaks * bump,
+        "port_bending": 1e5 * peaks * bump,
+        "starboard_bending": -2e5 * peaks * bump,
+    }
+    found = encounter_metrics(series.assign(loads), None)
+    for mode, peak in (("off", 0.8), ("feedforward", 0.5), ("perfect", 0.3), ("autopilot", 0.7)):
+        assert found[f"encounter.{mode}.largest_load_increment"] == pytest.approx(peak)
+        assert found[f"encounter.{mode}.largest_bending_increment"] == pytest.approx(2e5 * peak)
+    share = found["encounter.removed_of_perfect.largest_load_increment"]
+    assert share == pytest.approx(0.3 / 0.5)
+    assert not any("increment" in name for name in encounter_metrics(series, None))

@@ -96,6 +96,14 @@ def test_page_has_frames_and_their_script():
     assert f"slabs per second</td><td {row}" in html and 'table class="many"' in html
 
 
+def test_page_has_the_video_and_the_animation_for_browsers_without():
+    shown = Film("The flight", "Frames.", [(b"one", "0.1 s")], 0.2, b"film", "approach.gif")
+    chapter = encounter_chapter(numbers(off=25), [], [], shown)
+    html = page(check(encounter_keys(), "test"), "name: x", {"lidar-mi": "0"}, {}, [chapter])
+    assert "<video controls" in html and 'src="data:video/mp4;base64,ZmlsbQ=="' in html
+    assert 'src="approach.gif"' in html and "for (const film of" not in html
+
+
 @pytest.mark.parametrize("mode", ["off", "perfect"])
 def test_flights_without_a_lidar_have_no_verdict(mode):
     assert encounter_chapter(numbers(**{mode: 3}), [], []).verdict is None
@@ -104,3 +112,20 @@ def test_flights_without_a_lidar_have_no_verdict(mode):
 def test_a_flight_that_is_not_rolled_has_no_ratio_of_rounding():
     (answer,) = encounter_answer(numbers(off=1e-15, autopilot=1e-12, feedforward=0, perfect=1e-12))
     assert answer.startswith("No flight rolls by more than 0.01 degrees")
+
+
+def test_loads_in_words():
+    metrics = numbers(off=2, perfect=1)
+    for mode, load in (("off", 0.75), ("autopilot", 0.78), ("perfect", 0.3)):
+        metrics[f"encounter.{mode}.largest_load_increment"] = load
+        metrics[f"encounter.{mode}.largest_bending_increment"] = 1e6 * load
+    assert encounter_answer(metrics)[1] == (
+        "The load factor changes by up to 0.75 without control, 0.78 with the autopilot "
+        "(4 % more), 0.3 with perfect preview (60 % less)."
+    )
+    # a gust on both wings alike
+    level = metrics | {f"encounter.{mode}.largest_roll": 0.0 for mode in ("off", "perfect")}
+    assert encounter_answer(level, met="air")[1] == encounter_answer(metrics)[1]
+    (table, *_) = encounter_summary(metrics, met="air")
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert rows["largest change of a wing root's bending / kN m"][0] == "750"

@@ -3,6 +3,7 @@
 Wind, textures, seeds and places are none of those that the thresholds were tried on.
 """
 
+import warnings
 from functools import partial
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 import xarray as xr
 
+from lidar_mi.retrieval.defects.impulses import height
 from lidar_mi.retrieval.defects.rest import all_at_rest, saturated
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
@@ -280,3 +282,17 @@ def test_rolled_images_without_noise(roll):
         off = np.hypot(wind.displacement_z / 0.5 - roll[0], wind.displacement_y / 0.5 - roll[1])
         assert good.mean() > 0.95
         assert float(np.median(off.values[good])) < limit
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_heights_are_above_the_median_of_the_neighbours(missing):
+    """As numpy's median has it, with ties, signed zeros and unknown pixels."""
+    random = np.random.default_rng(1)
+    image = random.integers(-6, 6, (40, 50)) * random.choice([1.0, 0.3, -0.0], (40, 50))
+    image[random.random(image.shape) < missing] = np.nan
+    around = np.pad(image, 1, mode="edge")
+    near = [around[i : i + 40, j : j + 50] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # all of the neighbours are unknown
+        expected = image - np.nanmedian(near, axis=0)
+    np.testing.assert_allclose(height(torch.as_tensor(image)), expected, rtol=0, atol=1e-15)

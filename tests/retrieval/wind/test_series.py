@@ -1,11 +1,16 @@
 """Winds of a sequence of images, pair by pair, in a wind that changes from step to step.
 
 Detects: pairs of wrong images, a wrong time or time step of a pair, vectors of one pair in the
-place of another, a sequence that ends where one pair is bad. Unit tier.
+place of another, a sequence that ends where one pair is bad, threads that disturb each other. Unit
+tier.
 """
+
+import threading
 
 import numpy as np
 import pytest
+import torch
+import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.quality import Flag
@@ -25,6 +30,14 @@ def images():
     waves = plane_waves(1, 3.0, 0.5)
     y, z = axes(48, 40)
     return [data_array(texture(waves, y - way, z[:, None]), y, z) for way in WAYS]
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 def mean(winds, name="v"):
@@ -111,3 +124,37 @@ def test_bad_arguments(images, change, words):
 def test_one_image_is_too_few(images):
     with pytest.raises(InputError, match="images: 1 are not allowed"):
         retrieve_winds(images[:1], 0.1)
+
+
+def test_a_stack_of_pairs_has_the_winds_of_one_after_the_other(images, two_threads):
+    """Bit for bit, by two threads, and with the images' noise as a stack."""
+    stack = xr.concat(images, "pair")
+    level = xr.full_like(stack, 0.01) * (1 + np.arange(4))[:, None, None]
+    winds = retrieve_winds(stack, 0.1, [(0, 1), (2, 3)], noise=level, windows=WindowSizes(stride=4))
+    for number, (first, second) in enumerate([(0, 1), (2, 3)]):
+        one = retrieve_wind(
+            images[first], images[second], 0.1, windows=WindowSizes(stride=4), noise=level[first]
+        )
+        for name in ("v", "w", "v_stderr", "w_stderr", "flag"):
+            np.testing.assert_array_equal(winds[name].values[number], one[name].values)
+
+
+def test_pairs_are_retrieved_side_by_side(images, two_threads, monkeypatch):
+    """Each of two waits for the other: one after the other they would wait for ever."""
+    both = threading.Barrier(2, timeout=60)
+
+    def waiting(*args, **options):
+        both.wait()
+        return retrieve_wind(*args, **options)
+
+    monkeypatch.setattr("lidar_mi.retrieval.wind.series.retrieve_wind", waiting)
+    winds = retrieve_winds(images, STEPS, [(0, 1), (1, 2)], windows=WindowSizes(stride=4))
+    assert winds.sizes["time"] == 2 and both.n_waiting == 0
+    assert torch.get_num_threads() == 2
+
+
+def test_a_stack_of_other_dimensions(images):
+    with pytest.raises(InputError, match="images: dimensions z, y are not allowed"):
+        retrieve_winds(images[0], 0.1)
+    with pytest.raises(InputError, match="noise: dimensions z, y, pair are not allowed"):
+        retrieve_winds(images, 0.1, noise=xr.concat(images, "pair").transpose("z", "y", "pair"))

@@ -1,0 +1,33 @@
+"""The sentence about the loads of an aircraft that rises."""
+
+from collections.abc import Mapping
+
+from lidar_mi.assessment.digits import percent, three
+from lidar_mi.assessment.metrics.encounter import MODES
+
+_ADVERBS = {
+    "off": "without control",
+    "autopilot": "with the autopilot",
+    "feedforward": "with the lidar",
+    "perfect": "with perfect preview",
+}
+
+
+def loads_answer(metrics: Mapping[str, float]) -> list[str]:
+    """Largest changes of the load factor, and what is removed of that without control.
+
+    Parameters
+    ----------
+    metrics : mapping
+        From `lidar_mi.assessment.metrics.encounter.encounter_metrics`.
+    """
+    key = "encounter.{}.largest_load_increment"
+    found = {mode: metrics[key.format(mode)] for mode in MODES if key.format(mode) in metrics}
+    if not found:
+        return []
+    parts = []
+    for mode, value in found.items():
+        below = 1 - value / found["off"] if found.get("off") else 0.0
+        side = f" ({percent(abs(below))} {'less' if below >= 0 else 'more'})"
+        parts.append(f"{three(value)} {_ADVERBS[mode]}{side if mode != 'off' else ''}")
+    return [f"The load factor changes by up to {', '.join(parts)}."]

@@ -1,0 +1,95 @@
+"""Lines of sight that a coherent Doppler lidar measures, as the data set of its files."""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.instrument.coherent.scans import LineScan
+from lidar_mi.instrument.coherent.velocity_noise import cramer_rao
+from lidar_mi.instrument.coherent.weighting import CoherentLidar, WindField, radial_velocities
+
+_START = np.datetime64("2000-01-01T00:00:00", "ns")
+
+
+def measured_lines(
+    wind: WindField,
+    scan: LineScan,
+    lidar: CoherentLidar,
+    snr: float | np.ndarray | Callable[[np.ndarray], np.ndarray],
+    *,
+    samples: float = 1e5,
+    bandwidth: float = 38.8,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    resolution: float = 1.0,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Radial velocities with noise, in the layout of `read_lines_of_sight`.
+
+    Noise is normal with the standard deviation of the Cramér-Rao bound: of weak signals, below
+    some -20 dB, real estimates have false ones in addition, which are not modelled. Gates that
+    overlap share their samples: noise at the distance x correlates by 1 - x / gate length.
+
+    Parameters
+    ----------
+    wind, scan, lidar, origin, resolution
+        As of `radial_velocities`.
+    snr : float, (gates,) array or callable of the range (m)
+        Signal-to-noise ratio of the powers, above 0.
+    samples : float
+        Of a gate times pulses of a line.
+    bandwidth : float
+        Of the receiver as a range of velocities, m/s.
+    seed : int
+
+    Returns
+    -------
+    xr.Dataset, dims (time, range)
+        `radial_velocity` (m s-1, positive away), `radial_velocity_stderr`, `radial_velocity_true`,
+        `spectral_width` (of the pulse and of the wind within the gate), `snr`, `flag` (0);
+        `azimuth` and `elevation` in degrees.
+
+    Raises
+    ------
+    InputError
+        A signal that is not above 0, or of another number of gates.
+    """
+    ranges = lidar.ranges
+    ratio = np.asarray(snr(ranges) if callable(snr) else snr, float)
+    if ratio.shape not in ((), ranges.shape):
+        raise InputError(f"snr: shape {ratio.shape} is not allowed; expected ({ranges.size},)")
+    true, spread = radial_velocities(wind, scan, lidar, origin=origin, resolution=resolution)
+    width = np.hypot(lidar.pulse_width, spread)
+    ratio = np.broadcast_to(ratio, true.shape)
+    stderr = cramer_rao(ratio, width, bandwidth, samples)
+    random = np.random.default_rng(seed)
+    shared = np.maximum(1 - np.abs(ranges - ranges[0]) / lidar.gate_length, 0.0)
+    factor = np.linalg.cholesky(scipy.linalg.toeplitz(shared) + 1e-9 * np.eye(ranges.size))
+    noise = random.standard_normal(true.shape) @ factor.T
+    both = "time", "range"
+
+    def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
+        return both, values, {"units": units, "long_name": long_name}
+
+    time = _START + np.round(scan.time * 1e9).astype("timedelta64[ns]")
+    degree = {"units": "degree"}
+    return xr.Dataset(
+        {
+            "radial_velocity": field(true + stderr * noise, "radial velocity, positive away"),
+            "radial_velocity_stderr": field(stderr, "standard error of the radial velocity"),
+            "radial_velocity_true": field(true, "radial velocity without noise"),
+            "spectral_width": field(width, "width of the Doppler spectrum"),
+            "snr": field(ratio.copy(), "signal-to-noise ratio of the powers", "1"),
+            "flag": (both, np.zeros(true.shape, np.uint16), {"flag_meanings": ""}),
+        },
+        {
+            "time": ("time", time),
+            "range": ("range", ranges, {"units": "m"}),
+            "azimuth": ("time", np.mod(np.rad2deg(scan.azimuth), 360), degree),
+            "elevation": ("time", np.rad2deg(scan.elevation), degree),
+            "sweep": ("time", scan.sweep),
+        },
+        {"Conventions": "CF-1.11", "gate_length": lidar.gate_length, "seed": seed},
+    )

@@ -1,0 +1,1 @@
+"""Lines of sight of Doppler lidars from the files of their makers: one data set for all kinds."""

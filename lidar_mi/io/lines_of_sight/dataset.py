@@ -1,0 +1,224 @@
+"""The data set of lines of sight: scans one after another on common ranges, with CF attributes."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.lines_of_sight.flags import LineFlag
+from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, PLACE, Scan
+
+_SAME_PLACE = 0.01  # degrees: of one lidar, rounded differently from file to file
+_MOST_RANGES = 4  # times the gates of a line: common ranges of lines whose gates differ
+_CENTIMETRE = 0.01
+_STANDARD = {
+    "radial_velocity": "radial_velocity_of_scatterers_away_from_instrument",
+    "azimuth": "sensor_to_target_azimuth_angle",
+    "elevation": "sensor_to_target_elevation_angle",
+    "pitch": "platform_pitch",
+    "roll": "platform_roll",
+    "latitude": "latitude",
+    "longitude": "longitude",
+    "altitude": "altitude",
+}
+
+
+def assembled(
+    scans: Sequence[tuple[str, Scan, np.ndarray]], thresholds: dict[str, float]
+) -> xr.Dataset:
+    """One data set of all scans, lines in the order of time.
+
+    Parameters
+    ----------
+    scans : sequence of (str, Scan, (lines, gates) array)
+        The file's name, a scan and its flags.
+    thresholds : dict
+        Attributes.
+
+    Raises
+    ------
+    InputError
+        Lidars at different places; gates that differ from line to line without end.
+    """
+    ranges = _common_ranges([scan for _, scan, _ in scans])
+    gates = [_gates(scan.range, ranges) for _, scan, _ in scans]
+    lines = [len(scan.time) for _, scan, _ in scans]
+    time = np.concatenate([scan.time for _, scan, _ in scans])
+    remarks = [f"{name}: {text}" for name, scan, _ in scans for text in dict.fromkeys(scan.remarks)]
+    order = np.argsort(time, kind="stable")
+    back = int((np.diff(time.astype("int64")) < 0).sum())
+    remarks += _about_times(scans, back)
+    data: dict[str, Any] = {}
+    for name, (unit, long_name) in FIELDS.items():
+        if any(name in scan.fields for _, scan, _ in scans):
+            full = np.full((sum(lines), ranges.size), np.nan, np.float32)
+            _fill(full, [scan.fields.get(name) for _, scan, _ in scans], gates, lines)
+            data[name] = ("time", "range"), full[order], _attributes(name, unit, long_name)
+    flag = np.full((sum(lines), ranges.size), LineFlag.MISSING.value, np.uint16)
+    _fill(flag, [flags for _, _, flags in scans], gates, lines)
+    masks = np.array([one.value for one in LineFlag], np.uint16)
+    data["flag"] = (
+        ("time", "range"),
+        flag[order],
+        {
+            "long_name": "reasons not to use the velocity, 0 = valid",
+            "standard_name": "quality_flag",
+            "flag_masks": masks,
+            "flag_values": masks,
+            "flag_meanings": " ".join(str(one.name).lower() for one in LineFlag),
+        },
+    )
+    coords: dict[str, Any] = {
+        "time": ("time", time[order], {"long_name": "time of the line (UTC)", "axis": "T"}),
+        "range": (
+            "range",
+            ranges,
+            {"units": "m", "long_name": "distance of the gate's centre from the lidar"},
+        ),
+    }
+    for name, long_name in ANGLES.items():
+        there = [scan.angles.get(name) for _, scan, _ in scans]
+        if any(one is not None for one in there):
+            values = [
+                np.full(n, np.nan) if v is None else v for v, n in zip(there, lines, strict=True)
+            ]
+            coords[name] = (
+                "time",
+                np.concatenate(values)[order],
+                _attributes(name, "degree", long_name),
+            )
+    sweep = np.repeat(np.arange(len(scans)), lines)
+    coords["sweep"] = "time", sweep[order], {"units": "1", "long_name": "number of the scan"}
+    for name, value in _place([scan for _, scan, _ in scans]).items():
+        coords[name] = (), value, _attributes(name, *PLACE[name])
+    found = xr.Dataset(data, coords, _about(scans) | thresholds)
+    found.attrs["scan"] = scan_kind(coords["azimuth"][1], coords["elevation"][1])
+    found.attrs["remarks"] = "\n".join(remarks + _about_values(found))
+    found["time"].encoding |= {"units": "seconds since 1970-01-01T00:00:00", "dtype": "float64"}
+    return found
+
+
+def scan_kind(azimuth: np.ndarray, elevation: np.ndarray) -> str:
+    """How a lidar scans, from its angles in degrees.
+
+    stare (one direction), rhi (elevations at one azimuth, or over the top), dbs (three to
+    five directions above 40 degrees), ppi (azimuths at one elevation or
+    at several, a VAD where they go round), or mixed.
+    """
+    east = np.cos(np.deg2rad(elevation)) * np.sin(np.deg2rad(azimuth))
+    north = np.cos(np.deg2rad(elevation)) * np.cos(np.deg2rad(azimuth))
+    up = np.sin(np.deg2rad(elevation))
+    directions = np.unique(np.round(np.stack([east, north, up], -1) * 60).astype(int), axis=0) / 60
+    if len(directions) == 1 or np.ptp(np.stack([east, north, up], -1), axis=0).max() < 0.02:
+        return "stare"
+    # of one vertical plane: the smallest spread of horizontal directions
+    slanted = np.hypot(east, north) > 0.02
+    axis = np.unique(np.round(np.mod(azimuth[slanted], 180.0)) % 180)
+    if axis.size <= 2 and np.ptp(elevation) > 2 and len(directions) > 5:
+        return "rhi"
+    if 3 <= len(directions) <= 5 and (elevation > 40).all():
+        return "dbs"
+    steps = np.unique(np.round(elevation[slanted]))
+    if steps.size <= max(1, len(directions) // 4):
+        return "ppi"
+    return "mixed"
+
+
+def _common_ranges(scans: Sequence[Scan]) -> np.ndarray:
+    values = np.concatenate([np.ravel(scan.range) for scan in scans])
+    values = values[np.isfinite(values)]
+    ranges = np.unique(np.round(values / _CENTIMETRE)) * _CENTIMETRE
+    most = max(scan.range.shape[-1] for scan in scans)
+    if ranges.size > _MOST_RANGES * most + 1:
+        raise InputError(
+            f"range: {ranges.size} different gates of lines of at most {most}; expected the same "
+            "gates in all lines, or a few kinds of lines"
+        )
+    return ranges
+
+
+def _gates(ranges: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """Index of every gate on the common ranges; -1: no such gate."""
+    known = np.isfinite(ranges)
+    nearest = np.searchsorted(common, np.where(known, ranges, common[0]) - _CENTIMETRE)
+    return np.where(known, np.minimum(nearest, common.size - 1), -1)
+
+
+def _fill(
+    full: np.ndarray,
+    parts: Sequence[np.ndarray | None],
+    gates: Sequence[np.ndarray],
+    lines: Sequence[int],
+) -> None:
+    start = 0
+    for part, index, count in zip(parts, gates, lines, strict=True):
+        if part is not None:
+            columns = np.broadcast_to(index, part.shape)
+            rows = np.broadcast_to(np.arange(start, start + count)[:, None], part.shape)
+            inside = columns >= 0
+            full[rows[inside], columns[inside]] = part[inside]
+        start += count
+
+
+def _attributes(name: str, unit: str, long_name: str) -> dict[str, str]:
+    more = {"standard_name": _STANDARD[name]} if name in _STANDARD else {}
+    return {"units": unit, "long_name": long_name, **more}
+
+
+def _place(scans: Sequence[Scan]) -> dict[str, float]:
+    """Where the lidar is, which must be one place."""
+    found: dict[str, float] = {}
+    for scan in scans:
+        for name, value in scan.place.items():
+            first = found.setdefault(name, value)
+            if name != "altitude" and abs(value - first) > _SAME_PLACE:
+                raise InputError(
+                    f"{name}: {first:g} and {value:g} degrees; expected files of one lidar "
+                    "at one place"
+                )
+    return found
+
+
+def _about(scans: Sequence[tuple[str, Scan, np.ndarray]]) -> dict[str, str | float]:
+    """Attributes that all scans share; of those that differ, all values as text."""
+    found: dict[str, str | float] = {"Conventions": "CF-1.11", "title": "Lines of sight"}
+    for key in dict.fromkeys(key for _, scan, _ in scans for key in scan.about):
+        values = list(dict.fromkeys(s.about[key] for _, s, _ in scans if key in s.about))
+        found[key] = values[0] if len(values) == 1 else ", ".join(map(str, values))
+    found["source"] = ", ".join(dict.fromkeys(name for name, _, _ in scans))
+    found["history"] = f"read by lidar-mi from {found['source']}"
+    return found
+
+
+def _about_times(scans: Sequence[tuple[str, Scan, np.ndarray]], back: int) -> list[str]:
+    """Remarks on lines out of order, scans that overlap in time and lines that are there twice."""
+    remarks = []
+    within = sum(int((np.diff(s.time.astype("int64")) < 0).sum()) for _, s, _ in scans)
+    if within:
+        remarks.append(f"time goes back {within} times within a scan; lines are sorted by time")
+    elif back:
+        remarks.append("the scans are not in the order of time; lines are sorted by time")
+    spans = sorted((s.time.min(), s.time.max(), name) for name, s, _ in scans)
+    overlaps = [f"{one[2]} and {other[2]}" for one, other in pairwise(spans) if other[0] < one[1]]
+    if overlaps:
+        remarks.append(f"scans overlap in time: {', '.join(overlaps[:3])}; all lines are kept")
+    keys = [
+        key
+        for _, s, _ in scans
+        for key in zip(s.time.tolist(), s.angles["azimuth"], s.angles["elevation"], strict=True)
+    ]
+    if twice := len(keys) - len(set(keys)):
+        remarks.append(f"{twice} lines have the time and the direction of another; all are kept")
+    return remarks
+
+
+def _about_values(found: xr.Dataset) -> list[str]:
+    """Remarks on gates without any value."""
+    empty = ~np.isfinite(found["radial_velocity"].values).any(0)
+    if not empty.any():
+        return []
+    where = found["range"].values[empty]
+    return [f"{int(empty.sum())} gates, {where[0]:g} to {where[-1]:g} m, have no value in any line"]

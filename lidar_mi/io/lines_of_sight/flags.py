@@ -1,0 +1,192 @@
+"""Why a value of a line of sight is not to be used: blind range, weak signal, hard targets."""
+
+import enum
+import math
+
+import numpy as np
+
+from lidar_mi.io.lines_of_sight.scan import Scan
+
+MIN_CNR = {"WindCube": -27.0, "": -21.0}
+"""Least signal-to-noise ratio, dB, by kind of file.
+
+Below it, estimates of the velocity become uniform noise. -21 dB: SNR 0.008, of the wind profiles of
+ARM's Halo lidars (Newsom et al., Doppler Lidar Wind Value-Added Product, DOE/SC-ARM-TR-148, 2015).
+-27 dB is in use for scanning WindCubes; it is not derived, and the status of their own software
+rejects as well.
+"""
+
+BLIND_RANGE = {"Halo Photonics (hpl)": 90.0, "ARM": 90.0, "": 0.0}
+"""Range up to which the outgoing pulse is seen, m: three gates of 30 m of Halo Photonics' lidars.
+
+WindCube's gates begin behind it. Of others it is not known.
+"""
+
+HARD_TARGET_DB = 10.0
+"""Rise of the signal over the gates before it, dB.
+
+Aerosol changes by less within a few gates; a wall returns orders of magnitude more.
+"""
+HARD_TARGET_SPEED = 0.3
+"""Largest speed of a hard target, m/s: at rest, to a few steps of the velocity."""
+HARD_TARGET_ELEVATION = 30.0
+"""Largest elevation of hard targets, degrees: above it, bright gates are clouds."""
+
+_BEFORE = 5  # gates whose median is the signal before a target
+# of a reflection of the outgoing pulse: its speed does not depend on direction to this, m/s
+_SAME = 0.1
+_LONGEST_PULSES = 4  # gate lengths that a reflection may cover
+
+
+class LineFlag(enum.IntFlag):
+    """Reasons not to use a velocity of a line of sight; 0: valid."""
+
+    MISSING = 1
+    """No value, or no such gate of this line."""
+    BLIND_RANGE = 2
+    """The outgoing pulse, or its reflection in the lidar, is in the gate."""
+    LOW_CNR = 4
+    """The signal is too weak."""
+    HARD_TARGET = 8
+    """A target that stands, such as a building, is in the gate or before it."""
+    REJECTED = 16
+    """The lidar's own software rejects the value."""
+
+
+def flags(
+    scan: Scan, min_cnr: float | None = None, blind_range: float | None = None
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Flags (lines, gates) of a scan, and the thresholds that they were made with.
+
+    Parameters
+    ----------
+    scan : Scan
+        Reflections and overlapping gates that are found are added to its remarks.
+    min_cnr : float, optional
+        dB; default: `MIN_CNR` of the kind of file.
+    blind_range : float, optional
+        m; default: `BLIND_RANGE` of the kind of file, and behind it gates that measure the same
+        velocity in all directions.
+    """
+    kind = str(scan.about.get("kind", ""))
+    given = blind_range is not None
+    limit = MIN_CNR.get(kind, MIN_CNR[""]) if min_cnr is None else min_cnr
+    blind = BLIND_RANGE.get(kind, BLIND_RANGE[""]) if blind_range is None else blind_range
+    velocity, snr = scan.fields["radial_velocity"], scan.fields.get("snr")
+    found = np.zeros(velocity.shape, np.uint16)
+    found[~np.isfinite(velocity)] |= LineFlag.MISSING.value
+    overlap = 1.0
+    if snr is not None:
+        # as the total power would be none: never written
+        found[snr <= -1.0] |= LineFlag.MISSING.value
+        overlap = overlapping(scan, snr, limit)
+        found[np.isfinite(velocity) & ~(snr >= 10 ** (limit / 10))] |= LineFlag.LOW_CNR.value
+    near = np.broadcast_to(scan.range < blind, velocity.shape).copy()
+    if not given:
+        near |= reflection(scan, overlap)
+    found[near] |= LineFlag.BLIND_RANGE.value
+    if snr is not None:
+        found[hard_targets(scan, snr, found != 0, overlap)] |= LineFlag.HARD_TARGET.value
+    if scan.rejected is not None:
+        found[scan.rejected] |= LineFlag.REJECTED.value
+    return found, {"min_cnr": limit, "blind_range": blind}
+
+
+def overlapping(scan: Scan, snr: np.ndarray, limit: float) -> float:
+    """How many neighbouring gates share their samples, from the correlation of the noise; 1: none.
+
+    Noise of gates of n samples that are one sample apart correlates by 1 - 1/n. If the file's
+    ranges say that the gates are adjacent, this is remarked.
+    """
+    if scan.range.ndim > 1 or snr.shape[1] < 40:
+        return 1.0
+    # gates of the far half in which no line has a signal
+    noise = np.where(snr > -1.0, snr, np.nan)[:, snr.shape[1] // 2 :]
+    noise = noise[:, (noise < 10 ** (limit / 10)).all(0)]
+    if noise.size < 400 or noise.shape[1] < 150:
+        return 1.0
+    # by structure functions, which offsets of the background do not change
+    far = np.mean([_structure(noise, lag) for lag in range(60, 80)])
+    first = _structure(noise, 1)
+    if not (far > 0 and first / far < 0.5):
+        return 1.0
+    count = float(far / first)
+    # of as many samples as the file says, if the noise agrees
+    samples = float(scan.about.get("samples_per_gate", np.nan))
+    count = samples if abs(count / samples - 1) < 0.3 else count
+    step = float(np.median(np.diff(scan.range)))
+    length = float(scan.about.get("gate_length", step))
+    if step > 0.7 * length:
+        scan.remarks.append(
+            f"noise of neighbouring gates correlates by {1 - first / far:.2f}, as of gates that "
+            f"overlap {count:.0f}-fold, but range has steps of {step:g} m for gates of {length:g} "
+            f"m: ranges may be {count:.0f} times too long (range_step: '{length / count:.3g} m')"
+        )
+    return count
+
+
+def _structure(values: np.ndarray, lag: int) -> float:
+    return float(np.mean((values[:, lag:] - values[:, :-lag]) ** 2))
+
+
+def reflection(scan: Scan, overlap: float = 1.0) -> np.ndarray:
+    """First gates in which the velocity does not depend on direction, (gates,) or (lines, gates).
+
+    They hold the reflection of the outgoing pulse, not air. Found in scans that look round at less
+    than 80 degrees of elevation and that see wind behind it.
+    """
+    velocity = scan.fields["radial_velocity"]
+    none = np.zeros(scan.range.shape, bool)
+    slanted = np.abs(scan.angles["elevation"]) < 80
+    azimuth = np.unique(np.round(scan.angles["azimuth"][slanted]))
+    gaps = np.diff(azimuth, append=azimuth[:1] + 360)
+    if scan.range.ndim > 1 or azimuth.size < 4 or gaps.max() > 120:
+        return none
+    most = math.ceil(_LONGEST_PULSES * overlap)
+    spread = np.nanstd(velocity[slanted][:, : 2 * most], axis=0)
+    same = spread < _SAME
+    count = int(np.argmin(same)) if not same.all() else 0
+    behind = spread[count + math.ceil(overlap) : count + 3 * math.ceil(overlap)]
+    if not (0 < count <= most and behind.size and np.nanmedian(behind) > 5 * _SAME):
+        return none
+    # the gates in which reflection and air mix
+    count += math.ceil(overlap / 2)
+    none[:count] = True
+    scan.remarks.append(
+        f"the first {count} gates, to {scan.range[count - 1]:g} m, measure the same velocity in "
+        "all directions, the reflection of the pulse: flagged as blind"
+    )
+    return none
+
+
+def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 1.0) -> np.ndarray:
+    """Gates (lines, gates) with a target at rest, those that its pulse fills, and all behind it.
+
+    A target is at most at `HARD_TARGET_ELEVATION`, returns `HARD_TARGET_DB` more than the gates
+    before it and moves by less than `HARD_TARGET_SPEED`.
+    """
+    velocity = scan.fields["radial_velocity"]
+    found = np.zeros(snr.shape, bool)
+    low = np.abs(scan.angles["elevation"]) <= HARD_TARGET_ELEVATION
+    if not low.any() or snr.shape[1] <= 2 * _BEFORE:
+        return found
+    width = math.ceil(overlap)
+    usable = np.where(bad, np.nan, snr)
+    for line in np.flatnonzero(low):
+        bright = 10 ** (HARD_TARGET_DB / 10) * _median_before(usable[line], width)
+        still = np.abs(velocity[line]) < HARD_TARGET_SPEED
+        (gates,) = np.nonzero(still & (usable[line] > bright))
+        if gates.size:
+            found[line, max(gates[0] - width, 0) :] = True
+    return found
+
+
+def _median_before(snr: np.ndarray, width: int) -> np.ndarray:
+    """Median of the gates before each, (gates,), but its direct neighbours; NaN: too few."""
+    reach = _BEFORE * width
+    padded = np.concatenate([np.full(reach + width, np.nan), snr])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, reach)[: snr.size]
+    enough = np.isfinite(windows).sum(1) >= min(3, _BEFORE)
+    median = np.full(snr.size, np.nan)
+    median[enough] = np.nanmedian(windows[enough], axis=1)
+    return median

@@ -1,0 +1,1 @@
+"""Wind from lines of sight of a Doppler lidar on the ground."""

@@ -1,0 +1,184 @@
+"""Profiles of the wind as a CF data set."""
+
+import enum
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+_COMPONENTS = {
+    "u": ("eastward_wind", "wind to the east"),
+    "v": ("northward_wind", "wind to the north"),
+    "w": ("upward_air_velocity", "wind upwards"),
+}
+
+
+MAX_CONDITION = 100.0
+"""Largest condition number of the lines of a valid wind.
+
+Beyond it the component that they know least has a hundred times the error of the best.
+"""
+
+MIN_FRACTION = 0.5
+"""Least fraction of the lines at a height that are valid.
+
+Where most lines see nothing, those few that pass the threshold of the signal are mostly noise.
+"""
+
+MAX_STDERR = 5.0
+"""Largest standard error of the horizontal vector of a valid wind, m/s: as large as most winds."""
+
+
+class WindFlag(enum.IntFlag):
+    """Reasons not to use a wind; 0: valid."""
+
+    TOO_FEW_LINES = 1
+    """Fewer than three valid lines or than `MIN_FRACTION`, or lines in one plane."""
+    ILL_CONDITIONED = 2
+    """The lines hardly know one component: `MAX_CONDITION`."""
+    OUTLIERS = 4
+    """More than a third of the lines are outliers."""
+    ERROR_UNKNOWN = 8
+    """No residual and no stated noise tells the error."""
+    UNCERTAIN = 16
+    """The standard error of the horizontal wind is above `MAX_STDERR`."""
+
+
+@dataclass(eq=False)
+class Profile:
+    """Winds of one scan.
+
+    Attributes
+    ----------
+    time : datetime64
+    heights : (levels,) array
+        m above the lidar.
+    wind : (levels, 3) array
+    covariance : (levels, 3, 3) array
+    residual, condition : (levels,) arrays
+    dof, lines, outliers, flag : (levels,) arrays of int
+    """
+
+    time: np.datetime64
+    heights: np.ndarray
+    wind: np.ndarray
+    covariance: np.ndarray
+    residual: np.ndarray
+    condition: np.ndarray
+    dof: np.ndarray
+    lines: np.ndarray
+    outliers: np.ndarray
+    flag: np.ndarray
+
+
+def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr.Dataset:
+    """All profiles on common heights, in the order of time.
+
+    Parameters
+    ----------
+    profiles : sequence of Profile
+        Heights that differ by less than 1 cm are one.
+    about : mapping
+        Attributes of the lines of sight.
+    """
+    heights = np.unique(np.round(np.concatenate([one.heights for one in profiles]), 2))
+    order = sorted(profiles, key=lambda one: one.time)
+    index = [np.searchsorted(heights, np.round(one.heights, 2)) for one in order]
+
+    def full(values: Sequence[np.ndarray], missing: float = np.nan) -> np.ndarray:
+        found = np.full((len(order), heights.size), missing, np.asarray(values[0]).dtype)
+        for row, (places, one) in enumerate(zip(index, values, strict=True)):
+            found[row, places] = one
+        return found
+
+    wind = {n: full([one.wind[:, k] for one in order]) for k, n in enumerate(_COMPONENTS)}
+    data: dict[str, Any] = {}
+    for name, (standard, long_name) in _COMPONENTS.items():
+        data[name] = _variable(wind[name], long_name, "m s-1", standard_name=standard)
+    error = np.stack(
+        [
+            np.stack([full([one.covariance[:, a, b] for one in order]) for b in range(3)], -1)
+            for a in range(3)
+        ],
+        -2,
+    )
+    stderr = np.sqrt(np.einsum("...aa->...a", error))
+    for k, (name, (standard, long_name)) in enumerate(_COMPONENTS.items()):
+        data[f"{name}_stderr"] = _variable(
+            stderr[..., k],
+            f"standard error of the {long_name}",
+            "m s-1",
+            standard_name=f"{standard} standard_error",
+        )
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        one, other = "uvw"[a], "uvw"[b]
+        data[f"{one}{other}_correlation"] = _variable(
+            error[..., a, b] / (stderr[..., a] * stderr[..., b]),
+            f"correlation of the errors of {one} and {other}",
+            "1",
+        )
+    speed = np.hypot(wind["u"], wind["v"])
+    direction = np.mod(np.rad2deg(np.arctan2(-wind["u"], -wind["v"])), 360.0)
+    data["wind_speed"] = _variable(
+        speed, "speed of the horizontal wind", "m s-1", standard_name="wind_speed"
+    )
+    data["wind_from_direction"] = _variable(
+        direction,
+        "direction from which the wind blows, clockwise from north",
+        "degree",
+        standard_name="wind_from_direction",
+    )
+    for name, long_name, unit in (
+        ("residual", "rms of the lines' residuals about a uniform wind", "m s-1"),
+        ("condition", "condition number of the directions", "1"),
+    ):
+        data[name] = _variable(full([getattr(one, name) for one in order]), long_name, unit)
+    for name, long_name in (
+        ("dof", "degrees of freedom of the error"),
+        ("lines", "lines used"),
+        ("outliers", "lines left out as outliers"),
+    ):
+        values = full([getattr(one, name) for one in order], 0).astype(np.int32)
+        data[name] = (("time", "height"), values, {"long_name": long_name, "units": "1"})
+    missing = WindFlag.TOO_FEW_LINES.value
+    masks = np.array([one.value for one in WindFlag], np.uint16)
+    data["flag"] = (
+        ("time", "height"),
+        full([one.flag for one in order], missing).astype(np.uint16),
+        {
+            "long_name": "reasons not to use the wind, 0 = valid",
+            "standard_name": "quality_flag",
+            "flag_masks": masks,
+            "flag_values": masks,
+            "flag_meanings": " ".join(str(one.name).lower() for one in WindFlag),
+        },
+    )
+    coords = {
+        "time": (
+            "time",
+            np.array([one.time for one in order]).astype("datetime64[ns]"),
+            {"long_name": "mean time of the lines (UTC)", "axis": "T"},
+        ),
+        "height": (
+            "height",
+            heights,
+            {"units": "m", "long_name": "height above the lidar", "axis": "Z", "positive": "up"},
+        ),
+    }
+    kept = {
+        name: about[name]
+        for name in ("instrument", "kind", "scan", "source", "remarks")
+        if name in about
+    }
+    found = xr.Dataset(
+        data, coords, {"Conventions": "CF-1.11", "title": "Winds from lines of sight", **kept}
+    )
+    found["time"].encoding |= {"units": "seconds since 1970-01-01T00:00:00", "dtype": "float64"}
+    return found
+
+
+def _variable(values: np.ndarray, long_name: str, units: str, **more: str) -> tuple[Any, ...]:
+    about = {"long_name": long_name, "units": units, **more}
+    return ("time", "height"), values.astype(np.float32), about

@@ -1,0 +1,79 @@
+"""``lidar-mi winds``. System tier.
+
+Detects: winds that differ from those in Python, a remark that is not told, a file that is replaced,
+an input that ends in more than a line.
+"""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import lidar_mi as lm
+from lidar_mi.assessment.figures.wind_profile import draw_wind_profiles
+from tests.support import line_files as made
+from tests.support.command_line import shell, words_of
+
+
+@pytest.fixture
+def scan(tmp_path):
+    path = tmp_path / "vad.hpl"
+    path.write_text(made.halo_text(made.lines(), promised=9))
+    return path
+
+
+def test_winds_of_a_scan(scan, tmp_path):
+    done = shell("winds", scan, "--noise", "0.02 m/s", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    words = words_of(done.stdout)
+    assert "remark: vad.hpl: the header promises 9 rays, the file has 6" in words
+    assert "17 of 17 winds are valid, of 1 profiles" in words
+    with xr.open_dataset(tmp_path / "winds.nc") as found:
+        expected = lm.fit_winds_to_lines(lm.read_lines_of_sight(scan), noise=0.02)
+        for name, known in zip("uvw", made.WIND, strict=True):
+            np.testing.assert_allclose(found[name], expected[name], atol=1e-6)
+            assert (np.abs(found[name] - known) < 5 * found[f"{name}_stderr"]).all()
+    assert (tmp_path / "winds.png").stat().st_size > 10_000
+    table = shell("winds", scan, "-o", "winds.csv", "--interval", "1 min", cwd=tmp_path)
+    assert table.returncode == 0, table.stderr
+    assert (tmp_path / "winds.csv").read_text().startswith("time,height")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("missing.hpl",), "missing.hpl: No such file or directory"),
+        (("vad.hpl", "--name", "azimuth"), "--name: 'azimuth' is not allowed; expected OURS="),
+        (("vad.hpl", "--noise", "fast"), "--noise: 'fast' is not allowed"),
+        (("vad.hpl", "-o", "vad.hpl"), "vad.hpl: is an input"),
+        (("vad.hpl", "-o", "winds.txt"), "winds.txt: .txt is not allowed; expected .nc or .csv"),
+        (("vad.hpl", "--min-cnr", "90"), "no scan has three valid lines"),
+    ],
+)
+def test_bad_input_is_one_line(scan, tmp_path, arguments, message):
+    done = shell("winds", *arguments, cwd=tmp_path)
+    assert done.returncode == 2 and message in words_of(done.stderr)
+    assert done.stderr.count("\n") == 1
+
+
+def test_many_profiles_are_drawn_as_maps():
+    one = made.lines()
+    data = xr.Dataset(
+        {
+            name: (("time", "height"), np.full((8, 5), value, float))
+            for name, value in (
+                ("u", 1),
+                ("v", 2),
+                ("w", 0.1),
+                ("wind_speed", 2.2),
+                ("wind_from_direction", 207),
+                ("u_stderr", 0.1),
+                ("v_stderr", 0.1),
+                ("w_stderr", 0.1),
+                ("uv_correlation", 0),
+                ("flag", 0),
+            )
+        },
+        {"time": one.time[0] + np.arange(8) * np.timedelta64(60, "s"), "height": np.arange(5.0)},
+    )
+    assert len(draw_wind_profiles(data).axes) == 6
+    assert len(draw_wind_profiles(data.isel(time=[0])).axes) == 3
