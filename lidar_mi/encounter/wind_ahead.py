@@ -186,7 +186,8 @@ def _without(
     """Vectors (2, nz, ny) without the vortices, and the variance that this adds to them.
 
     A vector is a mean of the wind. Near a core it is between that over the window and that over
-    what is resolved elsewhere: retrievals resolve more where there is more.
+    what is resolved elsewhere, a Gaussian as wide as the window at least: retrievals resolve more
+    where there is more.
     """
     vectors = slab.vectors
     if vortices is None:
@@ -194,6 +195,6 @@ def _without(
     least = vectors.window / np.sqrt(12)
     y, z = np.meshgrid(vectors.y, vectors.z)
     place = np.full(y.shape, slab.x), y, z, np.full(y.shape, slab.time)
-    fine, coarse = (vortices(*place, width) for width in (least, max(least, resolution)))
+    fine, coarse = (vortices(*place, width) for width in (least, max(vectors.window, resolution)))
     # uniform between both
     return vectors.wind - (fine + coarse) / 2, (fine - coarse) ** 2 / 12

@@ -229,7 +229,7 @@ def test_flight_in_turbulence_rolls_less_and_is_replayed(tmp_path, monkeypatch):
     from lidar_mi.encounter.air import air_along_path
 
     monkeypatch.setattr("lidar_mi.encounter.report.draw_all", lambda *_: [])
-    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.MOST_FRAMES", 2)
+    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 2)
     experiment = flight()
     lidar = WithVectors(wake_along_path(experiment), air_along_path(experiment).wind, pairs=False)
     first = lm.fly(experiment, tmp_path / "one", lidar=lidar, notice=silent)
