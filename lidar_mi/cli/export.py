@@ -1,12 +1,13 @@
 """``lidar-mi export``: results of a run for ParaView, a spreadsheet, MATLAB, control design."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from lidar_mi.cli.options import starting
-from lidar_mi.cli.terminal import output
+from lidar_mi.cli.terminal import errors, output
 
 EXAMPLES = (
     "lidar-mi export outputs/wake_sensor",
@@ -50,7 +51,9 @@ def export(
     if format == "control":
         from lidar_mi.encounter.export_control import export_control
 
-        paths = export_control(folder, out, overwrite=overwrite)
+        paths = export_control(
+            folder, out, overwrite=overwrite, remark=partial(errors.print, soft_wrap=True)
+        )
     else:
         from lidar_mi.experiment import export as exporting
 

@@ -1,5 +1,7 @@
 """Flights' lidars as blocks for control design, as files of NumPy and MATLAB."""
 
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,11 @@ ABOUT = "blocks.json"
 
 @checked_arguments
 def export_control(
-    folder: str | Path, out: str | Path | None = None, *, overwrite: bool = False
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    overwrite: bool = False,
+    remark: Callable[[str], object] | None = None,
 ) -> list[Path]:
     """Identify the lidar of flights as a linear filter with delay and coloured noise, and write it.
 
@@ -37,6 +43,9 @@ def export_control(
         Folder of the files. Default: ``control`` in ``folder``.
     overwrite : bool
         Replace files that are there.
+    remark : callable, optional
+        Called with a line for every range that cannot be identified beside others that can.
+        Default: a warning.
 
     Returns
     -------
@@ -47,7 +56,8 @@ def export_control(
     Raises
     ------
     InputError
-        No flight with a lidar, one without wind vectors, too few slabs, a file that is there.
+        No flight with a lidar, one without wind vectors, too few slabs at every range, a file that
+        is there.
 
     Examples
     --------
@@ -58,14 +68,23 @@ def export_control(
     out = folder / "control" if out is None else Path(out)
     groups = list(pooled([samples_of(one) for one in flights_in(folder)]))
     blocks = dict(zip(_names([group[0].distance for group in groups]), groups, strict=True))
-    paths = [out / f"{name}{kind}" for name in blocks for kind in (".npz", ".mat")]
+    found, refused = {}, []
+    for name, group in blocks.items():
+        try:
+            found[name] = control_block(group)
+        except InputError as error:
+            refused.append(error)
+    if not found:
+        raise refused[0]
+    paths = [out / f"{name}{kind}" for name in found for kind in (".npz", ".mat")]
     paths.append(out / ABOUT)
     there = [path for path in paths if path.exists()]
     if there and not overwrite:
         raise InputError(
             f"{there[0]}: exists; expected another folder (-o DIR), or --overwrite to replace it"
         )
-    found = {name: control_block(group) for name, group in blocks.items()}
+    for one in refused:
+        (remark or warnings.warn)(str(one))
     make_folder(out)
     for name, block in found.items():
         write_npz(out / f"{name}.npz", block)

@@ -119,12 +119,14 @@ def slabs_of(lidar):
     )
 
 
-def record(folder, one, seed):
+def record(folder, one, seed, latency=LATENCY):
     """A flight as `lidar-mi fly` leaves it, as far as the export reads it."""
     folder.mkdir(parents=True)
     about = {"experiment": settings(one), "versions": {}}
     (folder / "experiment.yaml").write_text(to_yaml(about))
-    write_netcdf(slabs_of(KnownLidar(one, seed)), folder / "slabs.nc")
+    slabs = slabs_of(KnownLidar(one, seed))
+    slabs["delivered"] = slabs["delivered"] + latency - LATENCY
+    write_netcdf(slabs, folder / "slabs.nc")
     write_netcdf(xr.Dataset(), folder / "flight.nc")
 
 
@@ -316,6 +318,14 @@ def test_the_example_flies_along_recorded_flights(flights, block, capsys, monkey
     assert example()["AILERON_MOMENT"] == pytest.approx(
         aircraft_of(experiment().encounter).control_moments[0, 0], rel=1e-3
     )
+
+
+def test_a_range_of_few_slabs_does_not_hide_the_others(tmp_path):
+    record(tmp_path / "long", experiment(start="400 m", beyond="300 m"), 1)
+    record(tmp_path / "short", experiment(start="300 m", beyond="100 m"), 1, latency=0.2)
+    with pytest.warns(UserWarning, match="control block at 150 m: v: 30 slabs in succession"):
+        paths = lm.export_control(tmp_path)
+    assert [path.name for path in paths] == ["block_150m.npz", "block_150m.mat", "blocks.json"]
 
 
 def test_folders_without_what_is_needed_are_refused(tmp_path, flights):

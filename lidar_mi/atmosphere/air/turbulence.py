@@ -18,7 +18,7 @@ Spectrum = Literal["von_karman", "kolmogorov"]
 Evolution = Literal["frozen", "turnover", "sweeping"]
 
 VON_KARMAN = 1.339
-"""Constant a of von Karman's spectrum: sqrt(pi) Gamma(5/6) / Gamma(1/3), rounded."""
+"""Constant a of von Karman's spectrum: Gamma(1/3) / (sqrt(pi) Gamma(5/6)), rounded."""
 
 KOLMOGOROV_ONSET = (55 / (9 * math.pi) * VON_KARMAN ** (-5 / 3)) ** 1.5
 """First wavenumber of the Kolmogorov spectrum times L: its inertial range is von Karman's."""
