@@ -1,5 +1,6 @@
 """The points of a campaign as one data set."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,8 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
     -------
     xr.Dataset
         Dimensions in the order of the description, then ``member`` if there are several. A point
-        without metrics has NaN, and its ``status`` and ``message`` say why.
+        without metrics has NaN, and its ``status`` and ``message`` say why. A metric with the name
+        of a swept key is ``NAME.metric``: the time ahead of flights, where the distance is swept.
     """
     points = folder.points
     total = len(points)
@@ -124,7 +126,8 @@ def _data_set(
         coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})
     # sorted: the file does not depend on which point has a metric first
     variables: dict[str, Any] = {
-        key: (dims, values[key].reshape(shape), _about(key)) for key in sorted(values)
+        _beside(key, coords): (dims, values[key].reshape(shape), _about(key))
+        for key in sorted(values)
     }
     variables["status"] = (
         dims,
@@ -154,6 +157,11 @@ def knob_name(key: str) -> str:
     """What a key of an experiment is called on an axis: ``doppler.lidar.range``, as words."""
     words = key.replace("doppler.lidar.", "Doppler lidar ").replace("doppler.", "Doppler lidar's ")
     return words.replace(".", " ").replace("_", " ")
+
+
+def _beside(key: str, coords: Mapping[str, Any]) -> str:
+    """Name of a metric that is not that of a key of the campaign."""
+    return f"{key}.metric" if key in coords else key
 
 
 def _about(key: str) -> dict[str, str]:

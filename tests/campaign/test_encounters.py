@@ -4,6 +4,7 @@ Detects: points that are run instead of flown, images taken for shared ones, a d
 not that of the flights.
 """
 
+import json
 import math
 import re
 
@@ -15,9 +16,12 @@ from lidar_mi.campaign.collect import collect
 from lidar_mi.campaign.engine import prepare_campaign
 from lidar_mi.campaign.worker import carry_out
 from lidar_mi.encounter.fly import fly
+from lidar_mi.experiment.folder.records import METRICS
+
+CIRCULATION = {"wake.vortex_pair.circulation": {"linear": ["10 m^2/s", "300 m^2/s"]}}
 
 
-def carried_out(folder, keep, mode, count):
+def carried_out(folder, keep, mode, count, over=CIRCULATION):
     """A campaign of flights without a lidar, in the mode of control off or perfect."""
     base = {
         "name": "base",
@@ -40,11 +44,7 @@ def carried_out(folder, keep, mode, count):
         "base": "base.yaml",
         "seed": 1,
         "keep": keep,
-        "sample": {
-            "method": "latin_hypercube",
-            "n": count,
-            "over": {"wake.vortex_pair.circulation": {"linear": ["10 m^2/s", "300 m^2/s"]}},
-        },
+        "sample": {"method": "latin_hypercube", "n": count, "over": over},
     }
     path = folder / "encounters.yaml"
     path.write_text(yaml.safe_dump(described))
@@ -78,3 +78,15 @@ def test_everything_of_a_flight_is_kept(tmp_path, monkeypatch):
     ready = carried_out(tmp_path, "everything", "off", 2)
     names = {entry.name for entry in (ready.place(0) / "run").iterdir()}
     assert {"experiment.yaml", "flight.nc"} <= names
+
+
+def test_a_metric_may_have_the_name_of_a_swept_key(tmp_path):
+    """The time ahead and the distance ahead are both `encounter.look_ahead`."""
+    key = "encounter.look_ahead"
+    ready = carried_out(tmp_path, "metrics", "off", 2, {key: {"linear": ["100 m", "200 m"]}})
+    for number, seconds in enumerate((1.5, 2.5)):
+        path = ready.place(number) / METRICS
+        path.write_text(json.dumps(json.loads(path.read_text()) | {key: seconds}))
+    data = collect(ready)
+    assert data[f"{key}.metric"].values.tolist() == [1.5, 2.5]
+    assert (data[key] >= 100).all() and data[key].attrs["units"] == "m"
