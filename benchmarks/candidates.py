@@ -1,4 +1,4 @@
-"""Places of single scattering selected by their contribution, against places drawn at random.
+"""Paths of single scattering selected by their contribution, against paths drawn at random.
 
 A pulse of 10 ns in the paper's scan: it is 1.5 m long, the gate and the slab of the wake 2.5 m.
 Efficiency = 1 / (variance x time).
@@ -47,7 +47,7 @@ def compare(repeats: int = 5, samples: int = 64, columns: int = 219, rows: int =
             row(case, "variance x time", "s", costs["many"], costs["one"], "lower"),
         ]
     return Comparison(
-        f"Places of single scattering by contribution ({columns} x {rows} beams, 10 ns)",
+        f"Paths of single scattering by contribution ({columns} x {rows} beams, 10 ns)",
         f"{CANDIDATES} candidates",
         "one",
         tuple(lines),

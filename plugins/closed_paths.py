@@ -108,6 +108,14 @@ def closing_distance(offset: Vector, direction: Vector, path: Float) -> Float:
     return dr.select(path > length, end, -1)
 
 
+def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[Float, Float]:
+    """The closing distance of a flight from a point, and d(distance)/d(path)."""
+    distance = closing_distance(origin - goal, direction, path)
+    back = dr.normalize(goal - (origin + direction * distance))
+    # a vertex farther by ds lengthens the path by ds less its component along the way back
+    return distance, dr.rcp(1 - dr.dot(direction, back))
+
+
 def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: Float) -> Float:
     """Distance of a vertex in front of the point where the beam would close the path.
 

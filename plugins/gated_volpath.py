@@ -16,10 +16,10 @@ Parameter                    Type    Meaning                                    
                                      ``analog``: free flights from their physical
                                      distribution, most samples miss the gate (for
                                      validation)
-``candidates``               int     places in the gate and pulse, of which the single          1
-                                     scattering of a sample takes one by its contribution:
-                                     with 16 a long pulse at a bright slab needs 25 to 50
-                                     times fewer samples, each of which takes twice as long
+``candidates``               int     light paths, of which the single scattering of a sample   1
+                                     takes one by its contribution: with 16 a long pulse at a
+                                     bright slab needs 25 to 50 times fewer samples, each of
+                                     which takes twice as long
 ``orders``                   bool    also give S0 of every scattering order                  false
 ``covariance``               bool    also give the standard error of S1 and the correlation  false
                                      of the errors of S0 and S1 (for the error of the
@@ -36,9 +36,9 @@ the gated estimator every sample belongs to a gate and has a range R in it. The 
 scattering order is placed so that the whole path is 2 R long: on the ellipsoid whose foci are the
 last but one vertex and the telescope point. Its direction is drawn preferably into the field of
 view; of two candidates one is selected in proportion to its contribution (Talbot, Cline & Egbert
-2005). With several ``candidates`` so is the place of single scattering, among places in as many
-equally probable parts of the gate and the pulse; gradients, and scenes with open surfaces between
-media, have one.
+2005). With several ``candidates`` so is the path of single scattering: each has a ray of the
+laser and a point of the telescope of its own, and its place in another of as many equally probable
+parts of the gate and the pulse. Gradients, and scenes with open surfaces between media, have one.
 
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
 ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
@@ -412,8 +412,8 @@ def define() -> type:
             else:
                 near += 2 * sample.delay
                 many = dr.opaque(mi.UInt32, self.candidates)
-                place, weight = lidar.by_contribution(sample, near, near + width, many)
-                stokes = lidar.single(sample, place, weight * width)
+                chosen, place, weight = lidar.by_contribution(sample, near, near + width, many)
+                stokes = lidar.single(chosen, place, weight * width)
             if self.orders:
                 add(by_order, stokes[0], cell * self.max_order)
             if self.max_order > 1:

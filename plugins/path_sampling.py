@@ -13,7 +13,14 @@ import mitsuba as mi
 
 from .bodies import slabs
 from .bounds import Bounds
-from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
+from .closed_paths import (
+    OpenPath,
+    closed,
+    closing_distance,
+    near_density,
+    quarter_turn,
+    sample_near,
+)
 from .gate_sampling import pulse_in_gate
 from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
@@ -106,27 +113,37 @@ class Lidar:
     def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
         """Samples of beams by their index, with independent random numbers."""
         rng = generator(seed, beam, number)
-        sensor, laser = self.sensor, self.sensor.laser
+        sensor = self.sensor
         to_world = sensor.world_transform()
         frame = sensor.beam_frame(beam)
         start, time = sensor.beam_origin(beam), sensor.beam_time(beam)
-        origin, direction = laser.sample_local(pair(rng), pair(rng))
+        origin, direction, aperture = self._ends(rng, frame, start)
+        axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
+        delay = mi.Float(0)
+        if sensor.laser.pulse_duration > 0:
+            delay = self.pulse_sigma * mi.warp.square_to_std_normal(pair(rng)).x
+        stokes = self._emitted(axes, direction)
+        return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
+
+    def _ends(self, rng: Generator, frame: Frame, start: Point) -> tuple[Point, Vector, Point]:
+        """Origin and direction of a ray of the laser, and a point of the telescope."""
+        sensor, to_world = self.sensor, self.sensor.world_transform()
+        origin, direction = sensor.laser.sample_local(pair(rng), pair(rng))
         origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(origin)))
         direction = dr.normalize(to_world @ frame.to_world(direction))
         aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
-        axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
-        delay = mi.Float(0)
-        if laser.pulse_duration > 0:
-            delay = self.pulse_sigma * mi.warp.square_to_std_normal(pair(rng)).x
-        stokes = [mi.Float(1)]
-        if mi.is_polarized:
-            stokes = rotate_stokes(
-                [mi.Float(s) for s in laser.stokes],
-                direction,
-                transverse(axes.s, direction),
-                mi.mueller.stokes_basis(direction),
-            )
-        return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
+        return origin, direction, aperture
+
+    def _emitted(self, axes: Frame, direction: Vector) -> Stokes:
+        """The laser's Stokes vector about Mitsuba's axes of a direction."""
+        if not mi.is_polarized:
+            return [mi.Float(1)]
+        return rotate_stokes(
+            [mi.Float(s) for s in self.sensor.laser.stokes],
+            direction,
+            transverse(axes.s, direction),
+            mi.mueller.stokes_basis(direction),
+        )
 
     def single(self, sample: Sample, path: Float, width: Float) -> Stokes:
         """Stokes vector (about e_h) of the light scattered once, for whole paths of a length.
@@ -135,7 +152,7 @@ class Lidar:
         uniform one.
         """
         medium = mi.MediumPtr(self.sensor.get_medium())
-        closure, volume = self._closure(sample, path)
+        closure, volume = closed(sample.origin, sample.direction, sample.aperture, path)
         return self._connect(
             sample,
             sample.rng,
@@ -148,54 +165,60 @@ class Lidar:
             (path > 0) & (closure > 0),
         )
 
-    def _closure(self, sample: Sample, path: Float) -> tuple[Float, Float]:
-        """Distance at which a path of one scattering closes, and d(distance)/d(path)."""
-        closure = closing_distance(sample.origin - sample.aperture, sample.direction, path)
-        back = dr.normalize(sample.aperture - (sample.origin + sample.direction * closure))
-        # a vertex farther by ds lengthens the path by ds less its component along the way back
-        return closure, dr.rcp(1 - dr.dot(sample.direction, back))
-
     @dr.syntax
     def by_contribution(
         self, sample: Sample, low: Float, high: Float, candidates: UInt
-    ) -> tuple[Float, Float]:
-        """A whole path of light scattered once, of several by its contribution, and its weight.
+    ) -> tuple[Sample, Float, Float]:
+        """A sample of light scattered once, of several by its contribution; its path and weight.
 
-        ``low`` and ``high`` are twice the gate's ranges. They and the pulse's duration distribute
-        paths; each candidate is drawn from another part of that distribution, all of which are
-        equally probable. Contributions are compared without attenuation (resampled importance
-        sampling, Talbot et al. 2005). Not for scenes with open surfaces, whose media are known
-        behind one another only.
+        ``low`` and ``high`` are twice the gate's ranges. Candidates have rays of the laser and
+        points of the telescope of their own. The gate and the pulse distribute their whole paths,
+        each of which is drawn from another of so many equally probable parts. Contributions are
+        compared without attenuation and phase function (resampled importance sampling, Talbot et
+        al. 2005). Not for scenes with open surfaces, whose media are known behind one another only.
         """
-        rng, aperture, axes = sample.rng, sample.aperture, sample.axes
-        origin, direction, time = sample.origin, sample.direction, sample.time
-        sigma = 2 * self.pulse_sigma
-        crossings = self.air.crossings(origin, direction)
+        rng, axes, time = sample.rng, sample.axes, sample.time
         around = mi.MediumPtr(self.sensor.get_medium())
-        chosen, total, target = mi.Float(0), mi.Float(0), mi.Float(0)
-        number = mi.UInt32(0)
-        while dr.hint(number < candidates, label="places in the gate"):
+        origin, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
+        aperture, path = mi.Point3f(sample.aperture), mi.Float(0)
+        total, target, number = mi.Float(0), mi.Float(0), mi.UInt32(0)
+        while dr.hint(number < candidates, label="candidates"):
+            start, onward, end = self._ends(rng, sample.frame, sample.start)
             part = (mi.Float(number) + rng.next_float32()) / mi.Float(candidates)
-            path, weight = pulse_in_gate(part, low, high, sigma)
-            closure, volume = self._closure(sample, path)
-            active = (path > 0) & (closure > 0)
-            place = origin + direction * closure
-            active &= self.sensor.in_field_of_view(axes, place - aperture)
+            length, weight = pulse_in_gate(part, low, high, 2 * self.pulse_sigma)
+            closure, volume = closed(start, onward, end, length)
+            place = start + onward * closure
+            active = (length > 0) & (closure > 0)
+            active &= self.sensor.in_field_of_view(axes, place - end)
+            crossings = self.air.crossings(start, onward)
             _, _, _, medium, _ = self.air.next_surface(
-                crossings, origin, direction, closure, mi.Float(dr.inf), around, active
+                crossings, start, onward, closure, mi.Float(dr.inf), around, active
             )
             active &= medium != None
-            mei = interaction(medium, place, direction, self.wavelengths, time)
+            mei = interaction(medium, place, onward, self.wavelengths, time)
             scattering, _ = coefficients(medium, mei, self.channel, active)
-            here = weight * scattering * volume / dr.squared_norm(place - aperture)
-            here = dr.select(active, here, 0)
-            total += here
-            takes = rng.next_float32() * total < here
-            chosen = dr.select(takes, path, chosen)
-            target = dr.select(takes, here / weight, target)
+            here = scattering * volume / dr.squared_norm(place - end)
+            counts = dr.select(active, weight * here, 0)
+            total += counts
+            takes = rng.next_float32() * total < counts
+            origin, direction = dr.select(takes, start, origin), dr.select(takes, onward, direction)
+            aperture, path = dr.select(takes, end, aperture), dr.select(takes, length, path)
+            target = dr.select(takes, here, target)
             number += 1
         share = dr.select(target > 0, total / (target * mi.Float(candidates)), 0)
-        return chosen, share
+        chosen = Sample(
+            rng,
+            sample.frame,
+            sample.start,
+            time,
+            axes,
+            origin,
+            direction,
+            aperture,
+            sample.delay,
+            self._emitted(axes, direction),
+        )
+        return chosen, path, share
 
     def further(
         self,

@@ -58,8 +58,8 @@ class RenderSettings(Description):
     candidates: Annotated[int, Within(1, 1024, "more cost time and hardly lower the noise")] = (
         Field(
             1,
-            description="places in gate and pulse, of which the single scattering of a sample "
-            "takes one by its contribution",
+            description="light paths, of which the single scattering of a sample takes one by its "
+            "contribution",
         )
     )
     samples_per_pass: _PerPass = Field(
