@@ -4,6 +4,7 @@ No wind vectors are needed in between: the whole image informs the ten parameter
 works where the texture is too weak for any local method, and elsewhere as well as the noise allows.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -66,6 +67,8 @@ _NOISE_LAGS = 4.0
 # Least probability of a vortex with which a detected pair is fitted: below it are 1 in 150 of the
 # wakes that the probability is calibrated on, and half of the air without one.
 _LEAST_PROBABILITY = 0.05
+# Core radii of the starts over that of the filters: a fit of wider cores converges farther off.
+_CORES = (1.0, 2.0)
 # Expected error of the displacements of a detected pair, px: of its places on a raster.
 _DETECTED = 1.0
 
@@ -222,9 +225,12 @@ def _detected(first: torch.Tensor, second: torch.Tensor, taken: Acquisition) -> 
         return replace(found, probability=probability)
     theta = torch.cat([likeliest, likeliest.new_tensor(SAME_BRIGHTNESS)])
     limits = step_limits(make.y, make.z, make.profile, make.dt)
-    near = fit_near(theta, make, limits, _NOISE_LAGS, _DETECTED, estimates=2)
-    if near:
-        return replace(_checked(make, *near), probability=probability)
+    for wider in _CORES:
+        start = theta.clone()
+        start[[1, 5]] += math.log(wider)
+        near = fit_near(start, make, limits, _NOISE_LAGS, _DETECTED, estimates=2)
+        if near:
+            return replace(_checked(make, *near), probability=probability)
     found = no_fit(taken.profile, "no fit near the likeliest pair")
     return replace(found, parameters=likeliest.cpu().numpy(), probability=probability)
 
