@@ -219,9 +219,7 @@ def bad(*arguments, says):
             "device=gpu",
             says=["device: 'gpu' is not", "'auto', 'cpu'"],
         ),
-        bad(
-            "info", "slab.xml", says=["expected .exr, .nc, .hpl or .csv", "run folder"]
-        ),
+        bad("info", "slab.xml", says=["expected .exr, .nc, .hpl or .csv", "run folder"]),
         bad(
             "check",
             "tiny.yaml",
