@@ -64,8 +64,8 @@ _CHANGE = 0.25
 _REPLACED = 0.1
 # Lags (px) over which the noise of band-limited images correlates.
 _NOISE_LAGS = 4.0
-# Least probability of a vortex with which a detected pair is fitted: below it are 0.3 % of the wakes
-# that the probability is calibrated on, and 43 % of the air without one.
+# Least probability of a vortex with which a detected pair is fitted: below it are 0.3 % of the
+# wakes that the probability is calibrated on, and 43 % of the air without one.
 _LEAST_PROBABILITY = 0.05
 # Core radii of the starts over that of the filters: a fit of wider cores converges farther off.
 _CORES = (1.0, 2.0)
