@@ -410,9 +410,14 @@ def define() -> type:
             if self.candidates == 1 or differentiable or lidar.air.sheets:
                 stokes = lidar.single(sample, dr.lerp(*path), path[1] - path[0])
             else:
-                near += 2 * sample.delay
-                many = dr.opaque(mi.UInt32, self.candidates)
-                chosen, place, weight = lidar.by_contribution(sample, near, near + width, many)
+                # candidates have delays of their own
+                start_of_gate = 2 * low + width * gate
+                chosen, place, weight = lidar.by_contribution(
+                    sample,
+                    start_of_gate,
+                    start_of_gate + width,
+                    dr.opaque(mi.UInt32, self.candidates),
+                )
                 stokes = lidar.single(chosen, place, weight * width)
             if self.orders:
                 add(by_order, stokes[0], cell * self.max_order)

@@ -97,6 +97,20 @@ def test_expectation_is_that_of_one_candidate(world, case):
     assert (z**2).mean() == pytest.approx(1, abs=4 * np.sqrt(2 / z.size))
 
 
+def test_second_order_is_that_of_one_candidate(world):
+    """In a gate behind the slab, which only the tail of the pulse reaches."""
+    found = []
+    for candidates in (1, 12):
+        scene = slab_scene(world, candidates, pulse=20, gate=(504.0, 511.0), order=2)
+        scene.integrator().orders = True
+        images = [np.array(mi.render(scene, seed=seed, spp=2000)) for seed in range(8)]
+        # S0 to S3, its error, then order by order
+        found.append([image[..., 6].sum(dtype=float) for image in images])
+    one, many = np.array(found)
+    spread = np.hypot(*(np.std(a, ddof=1) / np.sqrt(len(a)) for a in found))
+    assert one.mean() > 0 and abs(many.mean() - one.mean()) < 4 * spread
+
+
 @pytest.mark.parametrize("case", [{"pulse": 10}, {"pulse": 1, "fov_half_mrad": 0.8}], ids=str)
 def test_noise_of_pulses_and_of_what_the_field_cuts_off_falls(world, case):
     one, many = (world.render(slab_scene(world, n, **case), seed=1, spp=400)[1] for n in (1, 16))
