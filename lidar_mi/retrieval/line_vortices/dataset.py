@@ -135,7 +135,7 @@ def vortex_dataset(found: Sequence[ScanVortices], about: Mapping[str, Any]) -> x
     return xr.Dataset(
         data,
         coords,
-        {"Conventions": "CF-1.11", "title": "Wake vortices from lines of sight"} | about,
+        {"Conventions": "CF-1.11", "title": "Wake vortices from lines of sight", **about},
     )
 
 

@@ -13,7 +13,7 @@ from lidar_mi.retrieval.line_vortices.swirl import lines_of, seen
 from lidar_mi.retrieval.line_vortices.turbulence import of_gates, overlap
 
 SEPARATIONS = (22.0, 32.0, 46.0, 64.0)
-"""Of the pairs that are searched for, m: factors of about 1.4, of aircraft of 28 to 81 m of span."""
+"""Of the pairs that are searched for, m: factors of about 1.4, of spans of 28 to 81 m."""
 
 TYPICAL = 300.0
 """Circulation of a wake before the scan: standard deviation of a half-normal number, m^2/s."""
@@ -142,7 +142,7 @@ def _windows(scan: PlaneScan, lidar: CoherentLidar) -> _Windows | None:
         starts = np.flatnonzero(np.diff(bins, prepend=-1))
         rows, pad = int(bins[-1]) + 1, _ROWS // 2
         total = np.zeros((3, rows + 2 * pad, index.size))
-        at = np.ix_(range(3), bins[starts] + pad, np.flatnonzero(inside))
+        at = np.ix_(np.arange(3), bins[starts] + pad, np.flatnonzero(inside))
         total[at] = [np.add.reduceat(one[:, columns], starts, axis=0) for one in parts]
         count = np.maximum(total[2], 1)
         cells = np.stack([total[0] / count, total[1] / count**2, total[2] > 0])
@@ -238,11 +238,11 @@ def _scores(
         for kind in np.unique(kinds)
     }
     packed = np.packbits(windows.usable, axis=1)
-    patterns, which = np.unique(packed, axis=0, return_inverse=True)
+    _, which = np.unique(packed, axis=0, return_inverse=True)
     which = _few(which.ravel(), windows.usable)
     for p in np.unique(which[which >= 0]):
         at = np.flatnonzero(which == p)
-        there = windows.usable[at].all(0)
+        there = np.asarray(windows.usable[at].all(0))
         some = _contrasts(windows, lidar, air.length, there)
         for kind in np.unique(kinds[at]):
             rows = at[kinds[at] == kind]

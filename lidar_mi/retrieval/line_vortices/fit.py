@@ -177,7 +177,7 @@ class _Problem:
         lines, number = self.window.lines, len(state.vortices)
         ground, model = self.given.ground, self.given.model
         speed, speed_by = self._speeds(state)
-        angle, time = node_angles(lines)
+        _, time = node_angles(lines)
         later = time - self.time
         value = np.zeros((len(lines.time), len(lines.ranges)))
         slope = np.zeros((len(state.vector), *value.shape))
@@ -315,7 +315,7 @@ class _Problem:
         for length in lengths:
             tried: dict[int, _Model] = {}
 
-            def at(k: int, length: float = length, tried: dict = tried) -> float:
+            def at(k: int, length: float = length, tried: dict[int, _Model] = tried) -> float:
                 if not low <= k <= high:
                     return -np.inf
                 if k not in tried:

@@ -96,10 +96,10 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneSca
         )
     if not np.ptp(angle) > 0:
         raise InputError(f"lines: scan {number} looks in one direction; expected an RHI")
-    gates = slice(gates[0], gates[-1] + 1)
-    velocity = velocity[:, gates]
+    part = slice(gates[0], gates[-1] + 1)
+    velocity = velocity[:, part]
     if "radial_velocity_stderr" in lines:
-        variance = lines["radial_velocity_stderr"].values.astype(float)[order][:, gates] ** 2
+        variance = lines["radial_velocity_stderr"].values.astype(float)[order][:, part] ** 2
     elif noise is not None:
         variance = np.full(velocity.shape, noise**2)
     else:
@@ -111,7 +111,7 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneSca
         time.min(),
         seconds[order],
         angle[order],
-        lines["range"].values.astype(float)[gates],
+        lines["range"].values.astype(float)[part],
         velocity,
         variance,
         float(np.median(np.diff(angle[order]))),

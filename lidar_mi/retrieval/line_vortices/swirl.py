@@ -135,11 +135,11 @@ def seen(
         By y, z, circulation, logarithm of the core radius; by y and z times the time of the node,
         s, after `Lines.time`: of a line whose beam moves.
     """
-    value, slope = 0.0, 0.0
-    for image in (False, True) if ground is not None else (False,):
-        found = _seen(lines, places, strengths, ground if image else None, model)
-        value, slope = value + found[0], slope + found[1]
-    return np.asarray(value), np.asarray(slope)
+    value, slope = _seen(lines, places, strengths, None, model)
+    if ground is None:
+        return value, slope
+    image, by = _seen(lines, places, strengths, ground, model)
+    return value + image, slope + by
 
 
 def node_angles(lines: Lines) -> tuple[np.ndarray, np.ndarray]:
