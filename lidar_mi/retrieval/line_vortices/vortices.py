@@ -137,7 +137,7 @@ def fit_vortices_to_lines(
         separations = tuple(math.pi / 4 * span * factor for factor in (0.85, 1.0, 1.2))
     found = []
     for number, one in enumerate(sets):
-        lidar = _lidar(one, pulse_length, gate_length)
+        lidar = lidar_of(one, pulse_length, gate_length)
         scans = list(plane_scans(one, noise))
         for k, scan in enumerate(scans):
             if notice is not None:
@@ -154,7 +154,7 @@ def _check(**numbers: float | None) -> None:
             raise InputError(f"{name}: {value} is not allowed; expected a number above 0")
 
 
-def _lidar(lines: xr.Dataset, pulse: float | None, gate: float | None) -> CoherentLidar:
+def lidar_of(lines: xr.Dataset, pulse: float | None, gate: float | None) -> CoherentLidar:
     """What the lidar averages over; gates of unknown length touch each other."""
     ranges = lines["range"].values if "range" in lines.variables else np.zeros(0)
     if len(ranges) < 2:
