@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import scipy
@@ -128,6 +128,11 @@ def fit_vortices_to_lines(
         gate_length=gate_length,
         noise=noise,
     )
+    for name, value, choice in (("kind", kind, Kind), ("profile", profile, Model)):
+        if value not in get_args(choice):
+            raise InputError(
+                f"{name}: {value!r} is not allowed; expected {' or '.join(get_args(choice))}"
+            )
     if not 0 < false_alarm < 1:
         raise InputError(f"false_alarm: {false_alarm} is not allowed; expected between 0 and 1")
     core = core_radius or (0.05 * span if span else _LIKELY_CORE)
