@@ -74,8 +74,10 @@ def sections(
     # of the processor: other programs do not lengthen it
     start = time.process_time()
     prepared = experiment.prepare(asked, search_path, without_warnings(notice))
-    asked = prepared.experiment
-    preparation, results = time.process_time() - start, prepared.results
+    asked, results = prepared.experiment, prepared.results
+    if timed and asked.wake:
+        _ = results["truth"].extinction[1]  # which a run advects
+    preparation = time.process_time() - start
     chosen: Samples | None = None
     if asked.wake:
         if sampled and asked.detector:
