@@ -28,7 +28,7 @@ FAULTS = {
     KILL: KINDS,
 }
 """At which kinds of places each may happen."""
-SOME = {FULL: 41, FORBIDDEN: 29, KILL: 31}
+SOME = {FULL: 67, FORBIDDEN: 47, KILL: 53}
 """Of these places, every so-manyth; no multiple of the places of one file."""
 
 
