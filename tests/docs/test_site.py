@@ -46,6 +46,13 @@ def test_pages_are_short():
     assert not long - GENERATED
 
 
+def test_the_readme_is_one_screen():
+    """What, for whom, a picture, the commands, and where to go on."""
+    readme = (DOCS.parent / "README.md").read_text()
+    assert len(readme.splitlines()) <= 60
+    assert readme.count("![") == 1 and "make demo" in readme and "make test" in readme
+
+
 def test_no_line_begins_with_a_per_cent_sign():
     """MyST takes it for a comment and drops the line."""
     for page in DOCS.rglob("*.md"):
