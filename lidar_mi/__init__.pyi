@@ -20,6 +20,7 @@ from .io.images import read_image, read_noise
 from .io.lines_of_sight.read import read_lines_of_sight
 from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
+from .rendering.labelled import to_xarray
 from .rendering.variant import use_variant
 from .retrieval.images.common_grid import on_one_grid
 from .retrieval.images.quality import Flag
@@ -83,6 +84,7 @@ __all__ = [
     "run",
     "run_campaign",
     "scene_file",
+    "to_xarray",
     "use_variant",
     "write_vortices",
 ]

@@ -317,6 +317,8 @@ def unpack(
 
 def label_scan(scan: "xr.Dataset") -> "xr.Dataset":
     """The same scan with CF names and units on its variables."""
+    import lidar_mi.plots  # noqa: F401 - scan.lidar.plot()
+
     meaning = _MEANING | {
         "S0_largest_share": "largest share of one Monte Carlo sample in the variance of S0",
         "S1_stderr": "Monte Carlo standard error of S1",

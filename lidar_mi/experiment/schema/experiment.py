@@ -43,8 +43,8 @@ class Experiment(Tabular, Section):
     )
     device: Literal["auto", "cpu", "cuda"] | None = Field(
         None,
-        description="that renders and retrieves; default: rendering by the variants, retrieval on "
-        "the processor",
+        description="where images are rendered and winds retrieved; default: rendering as "
+        "render.variant says, retrieval on the processor",
     )
     wake: Wake | None = Field(None, description="observed by the backscatter lidar")
     doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
