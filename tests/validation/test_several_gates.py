@@ -6,7 +6,6 @@ that is not that of the air.
 
 import numpy as np
 import pytest
-import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from validation import several_gates
@@ -21,8 +20,8 @@ def test_derivative_of_polynomials(number, order):
     assert found == pytest.approx([0, 1, *[0] * (order - 1)], abs=1e-12)
 
 
-def test_a_speed_along_x_is_found_and_removed(monkeypatch):
-    """Air of 8 m waves and longer that moves by 1 m/s: means of 20 rows are right to 15 %."""
+def test_what_a_speed_along_x_changes_is_removed():
+    """Air of structures of 2.5 m, standard deviation, that moves by 1 m/s: 70 % at least."""
     random, u, planes = np.random.default_rng(2), 1.0, np.arange(250)
     air = gaussian_filter(random.standard_normal((250, 80, 100)), (25, 5, 5), mode="wrap")
     air = 5 + air / air.std()
@@ -37,13 +36,6 @@ def test_a_speed_along_x_is_found_and_removed(monkeypatch):
         np.stack([volume[np.abs(planes - m) <= 12].mean(0) for m in middles])
         for volume in (air, moved)
     )
-    monkeypatch.setattr(several_gates, "SPEED", 100.0)  # nothing is expected of it
-    calm = np.zeros((2, 2))
-    wind = xr.Dataset(
-        {"v": (("z", "y"), calm), "w": (("z", "y"), calm)}, {"z": [0.0, 79.0], "y": [0.0, 99.0]}
-    )
-    found = several_gates.estimated(first, second, wind, (0.0, 0.0), 1.0, 5)
-    assert found[20:-20, 20:-20].mean() == pytest.approx(u, rel=0.15)
     before = second[2] - first[2]
     after = np.subtract(*several_gates.corrected(first, second, np.full((80, 100), u), 5)[::-1])
     assert after.std() < 0.3 * before.std()
