@@ -134,10 +134,12 @@ import mitsuba as mi
 import numpy as np
 
 from .bounds import Bounds
+from .differentiable import check_differentiable
 from .laser import channel_of
 from .parameters import choice, fail, whole
 from .passes import Batches, Progress, stored_passes
-from .path_sampling import Lidar, add
+from .path_gradients import gradients
+from .path_sampling import Lidar, Sample, add
 from .physical import Physical
 from .registration import register
 from .supported import check_air, check_supported
@@ -178,6 +180,8 @@ def define() -> type:
             # pixels of the last image that receive light, and those of them whose standard error
             # is unreliable
             self.lit, self.untrusted = 0, 0
+            # of the orders that count, for comparing order by order
+            self.lowest_order = 1
             self.physical = Physical(NAME)
             self.bounds = Bounds()
             # set by whoever renders
@@ -266,10 +270,10 @@ def define() -> type:
             seed: int = 0,
             spp: int = 0,
         ) -> None:
-            """Gradients of the scene from those of the image (of S0 to S3; S0_stderr has none)."""
-            for means, places in self._differentiable(scene, sensor, seed, spp):
-                grads = [dr.gather(mi.Float, grad_in.array, place) for place in places]
-                dr.backward(sum(dr.sum(m * g) for m, g in zip(means, grads, strict=True)))
+            """Gradients of the scene from those of S0 to S3; other channels have none."""
+            for lidar, sample, cell, low, high, part in self._passes_back(scene, sensor, seed, spp):
+                weights = [dr.gather(mi.Float, grad_in.array, c) * part for c in cell]
+                gradients(lidar, sample, low, high, self._counted(), weights)
 
         def render_forward(
             self,
@@ -279,40 +283,41 @@ def define() -> type:
             seed: int = 0,
             spp: int = 0,
         ) -> Tensor:
-            """Gradients of the image (of S0 to S3) from those of the scene."""
+            """Gradients of S0 to S3 from those of the scene; other channels have none."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             width, height = sensor.film().size()
             shape = (height, width, sensor.gate_count * len(self.quantities()))
             image = dr.zeros(mi.Float, shape[0] * shape[1] * shape[2])
-            for means, places in self._differentiable(scene, sensor, seed, spp):
-                dr.forward_to(means)
-                for mean, place in zip(means, places, strict=True):
-                    dr.scatter_reduce(dr.ReduceOp.Add, image, dr.grad(mean), place)
+            for lidar, sample, cell, low, high, part in self._passes_back(scene, sensor, seed, spp):
+                found = gradients(lidar, sample, low, high, self._counted())
+                for value, place in zip(found, cell, strict=True):
+                    add(image, value * part, place)
+                dr.eval(image)
             return mi.TensorXf(image, shape)
 
-        def _differentiable(
+        def _counted(self) -> tuple[int, int]:
+            return self.lowest_order, self.max_order
+
+        def _passes_back(
             self, scene: Scene, sensor: Sensor | int, seed: int, spp: int
-        ) -> Iterator[tuple[list[Float], list[UInt]]]:
-            """Means of passes, differentiable in the parameters, and their image indices."""
-            if self.estimator != "gated" or self.max_order > 1:
-                fail(
-                    NAME,
-                    "gradients",
-                    f"{self.estimator}, max_order {self.max_order}",
-                    "the gated estimator with max_order 1",
-                )
+        ) -> Iterator[tuple[Lidar, Sample, list[UInt], Float, Float, Float]]:
+            """Samples of all passes: as `_samples`, cells as image indices of S0 to S3.
+
+            The last one is a sample's part in the mean.
+            """
+            if self.estimator != "gated":
+                fail(NAME, "gradients", self.estimator, "the gated estimator")
+            check_differentiable(NAME, scene)
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
-            for first, count, start, now, _ in self._passes(sensor, samples):
-                # Mitsuba's derivatives call this with gradients suspended
-                with dr.resume_grad():
-                    _, means, *_ = self._gated(
+            with _nothing_freed():
+                for first, count, start, now, _ in self._passes(sensor, samples):
+                    lidar, sample, cell, low, high = self._samples(
                         scene, sensor, seed, first, count, start, now, differentiable=True
                     )
-                    # passes of one image are added up: each has its part of the samples
-                    fraction = now * gates / samples
-                    means = [m * fraction for m in means[: len(STOKES)]]
-                    yield means, self._places(first * gates, count * gates)[: len(STOKES)]
+                    place = (cell + dr.opaque(mi.UInt32, first * gates)) * len(self.quantities())
+                    places = [place + index for index in range(len(STOKES))]
+                    yield lidar, sample, places, low, high, _opaque(gates / samples)
 
         def _prepare(
             self, scene: Scene, sensor: Sensor | int, seed: int, spp: int
@@ -377,7 +382,7 @@ def define() -> type:
             cell = (dr.arange(mi.UInt32, cells) + dr.opaque(mi.UInt32, first)) * quantities
             return [cell + index for index in range(quantities)]
 
-        def _gated(
+        def _samples(
             self,
             scene: Scene,
             sensor: Sensor,
@@ -387,8 +392,11 @@ def define() -> type:
             start: int,
             rounds: int,
             differentiable: bool = False,
-        ) -> Moments:
-            """Means and summed products of deviations, last collisions forced into the gates."""
+        ) -> tuple[Lidar, Sample, UInt, Float, Float]:
+            """Samples of the gates: lidar, samples, cells, twice the nearest and farthest range.
+
+            Of light emitted later there is less before the gate: the sample's delay is taken off.
+            """
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * gates * rounds)
             # opaque, so that neither the number of samples nor the pass is compiled into the kernel
@@ -399,26 +407,40 @@ def define() -> type:
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, self.bounds, differentiable)
             sample = lidar.emit(seed, beam, number)
-
             low, high = sensor.ranges(sample.frame.n, sample.start)
-            # whole paths, twice the ranges; light emitted later has less of it before the gate
+            # whole paths, twice the ranges
             width = 2 * (high - low) / gates
             near = 2 * (low - sample.delay) + width * gate
-            path = near, near + width, sample.rng.next_float32()
+            return lidar, sample, cell, near, near + width
+
+        def _gated(
+            self,
+            scene: Scene,
+            sensor: Sensor,
+            seed: UInt,
+            first: int,
+            count: int,
+            start: int,
+            rounds: int,
+        ) -> Moments:
+            """Means and summed products of deviations, last collisions forced into the gates."""
+            gates = sensor.gate_count
+            lidar, sample, cell, low, high = self._samples(
+                scene, sensor, seed, first, count, start, rounds
+            )
+            path = low, high, sample.rng.next_float32()
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
-            # where extinction is 0 it has a gradient, but is never selected
-            if self.candidates == 1 or differentiable or lidar.air.sheets:
-                stokes = lidar.single(sample, dr.lerp(*path), path[1] - path[0])
+            if self.candidates == 1 or lidar.air.sheets:
+                stokes = lidar.single(sample, dr.lerp(*path), high - low)
             else:
                 # candidates have delays of their own
-                start_of_gate = 2 * low + width * gate
                 chosen, place, weight = lidar.by_contribution(
                     sample,
-                    start_of_gate,
-                    start_of_gate + width,
+                    low + 2 * sample.delay,
+                    high + 2 * sample.delay,
                     dr.opaque(mi.UInt32, self.candidates),
                 )
-                stokes = lidar.single(chosen, place, weight * width)
+                stokes = lidar.single(chosen, place, weight * (high - low))
             if self.orders:
                 add(by_order, stokes[0], cell * self.max_order)
             if self.max_order > 1:

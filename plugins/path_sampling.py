@@ -290,20 +290,7 @@ class Lidar:
             active &= (weight > 0) & (rng.next_float32(active) < survival)
             stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
             path -= flight
-
-            away = position - aperture
-            distance = dr.norm(away)
-            away, excess = away / distance, path - distance
-            active &= excess > 0
-            _, reach = slabs(self.low, self.high, position, -away)
-            # as long as the path is open, its remainder exceeds the straight way back
-            rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
-            closing, scattered, leg, volume = self._last_flight(
-                rng, sample, medium, mei, stokes, rest, active
-            )
-            gain = self._connect(
-                sample, rng, position, closing, leg, medium, scattered, width * volume, volume > 0
-            )
+            rest, gain, active = self._close(sample, rng, medium, mei, stokes, path, width, active)
             total = _sum(total, gain)
             if dr.hint(split, mode="scalar"):
                 add(by_order, gain[0], cell * max_order + order - 1, active)
@@ -315,6 +302,41 @@ class Lidar:
             )
             active &= weight > 0
         return total
+
+    def _close(
+        self,
+        sample: Sample,
+        rng: Generator,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        path: Float,
+        width: Float,
+        active: Mask,
+    ) -> tuple[OpenPath, Stokes, Mask]:
+        """The path closed by one more vertex.
+
+        Returns what remains of it at the vertex, the Stokes vector of the light about e_h, and
+        where the path is still open.
+        """
+        away = mei.p - sample.aperture
+        distance = dr.norm(away)
+        away, excess = away / distance, path - distance
+        active = active & (excess > 0)
+        _, reach = slabs(self.low, self.high, mei.p, -away)
+        # as long as the path is open, its remainder exceeds the straight way back
+        rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
+        with dr.suspend_grad():
+            closing, scattered, leg, volume = self._last_flight(
+                rng, sample, medium, mei, stokes, rest, active
+            )
+        if self.differentiable:
+            # of a direction that stays where it was drawn
+            scattered, _ = self._scatter(medium, mei, stokes, closing, volume > 0)
+        gain = self._connect(
+            sample, rng, mei.p, closing, leg, medium, scattered, width * volume, volume > 0
+        )
+        return rest, gain, active
 
     def _first_flight(
         self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
