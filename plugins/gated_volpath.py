@@ -134,7 +134,7 @@ import mitsuba as mi
 import numpy as np
 
 from .bounds import Bounds
-from .differentiable import check_differentiable
+from .differentiable import differentiable
 from .laser import channel_of
 from .parameters import choice, fail, whole
 from .passes import Batches, Progress, stored_passes
@@ -271,9 +271,11 @@ def define() -> type:
             spp: int = 0,
         ) -> None:
             """Gradients of the scene from those of S0 to S3; other channels have none."""
-            for lidar, sample, cell, low, high, part in self._passes_back(scene, sensor, seed, spp):
+            _, phases = differentiable(NAME, scene)
+            orders = self.lowest_order, self.max_order
+            for lidar, sample, cell, low, high, part in self._replayed(scene, sensor, seed, spp):
                 weights = [dr.gather(mi.Float, grad_in.array, c) * part for c in cell]
-                gradients(lidar, sample, low, high, self._counted(), weights)
+                gradients(lidar, sample, low, high, orders, phases, weights)
 
         def render_forward(
             self,
@@ -288,17 +290,19 @@ def define() -> type:
             width, height = sensor.film().size()
             shape = (height, width, sensor.gate_count * len(self.quantities()))
             image = dr.zeros(mi.Float, shape[0] * shape[1] * shape[2])
-            for lidar, sample, cell, low, high, part in self._passes_back(scene, sensor, seed, spp):
-                found = gradients(lidar, sample, low, high, self._counted())
+            wanted, phases = differentiable(NAME, scene)
+            orders = self.lowest_order, self.max_order
+            # what plugins have made of their parameters, which kernels look up
+            dr.enqueue(dr.ADMode.Forward, wanted)
+            dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
+            for lidar, sample, cell, low, high, part in self._replayed(scene, sensor, seed, spp):
+                found = gradients(lidar, sample, low, high, orders, phases)
                 for value, place in zip(found, cell, strict=True):
                     add(image, value * part, place)
                 dr.eval(image)
             return mi.TensorXf(image, shape)
 
-        def _counted(self) -> tuple[int, int]:
-            return self.lowest_order, self.max_order
-
-        def _passes_back(
+        def _replayed(
             self, scene: Scene, sensor: Sensor | int, seed: int, spp: int
         ) -> Iterator[tuple[Lidar, Sample, list[UInt], Float, Float, Float]]:
             """Samples of all passes: as `_samples`, cells as image indices of S0 to S3.
@@ -307,7 +311,6 @@ def define() -> type:
             """
             if self.estimator != "gated":
                 fail(NAME, "gradients", self.estimator, "the gated estimator")
-            check_differentiable(NAME, scene)
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
             with _nothing_freed():
