@@ -21,9 +21,9 @@ Parameter                    Type    Meaning                                    
                                      bright slab needs 25 to 50 times fewer samples, each of
                                      which takes twice as long
 ``orders``                   bool    also give S0 of every scattering order                  false
-``covariance``               bool    also give the standard error of S1 and the correlation  false
-                                     of the errors of S0 and S1 (for the error of the
-                                     depolarisation ratio)
+``covariance``               bool    also give the standard errors of S1, S2 and S3 and the  false
+                                     correlation of the errors of S0 and S1 (for the error of
+                                     the depolarisation ratio)
 ``shares``                   bool    also give the largest share of one sample in the        false
                                      variance of S0
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
@@ -43,8 +43,8 @@ parts of the gate and the pulse. Gradients, and scenes with open surfaces betwee
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
 ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
 each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... after these, with ``covariance``
-``gateNNN.S1_stderr`` and ``gateNNN.S0_S1_correlation`` after these, with ``shares``
-``gateNNN.S0_largest_share`` after all.
+``gateNNN.S1_stderr``, ``gateNNN.S0_S1_correlation``, ``gateNNN.S2_stderr`` and
+``gateNNN.S3_stderr`` after these, with ``shares`` ``gateNNN.S0_largest_share`` after all.
 
 A standard error to which one sample contributes half of the variance or more is known to a factor
 of two at best, and most of the light may not have been sampled. Without ``shares``, a warning says
@@ -154,8 +154,10 @@ Moments: TypeAlias = tuple[int, list[Float], list[Float], Float]
 """Of the samples of some cells: their number, means, summed products of deviations and the largest
 squared deviation of S0. Numbers by cell, but for the first."""
 
-# products of deviations that are summed: S0's alone, or all that the errors of S0 and S1 need
-PRODUCTS = ((0, 0), (1, 1), (0, 1))
+# products of deviations that are summed: that of S0 alone, or all that the errors of components and
+# of the depolarisation ratio need
+PRODUCTS = ((0, 0), (1, 1), (0, 1), (2, 2), (3, 3))
+COVARIANCE = ("S1_stderr", "S0_S1_correlation", "S2_stderr", "S3_stderr")
 # Deviations are multiplied by it before they are squared: a signal of 1e-19 has squares that
 # underflow in single precision. A power of two, so that nothing is rounded.
 MAGNIFIED = 2.0**50
@@ -194,7 +196,7 @@ def define() -> type:
         def quantities(self) -> list[str]:
             """Quantities that are rendered for every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
-            more = ("S1_stderr", "S0_S1_correlation") if self.covariance else ()
+            more = COVARIANCE if self.covariance else ()
             by_order = (f"order{order}.S0" for order in orders)
             shares = ("S0_largest_share",) if self.shares else ()
             return [*STOKES, "S0_stderr", *by_order, *more, *shares]
@@ -220,8 +222,9 @@ def define() -> type:
             gates, beams = sensor.gate_count, sensor.beam_count
             quantities = len(self.quantities())
             trace = self._gated if self.estimator == "gated" else self._analog
-            before, arrays = stored_passes(self.batches, self.samples_per_pass)
-            image = _float(arrays.get("image"), beams * gates * quantities)
+            size = beams * gates * quantities
+            before, arrays = stored_passes(self.batches, self.samples_per_pass, size)
+            image = _float(arrays.get("image"), size)
             done, total = 0, _moments(arrays)
             # of the finished pixels that receive light: how many there are, and how many of them
             # have an unreliable standard error
@@ -455,7 +458,7 @@ def define() -> type:
             # single precision
             off = [
                 MAGNIFIED * (s - dr.gather(mi.Float, m, cell))
-                for s, m in zip(stokes[:2], means[:2], strict=True)
+                for s, m in zip(stokes, means, strict=True)
             ]
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
@@ -499,7 +502,7 @@ def define() -> type:
             dr.eval(sums, products, largest, by_order)
             number = _opaque(rounds)
             means = [s / number for s in sums]
-            large = [MAGNIFIED * mean for mean in means[:2]]
+            large = [MAGNIFIED * mean for mean in means]
             # here contributions are scattered to their gates before a mean is known; most are 0,
             # so that squares exceed the mean's by far and hardly cancel
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
@@ -599,7 +602,7 @@ def _merge(first: Moments, second: Moments) -> Moments:
     fraction, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
     off = [b - a for a, b in zip(means1, means2, strict=True)]
     means = [a + o * fraction for a, o in zip(means1, off, strict=True)]
-    off = [MAGNIFIED * o for o in off[:2]]
+    off = [MAGNIFIED * o for o in off[: len(STOKES)]]
     deviations = [
         a + b + off[i] * off[j] * weight
         for a, b, (i, j) in zip(deviations1, deviations2, PRODUCTS[: len(deviations1)], strict=True)
@@ -609,13 +612,14 @@ def _merge(first: Moments, second: Moments) -> Moments:
 
 
 def _errors(number: Float, deviations: list[Float]) -> list[Float]:
-    """Standard error of S0, and with all three sums that of S1 and their correlation."""
-    variances = [dr.maximum(s, 0) / (number * (number - 1.0)) for s in deviations[:2]]
-    errors = [dr.sqrt(v) / MAGNIFIED for v in variances]
+    """Standard error of S0, and with the sums of all `PRODUCTS` the quantities `COVARIANCE`."""
+    errors = [dr.sqrt(dr.maximum(s, 0) / (number * (number - 1.0))) / MAGNIFIED for s in deviations]
     if len(deviations) == 1:
         return errors
-    both = dr.sqrt(dr.maximum(deviations[0], 0)) * dr.sqrt(dr.maximum(deviations[1], 0))
-    return [*errors, dr.select(both > 0, dr.clip(deviations[2] / both, -1, 1), 0)]
+    first, second, mixed, *_ = deviations
+    both = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
+    errors[2] = dr.select(both > 0, dr.clip(mixed / both, -1, 1), 0)
+    return errors
 
 
 def _warn_of_unreliable(lit: int, unreliable: int) -> None:
