@@ -64,7 +64,7 @@ FLOORS = {
     "assessment": (("metrics",), ("figures",), ("report",)),
     "experiment": (("schema",), ("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (
-        ("images", "rings"),
+        ("extinction", "images", "rings"),
         ("correlation", "channels", "lines", "lines_of_sight"),
         ("flow", "defects"),
         ("along_path", "vortices"),
