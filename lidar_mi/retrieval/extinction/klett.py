@@ -47,7 +47,7 @@ def klett(
     Raises
     ------
     InputError
-        Ranges that do not ascend, an index out of range; signal, extinction or exponent not above 0.
+        Ranges that do not ascend, an index out of range; other numbers not above 0.
 
     Notes
     -----
