@@ -39,9 +39,9 @@ PAGES = (
     ),
     (
         "lines_of_sight",
-        "Wind from lines of sight",
-        ("retrieval.lines_of_sight",),
-        "[lines of sight](../guide/doppler_lines.md)",
+        "Wind and vortices from lines of sight",
+        ("retrieval.lines_of_sight", "retrieval.line_vortices"),
+        "[lines of sight](../guide/doppler_lines.md), [wakes](../guide/measured_wakes.md)",
     ),
     ("vortices", "Vortices", ("retrieval.vortices",), "[methods](../guide/methods.md)"),
     (
