@@ -52,6 +52,9 @@ RESULTS = {
     "wind_volume": "wind_volume.nc",
     "v_los": "v_los.nc",
     "lines": "lines_of_sight.nc",
+    "coherent_lines": "lines_of_sight.nc",
+    "line_winds": "wind_profiles.nc",
+    "line_vortices": "line_vortices.nc",
     "wind3d": "wind3d.nc",
     "vortices": "vortex.json",
 }

@@ -93,7 +93,7 @@ def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> 
     """
     # the constants are of another machine; rendering is timed on this one
     here = slowness()
-    rendering = 2 * render_seconds(experiment, results) if experiment.wake else 0.0
+    rendering = 2 * render_seconds(experiment, results) if experiment.imaged_wake else 0.0
     return Cost(
         preparation,
         rendering,
@@ -191,7 +191,7 @@ def with_number(experiment: Experiment, samples: int) -> Experiment:
 
 def _images(experiment: Experiment, results: Results) -> float:
     """Winds from images or volumes."""
-    if not experiment.wake:
+    if not experiment.imaged_wake:
         return 0.0
     plan = results["plans"][0]
     pixels = plan.y.size * plan.z.size
@@ -213,7 +213,7 @@ def _images(experiment: Experiment, results: Results) -> float:
 
 def _rings(experiment: Experiment) -> float:
     """Images of rings, and velocities from them."""
-    doppler = experiment.doppler
+    doppler = experiment.fringes
     if not doppler:
         return 0.0
     settings, pixels = doppler.retrieval, doppler.camera.width * doppler.camera.height
@@ -234,7 +234,7 @@ def _rings(experiment: Experiment) -> float:
 
 def _lines(experiment: Experiment) -> float:
     """All lines of sight; the pulses of a line are summed, however many they are."""
-    sensor, doppler = experiment.sensor, experiment.doppler
+    sensor, doppler = experiment.sensor, experiment.fringes
     if sensor is None or doppler is None:
         return 0.0
     directions, camera = sensor.directions, doppler.camera
@@ -242,7 +242,11 @@ def _lines(experiment: Experiment) -> float:
 
 
 def _figures(experiment: Experiment) -> float:
-    parts = {"images": experiment.wake, "rings": experiment.doppler, "sensor": experiment.sensor}
+    parts = {
+        "images": experiment.imaged_wake,
+        "rings": experiment.fringes,
+        "sensor": experiment.sensor,
+    }
     return sum(FIGURES[name] for name, there in parts.items() if there)
 
 

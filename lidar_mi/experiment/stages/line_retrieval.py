@@ -1,0 +1,119 @@
+"""What the lines of a coherent lidar tell: vortices of vertical slices, winds of other scans."""
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema.coherent import CoherentDoppler
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.experiment.stages.coherent_lines import true_vortices
+from lidar_mi.experiment.truth.passing_wake import PassingWake
+from lidar_mi.instrument.coherent.measurement import START
+from lidar_mi.instrument.coherent.scans import directions
+
+
+def has_profiles(experiment: Experiment) -> bool:
+    """Whether a coherent lidar scans winds."""
+    return experiment.coherent is not None and experiment.coherent.scan.kind in ("ppi", "dbs")
+
+
+def has_slices(experiment: Experiment) -> bool:
+    """Whether a coherent lidar scans vertical slices."""
+    return experiment.coherent is not None and experiment.coherent.scan.kind == "rhi"
+
+
+def line_winds(
+    coherent_lines: xr.Dataset, passing_air: PassingWake, doppler_interval: float | None, log: Log
+) -> xr.Dataset:
+    """Profiles of the wind as of `fit_winds_to_lines`, beside the truth.
+
+    Returns
+    -------
+    xr.Dataset
+        With `u_true`, `v_true`, `w_true` (m/s): means over the slanted lines of the scan or the
+        interval, each at its own time where it crosses the height.
+
+    Raises
+    ------
+    InputError
+        Scans without any wind.
+    """
+    from lidar_mi.retrieval.lines_of_sight.winds import fit_winds_to_lines
+
+    log.bar("fitting winds to lines of sight", None)
+    found = fit_winds_to_lines(coherent_lines, interval=doppler_interval)
+    true = np.full((3, found.sizes["time"], found.sizes["height"]), np.nan)
+    groups = coherent_lines["sweep"].values
+    if doppler_interval is not None:
+        seconds = _seconds(coherent_lines["time"])
+        groups = (seconds - seconds[0]) // doppler_interval
+    numbers = np.unique(groups)
+    if len(numbers) != found.sizes["time"]:
+        raise InputError(
+            f"doppler.scan: {found.sizes['time']} of {len(numbers)} scans have winds; expected all "
+            "(a stronger doppler.signal)"
+        )
+    for k, number in enumerate(numbers):
+        one = coherent_lines.isel(time=np.flatnonzero(groups == number))
+        true[:, k] = _mean_wind(one, found["height"].values, passing_air)
+    for k, name in enumerate("uvw"):
+        attributes = {"units": "m s-1", "long_name": f"true {found[name].attrs['long_name']}"}
+        found[f"{name}_true"] = ("time", "height"), true[k], attributes
+    return found
+
+
+def line_vortices(
+    coherent_lines: xr.Dataset,
+    doppler: CoherentDoppler,
+    wake: Wake,
+    passing_air: PassingWake,
+    log: Log,
+) -> xr.Dataset:
+    """Vortices of every slice as of `fit_vortices_to_lines`, beside the truth.
+
+    Returns
+    -------
+    xr.Dataset
+        With `y_true`, `z_true` (m) and `circulation_true` (m^2/s) at the time of the fit, the
+        smaller y first, the wake's `age` (s) and the attribute ``separation`` (m) of the wake.
+    """
+    from lidar_mi.retrieval.line_vortices.vortices import fit_vortices_to_lines
+
+    log.bar("fitting vortices to lines of sight", None)
+    ground = -doppler.position[2] if doppler.passage.ground and wake.vortex_pair else None
+    found = fit_vortices_to_lines(coherent_lines, ground=ground)
+    seconds = _seconds(found["time"])
+    true = true_vortices(doppler, passing_air, seconds)
+    # the fit has the smaller y first
+    order = np.argsort(true[..., 0], axis=1)
+    true = np.take_along_axis(true, order[..., None], axis=1)
+    for k, (name, units) in enumerate((("y", "m"), ("z", "m"), ("circulation", "m2 s-1"))):
+        text = found[name].attrs["long_name"]
+        attributes = {"units": units, "long_name": f"true {text}"}
+        found[f"{name}_true"] = ("scan", "vortex"), true[..., k], attributes
+    age = {"units": "s", "long_name": "age of the wake"}
+    found["age"] = "scan", doppler.passage.age + seconds, age
+    # of a wake near the ground it grows
+    first = true_vortices(doppler, passing_air, np.zeros(1))[0]
+    separation = (
+        wake.vortex_pair.separation if wake.vortex_pair else np.hypot(*np.ptp(first, 0)[:2])
+    )
+    return found.assign_attrs(separation=float(separation))
+
+
+def _seconds(time: xr.DataArray) -> np.ndarray:
+    """Times from the start of the first line on, s."""
+    return (time.values - START) / np.timedelta64(1, "s")
+
+
+def _mean_wind(lines: xr.Dataset, heights: np.ndarray, air: PassingWake) -> np.ndarray:
+    """True wind (3, heights) to the east, to the north and up."""
+    azimuth, elevation = (np.deg2rad(lines[name].values) for name in ("azimuth", "elevation"))
+    slanted = np.cos(elevation) > 1e-3
+    along = directions(azimuth[slanted], elevation[slanted])
+    places = along / along[:, 2:]
+    east, north, up = (places[:, k, None] * heights for k in range(3))
+    time = np.broadcast_to(_seconds(lines["time"])[slanted, None], east.shape)
+    return np.stack([one.mean(0) for one in air.wind(east, north, up, time)])
