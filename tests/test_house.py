@@ -20,7 +20,7 @@ ARROWS = {
     "system": set(),
     "atmosphere": set(),
     "instrument": {"atmosphere.line"},
-    "retrieval": {"atmosphere.vortex"},
+    "retrieval": {"atmosphere.vortex", "instrument.coherent.weighting"},
     "io": {
         "atmosphere.aerosols",
         "atmosphere.particle_scattering",
@@ -57,7 +57,8 @@ ARROWS = {
     },
 }
 """What a room may import beside `errors` and `units`: a room, or modules of one. `atmosphere`,
-`instrument` and `retrieval` share descriptions alone: a vortex, a spectral line; `io` builds those
+`instrument` and `retrieval` share descriptions alone: a vortex, a spectral line, the weight of a
+gate; `io` builds those
 that its files hold; only `experiment` and what lies above it see all."""
 
 FLOORS = {
@@ -68,7 +69,7 @@ FLOORS = {
         ("correlation", "channels", "lines", "lines_of_sight"),
         ("flow", "defects"),
         ("along_path", "vortices"),
-        ("wind",),
+        ("wind", "line_vortices"),
     ),
 }
 """Folders of a room, the lowest floor first: each imports those of lower floors alone."""

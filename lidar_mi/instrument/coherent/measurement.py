@@ -95,5 +95,10 @@ def measured_lines(
             "elevation": ("time", np.rad2deg(scan.elevation), degree),
             "sweep": ("time", scan.sweep),
         },
-        {"Conventions": "CF-1.11", "gate_length": lidar.gate_length, "seed": seed},
+        {
+            "Conventions": "CF-1.11",
+            "gate_length": lidar.gate_length,
+            "pulse_length": lidar.pulse_length,
+            "seed": seed,
+        },
     )
