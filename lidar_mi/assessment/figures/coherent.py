@@ -130,7 +130,7 @@ def _track(vortices: xr.Dataset) -> Plate:
     for axes, (name, label) in zip(
         figure.subplots(1, 3),
         (
-            ("circulation", "|circulation| / (m²/s)"),
+            ("circulation_5_15", "|circulation|, 5 to 15 m / (m²/s)"),
             ("y", "distance from the lidar / m"),
             ("z", "height above the lidar / m"),
         ),
@@ -138,7 +138,7 @@ def _track(vortices: xr.Dataset) -> Plate:
     ):
         for k, (marker, side) in enumerate(_SIDES):
             one = vortices.isel(vortex=k)
-            sign = np.sign(one["circulation_true"].values) if name == "circulation" else 1.0
+            sign = np.sign(one[f"{name}_true"].values) if name == "circulation_5_15" else 1.0
             colour = f"C{k}"
             axes.plot(age, sign * one[f"{name}_true"], color=colour, lw=1, label=f"{side}, true")
             axes.errorbar(

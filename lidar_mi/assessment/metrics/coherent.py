@@ -17,6 +17,7 @@ circulation and of the separation (DLR's LES Lidar Simulator; J. Atmos. Oceanic 
 2025)."""
 
 _QUANTITIES = ("y", "z", "circulation")
+_CIRCULATION = "circulation_5_15"
 
 
 def lines_metrics(lines: xr.Dataset) -> dict[str, float]:
@@ -52,19 +53,19 @@ def vortex_errors(vortices: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        ``circulation_error`` relative to the true circulation, ``y_error`` and ``z_error`` in
-        separations of the wake, ``place_error`` their distance, all signed but the last; and
-        ``y_normalised``, ``z_normalised``, ``circulation_normalised`` over the standard errors.
+        ``circulation_error`` (of the mean over rings of 5 to 15 m, relative to the true one),
+        ``y_error`` and ``z_error`` in separations of the wake, ``place_error`` their distance, all
+        signed but the last; and ``y_normalised``, ``z_normalised``, ``circulation_normalised`` over
+        the standard errors.
     """
     found = {}
     valid = (vortices["flag"] == 0).values[:, None]
     for name in _QUANTITIES:
-        error = vortices[name].values - vortices[f"{name}_true"].values
-        size = np.full(error.shape, vortices.attrs["separation"])
-        if name == "circulation":
-            size = vortices["circulation_true"].values
+        key = _CIRCULATION if name == "circulation" else name
+        true = vortices[f"{key}_true"].values
+        error, stderr = vortices[key].values - true, vortices[f"{key}_stderr"].values
+        size = true if key == _CIRCULATION else vortices.attrs["separation"]
         found[f"{name}_error"] = np.where(valid, error / size, np.nan)
-        stderr = vortices[f"{name}_stderr"].values
         found[f"{name}_normalised"] = np.where(valid, error / stderr, np.nan)
     found["place_error"] = np.hypot(found["y_error"], found["z_error"])
     return xr.Dataset(

@@ -7,7 +7,8 @@ import numpy as np
 import xarray as xr
 from scipy.constants import c as SPEED_OF_LIGHT
 
-from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.atmosphere.vortex import Model, Vortex, angular_velocity
+from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.coherent import CoherentDoppler, CoherentScan
@@ -16,6 +17,8 @@ from lidar_mi.experiment.truth.passing_wake import PassingWake, echo, passing_wa
 from lidar_mi.instrument.coherent.measurement import measured_lines
 from lidar_mi.instrument.coherent.scans import LineScan, dbs_scan, ppi_scan, rhi_scan, stare_scan
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
+
+_RINGS = np.arange(5.0, 15.125, 0.25)  # m, as of `ring_averages`
 
 VORTICES = ("port", "starboard")
 
@@ -174,10 +177,19 @@ def _across(doppler: CoherentDoppler) -> float:
 def true_vortices(doppler: CoherentDoppler, air: PassingWake, times: np.ndarray) -> np.ndarray:
     """Port and starboard vortex in the scan's plane at times (s), (times, 2, 3).
 
-    Distance along the azimuth and height above the lidar (m), circulation (m^2/s).
+    Distance along the azimuth and height above the lidar (m), circulation over rings of 5 to 15 m
+    (m^2/s, positive from distance to height).
     """
     found = [air.vortices(float(time)) or () for time in times]
-    return np.array([[_in_plane(doppler, one) for one in pair] for pair in found])
+    # those of a simulated plane are averages already
+    averaged = isinstance(air.wake, VolumeAlongPath)
+    return np.array([[_in_plane(doppler, one, averaged) for one in pair] for pair in found])
+
+
+def ring_fraction(core_radius: np.ndarray, model: Model) -> np.ndarray:
+    """Circulation averaged over rings of 5 to 15 m (Holzaepfel et al. 2003) over that far away."""
+    square = (_RINGS / core_radius[..., None]) ** 2
+    return (2 * np.pi * square * angular_velocity(square, 1.0, 1.0, model)).mean(-1)
 
 
 def _true_vortices(
@@ -193,16 +205,21 @@ def _true_vortices(
         "vortex": ("vortex", list(VORTICES)),
         "vortex_y": field(0, "true distance from the lidar along the scan's azimuth", "m"),
         "vortex_z": field(1, "true height above the lidar", "m"),
-        "vortex_circulation": field(2, "true circulation, positive from y to z", "m2 s-1"),
+        "vortex_circulation": field(
+            2, "true circulation, mean over rings of 5 to 15 m, positive from y to z", "m2 s-1"
+        ),
         "wake_age": ("time", age, {"units": "s", "long_name": "age of the wake"}),
     }
 
 
-def _in_plane(doppler: CoherentDoppler, vortex: Vortex) -> tuple[float, float, float]:
+def _in_plane(
+    doppler: CoherentDoppler, vortex: Vortex, averaged: bool
+) -> tuple[float, float, float]:
+    fraction = ring_fraction(np.array(vortex.core_radius), vortex.model)
     # seen from the other side, a vortex turns the other way
     turn = math.copysign(1.0, _across(doppler))
     return (
         plane_place(doppler, vortex.y),
         vortex.z - doppler.position[2],
-        turn * vortex.circulation,
+        turn * vortex.circulation * (1.0 if averaged else float(fraction)),
     )

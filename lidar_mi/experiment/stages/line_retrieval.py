@@ -8,10 +8,11 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.coherent import CoherentDoppler
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.wake import Wake
-from lidar_mi.experiment.stages.coherent_lines import true_vortices
+from lidar_mi.experiment.stages.coherent_lines import coherent_lidar, ring_fraction, true_vortices
 from lidar_mi.experiment.truth.passing_wake import PassingWake
 from lidar_mi.instrument.coherent.measurement import START
 from lidar_mi.instrument.coherent.scans import directions
+from lidar_mi.instrument.coherent.weighting import echo_shift
 
 
 def has_profiles(experiment: Experiment) -> bool:
@@ -76,20 +77,24 @@ def line_vortices(
     Returns
     -------
     xr.Dataset
-        With `y_true`, `z_true` (m) and `circulation_true` (m^2/s) at the time of the fit, the
-        smaller y first, the wake's `age` (s) and the attribute ``separation`` (m) of the wake.
+        With `circulation_5_15` (m^2/s, mean over rings of 5 to 15 m) and its standard error;
+        `y_true`, `z_true` (m) and `circulation_5_15_true` at the time of the fit, the smaller y
+        first; the wake's `age` (s) and the attribute ``separation`` (m) of the wake.
     """
     from lidar_mi.retrieval.line_vortices.vortices import fit_vortices_to_lines
 
     log.bar("fitting vortices to lines of sight", None)
     ground = -doppler.position[2] if doppler.passage.ground and wake.vortex_pair else None
-    found = fit_vortices_to_lines(coherent_lines, ground=ground)
+    lines = _at_the_echo(coherent_lines, doppler)
+    found = fit_vortices_to_lines(lines, ground=ground)
     seconds = _seconds(found["time"])
     true = true_vortices(doppler, passing_air, seconds)
     # the fit has the smaller y first
     order = np.argsort(true[..., 0], axis=1)
     true = np.take_along_axis(true, order[..., None], axis=1)
-    for k, (name, units) in enumerate((("y", "m"), ("z", "m"), ("circulation", "m2 s-1"))):
+    found = found.assign(_over_rings(found))
+    names = (("y", "m"), ("z", "m"), ("circulation_5_15", "m2 s-1"))
+    for k, (name, units) in enumerate(names):
         text = found[name].attrs["long_name"]
         attributes = {"units": units, "long_name": f"true {text}"}
         found[f"{name}_true"] = ("scan", "vortex"), true[..., k], attributes
@@ -101,6 +106,43 @@ def line_vortices(
         wake.vortex_pair.separation if wake.vortex_pair else np.hypot(*np.ptp(first, 0)[:2])
     )
     return found.assign_attrs(separation=float(separation))
+
+
+def _over_rings(found: xr.Dataset) -> dict[str, tuple[object, ...]]:
+    """Circulation over rings of 5 to 15 m of the fitted vortices, and its standard error.
+
+    It hardly depends on the core, which a lidar with gates of 30 m hardly sees.
+    """
+    core, model = found["core_radius"].values, found.attrs["profile"]
+    fraction = ring_fraction(core, model)
+    step = 1e-3 * core
+    slope = (ring_fraction(core + step, model) - ring_fraction(core - step, model)) / (2 * step)
+    circulation = found["circulation"].values
+    variance = np.empty_like(circulation)
+    for k in range(found.sizes["vortex"]):
+        names = [f"circulation_{k}", f"core_radius_{k}"]
+        own = found["covariance"].sel(number=names, other_number=names).values
+        by = np.stack([fraction[:, k], circulation[:, k] * slope[:, k]], axis=-1)
+        variance[:, k] = np.einsum("sa,sab,sb->s", by, own, by)
+    both, about = ("scan", "vortex"), {"units": "m2 s-1"}
+    text = "circulation, mean over rings of 5 to 15 m"
+    return {
+        "circulation_5_15": (both, circulation * fraction, {**about, "long_name": text}),
+        "circulation_5_15_stderr": (
+            both,
+            np.sqrt(variance),
+            {**about, "long_name": f"standard error: {text}"},
+        ),
+    }
+
+
+def _at_the_echo(lines: xr.Dataset, doppler: CoherentDoppler) -> xr.Dataset:
+    """Lines whose ranges are the middles of the echoes, as the signal tells them."""
+    if lines.sizes["range"] < 2:
+        return lines
+    ranges, ratio = lines["range"].values, lines["snr"].median("time").values
+    shift = echo_shift(ranges, ratio, coherent_lidar(doppler))
+    return lines.assign_coords(range=("range", ranges + shift, lines["range"].attrs))
 
 
 def _seconds(time: xr.DataArray) -> np.ndarray:

@@ -86,6 +86,22 @@ def range_weight(offset: np.ndarray, lidar: CoherentLidar) -> np.ndarray:
     return (scipy.special.erf(upper) - scipy.special.erf(lower)) / (2 * lidar.gate_length)
 
 
+def echo_shift(ranges: np.ndarray, ratio: np.ndarray, lidar: CoherentLidar) -> np.ndarray:
+    """Distance (m) of the middle of a gate's echo from the middle of the gate.
+
+    Where the signal falls with range, the near end of a gate says more: by the variance of
+    `range_weight` times the slope of the logarithm of the signal, to first order in it.
+
+    Parameters
+    ----------
+    ranges, ratio : (gates,) arrays
+        Middles of the gates, m, and signal-to-noise ratio there, above 0.
+    lidar : CoherentLidar
+    """
+    variance = lidar.pulse_length**2 / (8 * math.log(2)) + lidar.gate_length**2 / 12
+    return variance * np.gradient(np.log(ratio), ranges)
+
+
 Signal = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Relative power of the echo at x, y, z (lines, points), in the order of range, and time."""
 
