@@ -22,7 +22,7 @@ from lidar_mi.units import (
 
 _Elevation = Annotated[Angle, Within(0, math.pi, "from the horizon over the top")]
 _Azimuth = Annotated[Angle, Within(-4 * math.pi, 4 * math.pi, "two turns")]
-_Height = Annotated[Length, Within(0, 20000, "to the stratosphere")]
+_Place = Annotated[Length, Within(-1e5, 1e5, "the range of a lidar")]
 
 
 class CoherentLaser(Section):
@@ -94,7 +94,7 @@ class CoherentScan(Section):
     move: Annotated[Time, Within(0, 3600, "an hour")] = Field(
         1.0, description="of dbs, from one beam to the next"
     )
-    repeat: Annotated[Time, Within(1e-3, 1e5, "a day")] | None = Field(
+    repeat: Annotated[Time, Within(1e-3, 1e5, "a day of scans")] | None = Field(
         quantity("5 s"), description="from one scan's start to the next; null: without a break"
     )
     count: Annotated[int, Within(1, 10000, "half a day of scans of 5 s")] = Field(
@@ -201,11 +201,7 @@ class CoherentDoppler(Section):
     bias: Annotated[Speed, Within(-10, 10, "a frequency that is not known")] = Field(
         0.0, description="of all velocities"
     )
-    position: tuple[
-        Annotated[Length, Within(-1e5, 1e5, "the range of a lidar")],
-        Annotated[Length, Within(-1e5, 1e5, "the range of a lidar")],
-        _Height,
-    ] = Field(
+    position: tuple[_Place, _Place, _Place] = Field(
         (0.0, 700.0, 2.0),
         description="of the lidar: along the flight and to its left, from where the wake begins, "
         "and above the ground",
@@ -215,3 +211,12 @@ class CoherentDoppler(Section):
     )
     passage: Passage = Passage()
     air: AirAtTheGround = AirAtTheGround()
+
+    @model_validator(mode="after")
+    def _above_the_ground(self) -> Self:
+        if self.position[2] < 0:
+            raise ValueError(
+                f"position: {self.position[2]:g} m above the ground is not allowed; expected 0 m "
+                "or more"
+            )
+        return self

@@ -114,6 +114,33 @@ class Experiment(Tabular, Section):
         return copy
 
     @model_validator(mode="after")
+    def _coherent_lidar_alone(self) -> Self:
+        if self.coherent is None:
+            return self
+        for key in ("sensor", "volume", "encounter"):
+            if getattr(self, key) is not None:
+                raise ValueError(
+                    f"{key}: not allowed with doppler.kind coherent, a lidar on the ground; "
+                    "expected doppler.kind: fringes"
+                )
+        wake = self.wake
+        if wake is not None and wake.turbine is not None:
+            raise ValueError(
+                "wake.turbine: not allowed with doppler.kind coherent; expected vortex_pair or file"
+            )
+        if wake is not None and (wake.depth == "volume" or wake.second != "advect"):
+            key = "depth" if wake.depth == "volume" else "second"
+            raise ValueError(
+                f"wake.{key}: {getattr(wake, key)} is not allowed with doppler.kind coherent, "
+                "which observes a plane as it drifts; expected the default"
+            )
+        if wake is None and self.coherent.scan.kind == "rhi":
+            raise ValueError(
+                "wake: missing; doppler.scan.kind rhi expects one (ppi and dbs measure the wind)"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _gates_that_make_a_volume(self) -> Self:
         if self.volume is None:
             return self
@@ -195,33 +222,6 @@ class Experiment(Tabular, Section):
             if self.imaged_wake is None and unused:
                 without = "with doppler.kind coherent" if self.coherent else "without wake"
                 raise ValueError(f"{key}: not allowed {without}; expected it under doppler")
-        return self
-
-    @model_validator(mode="after")
-    def _coherent_lidar_alone(self) -> Self:
-        if self.coherent is None:
-            return self
-        for key in ("sensor", "volume", "encounter"):
-            if getattr(self, key) is not None:
-                raise ValueError(
-                    f"{key}: not allowed with doppler.kind coherent, a lidar on the ground; "
-                    "expected doppler.kind: fringes"
-                )
-        wake = self.wake
-        if wake is not None and wake.turbine is not None:
-            raise ValueError(
-                "wake.turbine: not allowed with doppler.kind coherent; expected vortex_pair or file"
-            )
-        if wake is not None and (wake.depth == "volume" or wake.second != "advect"):
-            key = "depth" if wake.depth == "volume" else "second"
-            raise ValueError(
-                f"wake.{key}: {getattr(wake, key)} is not allowed with doppler.kind coherent, "
-                "which observes a plane as it drifts; expected the default"
-            )
-        if wake is None and self.coherent.scan.kind == "rhi":
-            raise ValueError(
-                "wake: missing; doppler.scan.kind rhi expects one (ppi and dbs measure the wind)"
-            )
         return self
 
     @model_validator(mode="after")
