@@ -80,19 +80,20 @@ def vortex_scan_metrics(vortices: xr.Dataset) -> dict[str, float]:
     ``coherent.vortices.``: ``scans``, ``valid_fraction``; ``circulation_error`` and ``place_error``
     (medians of the sizes, of the circulation and of the separation), ``circulation_rms``,
     ``place_rms``, ``circulation_bias`` (mean); ``coverage_68_*`` and ``coverage_95_*``,
-    ``normalised_error_variance_*`` of y, z and circulation.
+    ``normalised_error_variance_*`` of y, z and circulation. ``coherent.rv.``: the same errors by
+    the method of radial velocities, and the fraction of the slices in which it finds both.
     """
     errors, start = vortex_errors(vortices), f"{PREFIX}vortices."
     found = {
         f"{start}scans": float(vortices.sizes["scan"]),
         f"{start}valid_fraction": float((vortices["flag"] == 0).mean()),
     }
+    found |= _sizes(f"{PREFIX}rv.", _peer_errors(vortices))
+    known = np.isfinite(vortices["y_rv"].values).all(1)
+    found[f"{PREFIX}rv.valid_fraction"] = float(known.mean())
     if not found[f"{start}valid_fraction"]:
         return found
-    for name in ("circulation", "place"):
-        size = np.abs(errors[f"{name}_error"].values)
-        found[f"{start}{name}_error"] = float(np.nanmedian(size))
-        found[f"{start}{name}_rms"] = float(np.sqrt(np.nanmean(size**2)))
+    found |= _sizes(start, errors)
     found[f"{start}circulation_bias"] = float(np.nanmean(errors["circulation_error"]))
     for name in _QUANTITIES:
         normalised = errors[f"{name}_normalised"].values
@@ -100,6 +101,28 @@ def vortex_scan_metrics(vortices: xr.Dataset) -> dict[str, float]:
         for key in ("coverage_68", "coverage_95", "normalised_error_variance"):
             found[f"{start}{key}_{name}"] = statistics[key]
     return found
+
+
+def _sizes(start: str, errors: xr.Dataset) -> dict[str, float]:
+    """Medians and rms of the sizes of errors."""
+    found = {}
+    for name in ("circulation", "place"):
+        size = np.abs(errors[f"{name}_error"].values)
+        if np.isfinite(size).any():
+            found[f"{start}{name}_error"] = float(np.nanmedian(size))
+            found[f"{start}{name}_rms"] = float(np.sqrt(np.nanmean(size**2)))
+    return found
+
+
+def _peer_errors(vortices: xr.Dataset) -> xr.Dataset:
+    """Relative errors of circulation and place by the method of radial velocities."""
+    away = {n: vortices[f"{n}_rv"] - vortices[f"{n}_rv_true"] for n in ("y", "z", _CIRCULATION)}
+    return xr.Dataset(
+        {
+            "circulation_error": away[_CIRCULATION] / vortices[f"{_CIRCULATION}_rv_true"],
+            "place_error": np.hypot(away["y"], away["z"]) / vortices.attrs["separation"],
+        }
+    )
 
 
 def errors_by_age(vortices: xr.Dataset, bins: int = 4) -> Sequence[Mapping[str, float]]:

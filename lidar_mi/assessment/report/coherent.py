@@ -29,7 +29,7 @@ def coherent_chapter(
     )
     tables: list[NumberTable] = []
     if vortices is not None and f"{_VORTICES}place_error" in metrics:
-        tables += [_by_age(vortices), _stated(metrics)]
+        tables += [_by_age(vortices), _peer(metrics), _stated(metrics)]
     elif f"{_WINDS}rmse_u" in metrics:
         tables.append(_wind_errors(metrics))
     numbers = Tables(
@@ -59,6 +59,22 @@ def _by_age(vortices: xr.Dataset) -> NumberTable:
             line("error of the place, of the separation", "%", "place", 100),
         ],
     )
+
+
+def _peer(metrics: Mapping[str, float]) -> NumberTable:
+    columns = (_VORTICES, f"{PREFIX}rv.")
+    rows = []
+    for key, label in (
+        ("circulation_error", "median error of the circulation"),
+        ("circulation_rms", "rms error of the circulation"),
+        ("place_error", "median error of the place, of the separation"),
+        ("place_rms", "rms error of the place, of the separation"),
+        ("valid_fraction", "slices with valid vortices"),
+    ):
+        values = [metrics.get(f"{start}{key}") for start in columns]
+        rows.append((label, "%", ["-" if one is None else f"{100 * one:.3g}" for one in values]))
+    heads = ("fit to the slice", "method of radial velocities")
+    return "Compared with the method of radial velocities", heads, rows
 
 
 def _stated(metrics: Mapping[str, float]) -> NumberTable:

@@ -79,8 +79,10 @@ def line_vortices(
     xr.Dataset
         With `circulation_5_15` (m^2/s, mean over rings of 5 to 15 m) and its standard error;
         `y_true`, `z_true` (m) and `circulation_5_15_true` at the time of the fit, the smaller y
-        first; the wake's `age` (s) and the attribute ``separation`` (m) of the wake.
+        first; the wake's `age` (s) and the attribute ``separation`` (m) of the wake. Of the method
+        of radial velocities, its peer, `y_rv`, ... and the truth at its own times, `y_rv_true`, ...
     """
+    from lidar_mi.retrieval.line_vortices.rv_method import radial_velocity_vortices
     from lidar_mi.retrieval.line_vortices.vortices import fit_vortices_to_lines
 
     log.bar("fitting vortices to lines of sight", None)
@@ -88,16 +90,21 @@ def line_vortices(
     lines = _at_the_echo(coherent_lines, doppler)
     found = fit_vortices_to_lines(lines, ground=ground)
     seconds = _seconds(found["time"])
-    true = true_vortices(doppler, passing_air, seconds)
-    # the fit has the smaller y first
-    order = np.argsort(true[..., 0], axis=1)
-    true = np.take_along_axis(true, order[..., None], axis=1)
     found = found.assign(_over_rings(found))
-    names = (("y", "m"), ("z", "m"), ("circulation_5_15", "m2 s-1"))
-    for k, (name, units) in enumerate(names):
-        text = found[name].attrs["long_name"]
-        attributes = {"units": units, "long_name": f"true {text}"}
-        found[f"{name}_true"] = ("scan", "vortex"), true[..., k], attributes
+    peer = radial_velocity_vortices(lines)
+    core = np.array(peer.attrs["core_radius"])
+    peer["circulation_5_15"] = peer["circulation"] * ring_fraction(core, peer.attrs["profile"])
+    true = _nearer_first(doppler, passing_air, np.stack([seconds, seconds], -1))
+    at_peer = _nearer_first(doppler, passing_air, _seconds(peer["time"]))
+    both = "scan", "vortex"
+    for k, name in enumerate(("y", "z", "circulation_5_15")):
+        about = found[name].attrs
+        text = about["long_name"]
+        found[f"{name}_true"] = both, true[..., k], about | {"long_name": f"true {text}"}
+        by = f"{text}, by the method of radial velocities"
+        found[f"{name}_rv"] = both, peer[name].values, about | {"long_name": by}
+        then = f"true {text} at its time"
+        found[f"{name}_rv_true"] = both, at_peer[..., k], about | {"long_name": then}
     age = {"units": "s", "long_name": "age of the wake"}
     found["age"] = "scan", doppler.passage.age + seconds, age
     # of a wake near the ground it grows
@@ -106,6 +113,17 @@ def line_vortices(
         wake.vortex_pair.separation if wake.vortex_pair else np.hypot(*np.ptp(first, 0)[:2])
     )
     return found.assign_attrs(separation=float(separation))
+
+
+def _nearer_first(doppler: CoherentDoppler, air: PassingWake, seconds: np.ndarray) -> np.ndarray:
+    """True vortices (scans, 2, 3), the smaller y first, each at its time (scans, 2); NaN: none."""
+    true = np.full((*seconds.shape, 3), np.nan)
+    for k in range(2):
+        known = np.isfinite(seconds[:, k])
+        both = true_vortices(doppler, air, seconds[known, k])
+        order = np.argsort(both[..., 0], axis=1)
+        true[known, k] = np.take_along_axis(both, order[..., None], axis=1)[:, k]
+    return true
 
 
 def _over_rings(found: xr.Dataset) -> dict[str, tuple[object, ...]]:
@@ -147,7 +165,8 @@ def _at_the_echo(lines: xr.Dataset, doppler: CoherentDoppler) -> xr.Dataset:
 
 def _seconds(time: xr.DataArray) -> np.ndarray:
     """Times from the start of the first line on, s."""
-    return (time.values - START) / np.timedelta64(1, "s")
+    passed = time.values - START
+    return np.where(np.isnat(passed), np.nan, passed / np.timedelta64(1, "s"))
 
 
 def _mean_wind(lines: xr.Dataset, heights: np.ndarray, air: PassingWake) -> np.ndarray:
