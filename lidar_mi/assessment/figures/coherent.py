@@ -60,7 +60,12 @@ def _slices(lines: xr.Dataset, vortices: xr.Dataset) -> Plate:
     usable = np.flatnonzero(vortices["flag"].values == 0)
     usable = usable if usable.size else np.arange(sweeps.size)
     chosen = usable[np.unique(np.linspace(0, usable.size - 1, _SHOWN).round().astype(int))]
-    figure = Figure(figsize=(13, 3.3 * len(chosen)), layout="constrained")
+    places = vortices.isel(scan=chosen)
+    left, right = float(places["y_true"].min()) - _ASIDE, float(places["y_true"].max()) + _ASIDE
+    top = float(places["z_true"].max()) + 0.6 * _ASIDE
+    # panels are 5.7 inches wide and true to scale
+    height = 5.7 * top / (right - left) + 0.5
+    figure = Figure(figsize=(13, height * len(chosen) + 0.4), layout="constrained")
     panels = figure.subplots(len(chosen), 2, squeeze=False, sharex=True, sharey=True)
     shown = lines.isel(time=np.flatnonzero(np.isin(lines["sweep"], sweeps[chosen])))
     limit = float(np.quantile(np.abs(shown["radial_velocity_true"].values), 0.998))
@@ -89,16 +94,12 @@ def _slices(lines: xr.Dataset, vortices: xr.Dataset) -> Plate:
             _mark(axes, pair)
             axes.set_title(f"{title}, age {float(pair['age']):.0f} s")
             axes.set_aspect("equal")
-        row[0].set_ylabel("height above the lidar / m")
-        figure.colorbar(mesh, ax=row, label="radial velocity / (m/s)", pad=0.01)
-    places = vortices.isel(scan=chosen)
+        row[0].set_ylabel("height / m")
+    figure.colorbar(mesh, ax=panels, label="radial velocity / (m/s)", pad=0.01, aspect=40)
     for axes in panels[-1]:
         axes.set_xlabel("distance from the lidar / m")
-    panels[0, 0].set_xlim(
-        float(places["y_true"].min()) - _ASIDE, float(places["y_true"].max()) + _ASIDE
-    )
-    panels[0, 0].set_ylim(0, float(places["z_true"].max()) + 0.6 * _ASIDE)
-    panels[0, 0].legend(loc="upper right", fontsize=8)
+    panels[0, 0].set(xlim=(left, right), ylim=(0, top))
+    panels[0, 0].legend(loc="upper left", fontsize=8)
     return figure, (
         "Radial velocity, positive away from the lidar. Black crosses: true vortices; green "
         "circles: fitted vortices with their core and 95 % intervals of the place."

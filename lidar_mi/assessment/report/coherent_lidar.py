@@ -10,7 +10,7 @@ from lidar_mi.units import shown
 _SCANS = {
     "rhi": "vertical slices",
     "ppi": "cones",
-    "dbs": "beams in five directions",
+    "dbs": "rounds of five beams",
     "stare": "lines in one direction",
 }
 _VORTICES = f"{PREFIX}vortices."
@@ -72,6 +72,6 @@ def coherent_described(lidar: CoherentDescription, wake: Wake | None) -> list[tu
             f"{laser.gate_length:g} m every {laser.gate_spacing:g} m from {laser.first_gate:g} m; "
             f"{lidar.signal.cnr:g} dB at {lidar.signal.range:g} m; at ({where}) m",
         ),
-        ("scan", f"{scan.count} times {_SCANS[scan.kind]}, {shown(scan.accumulation, 's')} a line"),
+        ("scan", f"{scan.count} {_SCANS[scan.kind]}, {shown(scan.accumulation, 's')} a line"),
     ]
     return rows

@@ -214,7 +214,8 @@ class RunFolder:
     def data_files(self) -> list[str]:
         """Names of the files beside the report, for links to them."""
         there = self._those((*RENDERED, *PREVIEWS))
-        there += [self.path / name for name in RESULTS.values() if (self.path / name).exists()]
+        names = dict.fromkeys(RESULTS.values())
+        there += [self.path / name for name in names if (self.path / name).exists()]
         return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
 
     def store_verdict(
