@@ -183,7 +183,7 @@ def _contrasts(
 ) -> _Contrasts:
     along, height = _geometry(windows)
     along, height = along[there], height[there]
-    full = of_gates(along[:, None] - along, height[:, None] - height, lidar, (length,))[0]
+    full = of_gates(along[:, None] - along, height[:, None] - height, lidar, (length,), _CELL)[0]
     shared = overlap(along, lidar.gate_length) * (np.abs(height[:, None] - height) < _CELL / 2)
     scaled = height / (_ROWS * _CELL / 2)
     mean = np.stack([np.ones_like(scaled), scaled, scaled**2], -1)

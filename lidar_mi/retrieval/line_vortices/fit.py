@@ -23,7 +23,7 @@ _SAME = 9.0  # of the misfit: another fit that is nearly as likely
 _ENOUGH = 1e-3  # of the misfit, at which iterations end
 _RATIO = 1.5  # of the strengths of turbulence that are compared
 _MOST_STEPS = 8
-_JITTER = 2e-3  # of the variance: interpolation of the covariance
+_JITTER = 1e-4  # of the variance: interpolation of the covariance
 _LEAST_TURBULENCE, _MOST_TURBULENCE = 0.01, 5.0  # m/s
 
 

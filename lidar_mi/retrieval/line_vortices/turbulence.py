@@ -10,13 +10,16 @@ from lidar_mi.retrieval.lines_of_sight.turbulence_covariance import correlations
 LENGTHS = (25.0, 75.0, 225.0)
 """Length scales of turbulence that are considered, m."""
 
-_STEP, _FINE = 2.5, 1.0  # m, of the tables along and across the lines
+_STEP, _FINE = 2.5, 0.5  # m, of the tables along and across the lines
 _ALONG, _ACROSS = 320.0, 240.0  # m, their ends
 
 
 @functools.lru_cache(maxsize=16)
-def _table(pulse_duration: float, gate_length: float, length: float) -> np.ndarray:
-    """Covariance (along, across) of two gates of parallel lines, of unit variance of the wind."""
+def _table(pulse_duration: float, gate_length: float, cell: int, length: float) -> np.ndarray:
+    """Covariance (along, across) of two gates of parallel lines, of unit variance of the wind.
+
+    Of averages over a cell of so many fine steps across the lines.
+    """
     lidar = CoherentLidar(
         pulse_duration=pulse_duration, gate_length=gate_length, first_gate=gate_length
     )
@@ -25,7 +28,7 @@ def _table(pulse_duration: float, gate_length: float, length: float) -> np.ndarr
     weight = range_weight(offset, lidar)
     pair = np.convolve(weight / weight.sum(), weight / weight.sum())
     along = np.arange(0.0, _ALONG + _STEP / 2, _STEP)
-    across = np.arange(0.0, _ACROSS + _FINE / 2, _FINE)
+    across = np.arange(-cell * _FINE, _ACROSS + (cell + 0.5) * _FINE, _FINE)
     extended = np.arange(-2 * reach, _ALONG + 2 * reach + _STEP / 2, _STEP)
     # a cell's mean square distance, so that small eddies within it count
     square = extended[:, None] ** 2 + across**2
@@ -33,17 +36,31 @@ def _table(pulse_duration: float, gate_length: float, length: float) -> np.ndarr
     f, g = correlations(distance, length)
     full = g + (f - g) * extended[:, None] ** 2 / np.maximum(square, 1e-9)
     windows = np.lib.stride_tricks.sliding_window_view(full, len(pair), axis=0)
-    return (windows @ pair)[: len(along)]
+    full = (windows @ pair)[: len(along)]
+    # two averages over a cell differ in place by a triangle of twice its width
+    triangle = np.convolve(np.ones(cell), np.ones(cell)) / cell**2
+    if cell == 1:
+        return full[:, 1:-1]
+    columns = np.lib.stride_tricks.sliding_window_view(full[:, 1:-1], len(triangle), axis=1)
+    return columns @ triangle
 
 
 def of_gates(
-    along: np.ndarray, across: np.ndarray, lidar: CoherentLidar, lengths: tuple[float, ...]
+    along: np.ndarray,
+    across: np.ndarray,
+    lidar: CoherentLidar,
+    lengths: tuple[float, ...],
+    cell: float,
 ) -> np.ndarray:
     """Covariances (lengths, ...) of gates at distances along and across their lines, m.
 
-    Lines are taken for parallel; the variance of each component of the wind is 1.
+    Lines are taken for parallel, each is an average over a cell (m) across; the variance of each
+    component of the wind is 1.
     """
-    tables = np.stack([_table(lidar.pulse_duration, lidar.gate_length, one) for one in lengths], -1)
+    steps = max(1, round(cell / _FINE))
+    tables = np.stack(
+        [_table(lidar.pulse_duration, lidar.gate_length, steps, one) for one in lengths], -1
+    )
     last = np.array(tables.shape[:2]) - 1.001
     row = np.minimum(np.abs(along) / _STEP, last[0])
     column = np.minimum(np.abs(across) / _FINE, last[1])

@@ -47,7 +47,8 @@ class Window:
         moved = wind * (time[:, None] - time)
         along = ranges[:, None] - ranges - moved * np.cos(angle)
         across = (ranges[:, None] + ranges) / 2 * (angle[:, None] - angle) + moved * np.sin(angle)
-        full = of_gates(along, across, self.lidar, lengths)
+        cell = float(np.median(lines.span)) * float(lines.ranges.mean())
+        full = of_gates(along, across, self.lidar, lengths, cell)
         # drift and range are those of one of the two
         return (full + full.transpose(0, 2, 1)) / 2
 
