@@ -18,6 +18,9 @@ WIND_TERMS = 3
 CORE_SPREAD = 0.5
 """Standard deviation of the logarithm of the core radius before the scan."""
 
+OTHER_PROFILE = 0.3
+"""Standard deviation of the fraction of the other profile: real vortices have neither."""
+
 _ROUNDS, _FIRST_ROUNDS = 20, 12
 _SAME = 9.0  # of the misfit: another fit that is nearly as likely
 _ENOUGH = 1e-3  # of the misfit, at which iterations end
@@ -55,16 +58,31 @@ class Air:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Vortices (n, 4) of `OF_VORTEX`, departures (n, 2) of their motion, m/s, wind (terms,)."""
+    """What a fit determines.
+
+    Attributes
+    ----------
+    vortices : (n, 4) array
+        `OF_VORTEX`.
+    departures : (n, 2) array
+        Of their motion along y and z from induction and mean wind, m/s.
+    other_profile : (1,) array
+        Fraction of the other profile in that of both.
+    wind : (terms,) array
+        Polynomial in height.
+    """
 
     vortices: np.ndarray
     departures: np.ndarray
+    other_profile: np.ndarray
     wind: np.ndarray
 
     @property
     def vector(self) -> np.ndarray:
         """All numbers."""
-        return np.concatenate([self.vortices.ravel(), self.departures.ravel(), self.wind])
+        return np.concatenate(
+            [self.vortices.ravel(), self.departures.ravel(), self.other_profile, self.wind]
+        )
 
     def of(self, vector: np.ndarray) -> "State":
         """The state of such numbers."""
@@ -72,7 +90,8 @@ class State:
         return State(
             vector[:first].reshape(-1, OF_VORTEX),
             vector[first : first + second].reshape(-1, 2),
-            vector[first + second :],
+            vector[first + second : first + second + 1],
+            vector[first + second + 1 :],
         )
 
 
@@ -119,7 +138,7 @@ def start_state(window: Window, vortices: np.ndarray) -> State:
     """A state of vortices (n, 4), of the mean of the window as wind."""
     wind = np.zeros(WIND_TERMS)
     wind[0] = np.mean(window.velocity / np.cos(window.lines.angle[window.line]))
-    return State(vortices, np.zeros((len(vortices), 2)), wind)
+    return State(vortices, np.zeros((len(vortices), 2)), np.zeros(1), wind)
 
 
 def fitted(
@@ -184,11 +203,13 @@ class _Problem:
         since = (lines.time - self.time)[:, None]
         for k in range(number):
             places = state.vortices[k, :2] + later[..., None] * speed[k]
-            one, by = seen(lines, places, state.vortices[k, 2:], ground, model)
+            other = float(state.other_profile[0])
+            one, by = seen(lines, places, state.vortices[k, 2:], ground, model, other)
             value += one
             slope[OF_VORTEX * k : OF_VORTEX * (k + 1)] += by[:4]
             # every number moves the vortices
-            moved = by[4:] + by[:2] * since
+            slope[-len(state.wind) - 1] += by[4]
+            moved = by[5:] + by[:2] * since
             slope += np.tensordot(speed_by[k].T, moved, 1)
         height = lines.ranges * np.sin(lines.angle)[:, None] - self.reference
         cos = np.cos(lines.angle)[:, None]
@@ -207,7 +228,7 @@ class _Problem:
         first, second = state.vortices.size, state.departures.size
         speed = motion(
             many[:, :first].reshape(len(many), -1, OF_VORTEX),
-            many[:, first + second :],
+            many[:, first + second + 1 :],
             self.reference,
             self.given.ground,
             self.given.model,
@@ -224,6 +245,7 @@ class _Problem:
         likely[cores], weight[cores] = np.log(self.given.core_radius), CORE_SPREAD**-2
         moves = slice(state.vortices.size, state.vortices.size + state.departures.size)
         weight[moves] = max(air.sigma, _LEAST_TURBULENCE) ** -2
+        weight[moves.stop] = OTHER_PROFILE**-2
         return vector - likely, weight
 
     def minimised(

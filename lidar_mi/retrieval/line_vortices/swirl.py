@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from lidar_mi.atmosphere.vortex import LAMB_OSEEN_CONSTANT, Model
 from lidar_mi.instrument.coherent.weighting import CoherentLidar, range_weight
@@ -79,6 +80,27 @@ def shape(square: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
     return value, np.where(small, -(a**2) / 2 + a**3 * square / 3, slope)
 
 
+def mixed(
+    square: np.ndarray, model: Model, departure: float | np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`shape` and its derivative, with a fraction of the other profile; what the fraction adds.
+
+    Both profiles have their largest speed at the core radius, so that all mixtures have.
+    """
+    other: Model = "lamb_oseen" if model == "burnham_hallock" else "burnham_hallock"
+    (value, slope), (second, second_slope) = shape(square, model), shape(square, other)
+    more = second - value
+    return value + departure * more, slope + departure * (second_slope - slope), more
+
+
+def circulation_5_15(core_radius: np.ndarray, departure: np.ndarray, model: Model) -> np.ndarray:
+    """Mean circulation over radii from 5 to 15 m, as usual for lidars, over the whole one."""
+    radius = np.linspace(5.0, 15.0, 101)
+    square = (radius / np.asarray(core_radius)[..., None]) ** 2
+    values = mixed(square, model, np.asarray(departure)[..., None])[0] * square
+    return np.asarray(scipy.integrate.trapezoid(values, radius) / 10)
+
+
 def motion(
     vortices: np.ndarray, wind: np.ndarray, reference: float, ground: float | None, model: Model
 ) -> np.ndarray:
@@ -113,7 +135,12 @@ def motion(
 
 
 def seen(
-    lines: Lines, places: np.ndarray, strengths: np.ndarray, ground: float | None, model: Model
+    lines: Lines,
+    places: np.ndarray,
+    strengths: np.ndarray,
+    ground: float | None,
+    model: Model,
+    departure: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Radial velocity of one vortex and its derivatives.
 
@@ -127,18 +154,20 @@ def seen(
         y and z of the vortex at the times of the lines' nodes, m.
     strengths : (2,) array
         Circulation and logarithm of the core radius.
+    departure : float
+        Fraction of the other profile.
 
     Returns
     -------
     value : (lines, gates) array
-    slope : (6, lines, gates) array
-        By y, z, circulation, logarithm of the core radius; by y and z times the time of the node,
-        s, after `Lines.time`: of a line whose beam moves.
+    slope : (7, lines, gates) array
+        By y, z, circulation, logarithm of the core radius, departure; by y and z times the time of
+        the node, s, after `Lines.time`: of a line whose beam moves.
     """
-    value, slope = _seen(lines, places, strengths, None, model)
+    value, slope = _seen(lines, places, strengths, None, model, departure)
     if ground is None:
         return value, slope
-    image, by = _seen(lines, places, strengths, ground, model)
+    image, by = _seen(lines, places, strengths, ground, model, departure)
     return value + image, slope + by
 
 
@@ -149,7 +178,12 @@ def node_angles(lines: Lines) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _seen(
-    lines: Lines, places: np.ndarray, strengths: np.ndarray, mirror: float | None, model: Model
+    lines: Lines,
+    places: np.ndarray,
+    strengths: np.ndarray,
+    mirror: float | None,
+    model: Model,
+    departure: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     angle, time = node_angles(lines)
     cos, sin = np.cos(angle)[..., None], np.sin(angle)[..., None]
@@ -161,13 +195,14 @@ def _seen(
     across = z * cos - y * sin
     offset = lines.distance - along
     square = (offset**2 + across**2) * inverse
-    f, df = shape(square, model)
+    f, df, more = mixed(square, model, departure)
     # of unit circulation, before the weighting
     unit = inverse / (2 * np.pi)
     omega = f @ lines.weight * unit
     by_square = df @ lines.weight * unit * inverse
     by_offset = (df * offset) @ lines.weight * unit * inverse
     by_core = (f + square * df) @ lines.weight * (-2 * unit)
+    by_departure = more @ lines.weight * unit
     gamma = strengths[0] if mirror is None else -strengths[0]
     # the square is offset^2 + across^2: d offset = -(cos, sin), d across = (-sin, cos)
     by_y = gamma * (-sin * omega + 2 * across * (-cos * by_offset - sin * across * by_square))
@@ -175,5 +210,6 @@ def _seen(
     sign = 1.0 if mirror is None else -1.0
     by_z, by_gamma = sign * by_z, sign * across * omega
     later = (time - lines.time[:, None])[..., None]
-    parts = [by_y, by_z, by_gamma, gamma * across * by_core, by_y * later, by_z * later]
+    by_shape = [gamma * across * by_core, gamma * across * by_departure]
+    parts = [by_y, by_z, by_gamma, *by_shape, by_y * later, by_z * later]
     return (gamma * across * omega).mean(1), np.stack(parts).mean(2)

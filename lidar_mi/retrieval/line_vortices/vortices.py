@@ -16,6 +16,7 @@ from lidar_mi.retrieval.line_vortices.dataset import ScanVortices, VortexFlag, v
 from lidar_mi.retrieval.line_vortices.detection import SEPARATIONS, detect
 from lidar_mi.retrieval.line_vortices.fit import Air, Assumptions, Fit, fitted
 from lidar_mi.retrieval.line_vortices.scan_plane import PlaneScan, plane_scans
+from lidar_mi.retrieval.line_vortices.track import tracked
 from lidar_mi.retrieval.line_vortices.turbulence import LENGTHS
 from lidar_mi.retrieval.line_vortices.window import Window, window_of
 
@@ -75,10 +76,13 @@ def fit_vortices_to_lines(
     -------
     xr.Dataset, dims (scan, vortex)
         `y` (horizontal distance from the lidar in the plane of the scan, m), `z` (height above the
-        lidar, m), `circulation` (m2 s-1; positive turns from y to z), `core_radius` (m), each with
-        `_stderr`, and their `covariance` (scan, number, other_number); `wind` (m s-1) along y at
-        the mean height of the vortices; `time`, at which they are there; `probability` of a wake,
-        `false_alarm`, `score`; `flag` (0: valid). Vortex 0 is that of smaller y.
+        lidar, m), `circulation` (m2 s-1; positive turns from y to z), `core_radius` (m) and
+        `circulation_5_15` (m2 s-1, mean over radii from 5 to 15 m), each with `_stderr`; the
+        `covariance` (scan, number, other_number) of the first four; `wind` (m s-1) along y at the
+        mean height of the vortices; `other_profile`, the fraction of the profile that was not
+        chosen; `time`, at which the vortices are there; `probability` of a wake, `false_alarm`,
+        `score`; `flag` (0: valid). Vortex 0 is that of smaller y. Of two scans or more, `y_tracked`
+        and so on with `_stderr`, smoothed over all scans, and `track_used`.
 
     Raises
     ------
@@ -133,7 +137,8 @@ def fit_vortices_to_lines(
         for scan in plane_scans(one, noise):
             found.append(_scan(scan, lidar, given, kind, separations, false_alarm))
     about = {"profile": profile, "kind": kind, "false_alarm_limit": false_alarm}
-    return vortex_dataset(found, about)
+    vortices = vortex_dataset(found, about)
+    return tracked(vortices, ground) if len(found) > 1 else vortices
 
 
 def _check(**numbers: float | None) -> None:
