@@ -26,6 +26,7 @@ from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
 from lidar_mi.experiment import shipped
+from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.schema import air, coherent, reading, scattering, wake
 from lidar_mi.experiment.schema import experiment as schema
 from lidar_mi.experiment.truth import extinction as truth
@@ -400,8 +401,10 @@ def check_yaml(block):
     elif block.file:
         Path(block.file).write_text(block.text)
         for experiment in reading.load_variants(block.file).values() or [reading.load(block.file)]:
-            if experiment.wake:
+            if experiment.imaged_wake:
                 truth.make_truth(experiment)
+            elif experiment.coherent:
+                prepare(experiment)
     else:
         loaded = reading.check({**BASE, **data}, block.place)
         scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables

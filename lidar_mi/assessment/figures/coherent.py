@@ -142,6 +142,9 @@ def _track(vortices: xr.Dataset) -> Plate:
             sign = np.sign(one[f"{name}_true"].values) if name == "circulation_5_15" else 1.0
             colour = f"C{k}"
             axes.plot(age, sign * one[f"{name}_true"], color=colour, lw=1, label=f"{side}, true")
+            if f"{name}_tracked" in one:
+                middle, spread = one[f"{name}_tracked"], 1.96 * one[f"{name}_tracked_stderr"]
+                axes.fill_between(age, middle - spread, middle + spread, color=colour, alpha=0.25)
             axes.errorbar(
                 age[valid],
                 (sign * one[name].values)[valid],
@@ -156,7 +159,10 @@ def _track(vortices: xr.Dataset) -> Plate:
         if name != "y":
             axes.set_ylim(bottom=0)
     figure.axes[0].legend(fontsize=8)
-    return figure, "Every scan by itself, with 95 % intervals; scans with a flag are left out."
+    return figure, (
+        "Markers: every slice by itself, with 95 % intervals; those with a flag are left out. "
+        "Bands: 95 % intervals by all slices together."
+    )
 
 
 def _errors(vortices: xr.Dataset) -> Plate:

@@ -81,7 +81,8 @@ def vortex_scan_metrics(vortices: xr.Dataset) -> dict[str, float]:
     (medians of the sizes, of the circulation and of the separation), ``circulation_rms``,
     ``place_rms``, ``circulation_bias`` (mean); ``coverage_68_*`` and ``coverage_95_*``,
     ``normalised_error_variance_*`` of y, z and circulation. ``coherent.rv.``: the same errors by
-    the method of radial velocities, and the fraction of the slices in which it finds both.
+    the method of radial velocities, and the fraction of the slices in which it finds both;
+    ``coherent.track.``: of the places by all slices together.
     """
     errors, start = vortex_errors(vortices), f"{PREFIX}vortices."
     found = {
@@ -95,6 +96,8 @@ def vortex_scan_metrics(vortices: xr.Dataset) -> dict[str, float]:
         return found
     found |= _sizes(start, errors)
     found[f"{start}circulation_bias"] = float(np.nanmean(errors["circulation_error"]))
+    if "y_tracked" in vortices:
+        found |= _track_metrics(vortices)
     for name in _QUANTITIES:
         normalised = errors[f"{name}_normalised"].values
         statistics = error_statistics(normalised, np.ones_like(normalised))
@@ -111,6 +114,19 @@ def _sizes(start: str, errors: xr.Dataset) -> dict[str, float]:
         if np.isfinite(size).any():
             found[f"{start}{name}_error"] = float(np.nanmedian(size))
             found[f"{start}{name}_rms"] = float(np.sqrt(np.nanmean(size**2)))
+    return found
+
+
+def _track_metrics(vortices: xr.Dataset) -> dict[str, float]:
+    """Of the places that all slices together give: ``coherent.track.place_error``, coverages."""
+    away, found = [], {}
+    for name in "yz":
+        error = (vortices[f"{name}_tracked"] - vortices[f"{name}_true"]).values
+        away.append(error / vortices.attrs["separation"])
+        statistics = error_statistics(error, vortices[f"{name}_tracked_stderr"].values)
+        for key in ("coverage_68", "coverage_95"):
+            found[f"{PREFIX}track.{key}_{name}"] = statistics[key]
+    found[f"{PREFIX}track.place_error"] = float(np.nanmedian(np.hypot(*away)))
     return found
 
 

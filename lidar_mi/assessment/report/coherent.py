@@ -62,7 +62,7 @@ def _by_age(vortices: xr.Dataset) -> NumberTable:
 
 
 def _peer(metrics: Mapping[str, float]) -> NumberTable:
-    columns = (_VORTICES, f"{PREFIX}rv.")
+    columns = (_VORTICES, f"{PREFIX}track.", f"{PREFIX}rv.")
     rows = []
     for key, label in (
         ("circulation_error", "median error of the circulation"),
@@ -73,7 +73,7 @@ def _peer(metrics: Mapping[str, float]) -> NumberTable:
     ):
         values = [metrics.get(f"{start}{key}") for start in columns]
         rows.append((label, "%", ["-" if one is None else f"{100 * one:.3g}" for one in values]))
-    heads = ("fit to the slice", "method of radial velocities")
+    heads = ("fit to each slice", "all slices together", "method of radial velocities")
     return "Compared with the method of radial velocities", heads, rows
 
 

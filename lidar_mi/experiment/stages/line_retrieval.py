@@ -3,6 +3,7 @@
 import numpy as np
 import xarray as xr
 
+from lidar_mi.atmosphere.vortex import Model
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.coherent import CoherentDoppler
@@ -77,12 +78,11 @@ def line_vortices(
     Returns
     -------
     xr.Dataset
-        With `circulation_5_15` (m^2/s, mean over rings of 5 to 15 m) and its standard error;
-        `y_true`, `z_true` (m) and `circulation_5_15_true` at the time of the fit, the smaller y
-        first; the wake's `age` (s) and the attribute ``separation`` (m) of the wake. Of the method
-        of radial velocities, its peer, `y_rv`, ... and the truth at its own times, `y_rv_true`, ...
+        With `y_true`, `z_true` (m) and `circulation_5_15_true` (m^2/s, mean over rings of 5 to
+        15 m) at the time of the fit, the smaller y first; the wake's `age` (s) and the attribute
+        ``separation`` (m) of the wake. Of the method of radial velocities, its peer, `y_rv`, ...
+        and the truth at its own times, `y_rv_true`, ...
     """
-    from lidar_mi.retrieval.line_vortices.rv_method import radial_velocity_vortices
     from lidar_mi.retrieval.line_vortices.vortices import fit_vortices_to_lines
 
     log.bar("fitting vortices to lines of sight", None)
@@ -90,19 +90,16 @@ def line_vortices(
     lines = _at_the_echo(coherent_lines, doppler)
     found = fit_vortices_to_lines(lines, ground=ground)
     seconds = _seconds(found["time"])
-    found = found.assign(_over_rings(found))
-    peer = radial_velocity_vortices(lines)
-    core = np.array(peer.attrs["core_radius"])
-    peer["circulation_5_15"] = peer["circulation"] * ring_fraction(core, peer.attrs["profile"])
+    peer = _by_peer(lines, doppler, passing_air, found.attrs["profile"])
     true = _nearer_first(doppler, passing_air, np.stack([seconds, seconds], -1))
-    at_peer = _nearer_first(doppler, passing_air, _seconds(peer["time"]))
+    at_peer = _nearer_first(doppler, passing_air, peer[..., 3])
     both = "scan", "vortex"
     for k, name in enumerate(("y", "z", "circulation_5_15")):
         about = found[name].attrs
         text = about["long_name"]
         found[f"{name}_true"] = both, true[..., k], about | {"long_name": f"true {text}"}
         by = f"{text}, by the method of radial velocities"
-        found[f"{name}_rv"] = both, peer[name].values, about | {"long_name": by}
+        found[f"{name}_rv"] = both, peer[..., k], about | {"long_name": by}
         then = f"true {text} at its time"
         found[f"{name}_rv_true"] = both, at_peer[..., k], about | {"long_name": then}
     age = {"units": "s", "long_name": "age of the wake"}
@@ -126,32 +123,34 @@ def _nearer_first(doppler: CoherentDoppler, air: PassingWake, seconds: np.ndarra
     return true
 
 
-def _over_rings(found: xr.Dataset) -> dict[str, tuple[object, ...]]:
-    """Circulation over rings of 5 to 15 m of the fitted vortices, and its standard error.
+def _by_peer(
+    lines: xr.Dataset, doppler: CoherentDoppler, air: PassingWake, profile: Model
+) -> np.ndarray:
+    """By the method of radial velocities: y, z, circulation of 5 to 15 m, time (scans, 2, 4).
 
-    It hardly depends on the core, which a lidar with gates of 30 m hardly sees.
+    It searches around the true places, at which it has no way to be wrong by a whole vortex. NaN:
+    it finds nothing.
     """
-    core, model = found["core_radius"].values, found.attrs["profile"]
-    fraction = ring_fraction(core, model)
-    step = 1e-3 * core
-    slope = (ring_fraction(core + step, model) - ring_fraction(core - step, model)) / (2 * step)
-    circulation = found["circulation"].values
-    variance = np.empty_like(circulation)
-    for k in range(found.sizes["vortex"]):
-        names = [f"circulation_{k}", f"core_radius_{k}"]
-        own = found["covariance"].sel(number=names, other_number=names).values
-        by = np.stack([fraction[:, k], circulation[:, k] * slope[:, k]], axis=-1)
-        variance[:, k] = np.einsum("sa,sab,sb->s", by, own, by)
-    both, about = ("scan", "vortex"), {"units": "m2 s-1"}
-    text = "circulation, mean over rings of 5 to 15 m"
-    return {
-        "circulation_5_15": (both, circulation * fraction, {**about, "long_name": text}),
-        "circulation_5_15_stderr": (
-            both,
-            np.sqrt(variance),
-            {**about, "long_name": f"standard error: {text}"},
-        ),
-    }
+    from lidar_mi.retrieval.line_vortices.fit import Assumptions
+    from lidar_mi.retrieval.line_vortices.radial_velocities import by_radial_velocities
+    from lidar_mi.retrieval.line_vortices.scan_plane import plane_scans
+
+    given, lidar = Assumptions(profile), coherent_lidar(doppler)
+    part = float(ring_fraction(np.array(given.core_radius), profile))
+    scans = list(plane_scans(lines, None))
+    rows = np.full((len(scans), 2, 4), np.nan)
+    for row, scan in zip(rows, scans, strict=True):
+        start = (scan.start - START) / np.timedelta64(1, "s")
+        middle = np.full((1, 2), start + float(scan.time.mean()))
+        guess = _nearer_first(doppler, air, middle)[0]
+        cores = np.full((2, 1), np.log(given.core_radius))
+        found = by_radial_velocities(scan, lidar, given, np.hstack([guess, cores]))
+        if found is not None:
+            row[:, :3] = found * [1, 1, part]
+            # when the lines pass there
+            angle = np.arctan2(found[:, 1], found[:, 0])
+            row[:, 3] = start + np.interp(angle, scan.angle, scan.time)
+    return rows
 
 
 def _at_the_echo(lines: xr.Dataset, doppler: CoherentDoppler) -> xr.Dataset:
@@ -165,8 +164,7 @@ def _at_the_echo(lines: xr.Dataset, doppler: CoherentDoppler) -> xr.Dataset:
 
 def _seconds(time: xr.DataArray) -> np.ndarray:
     """Times from the start of the first line on, s."""
-    passed = time.values - START
-    return np.where(np.isnat(passed), np.nan, passed / np.timedelta64(1, "s"))
+    return (time.values - START) / np.timedelta64(1, "s")
 
 
 def _mean_wind(lines: xr.Dataset, heights: np.ndarray, air: PassingWake) -> np.ndarray:
