@@ -170,6 +170,13 @@ def vortex_dataset(found: Sequence[ScanVortices], about: Mapping[str, Any]) -> x
         "azimuth": _variable(
             ("scan",), np.array([one.scan.azimuth for one in found]), "degree", "azimuth of y"
         ),
+        "sweep": (
+            "scan",
+            np.array([one.scan.sweep for one in found]),
+            {"long_name": "number of the scan in its data set"},
+        ),
+        "scan": np.arange(count),
+        "vortex": np.arange(number),
         "number": names,
         "other_number": names,
     }

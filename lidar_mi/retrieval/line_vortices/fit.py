@@ -26,7 +26,7 @@ _SAME = 9.0  # of the misfit: another fit that is nearly as likely
 _ENOUGH = 1e-3  # of the misfit, at which iterations end
 _RATIO = 1.5  # of the strengths of turbulence that are compared
 _MOST_STEPS = 8
-_JITTER = 1e-4  # of the variance: interpolation of the covariance
+_ROUNDING = 3e-4  # of the variance: interpolation of the covariance
 _LEAST_TURBULENCE, _MOST_TURBULENCE = 0.01, 5.0  # m/s
 
 
@@ -170,6 +170,12 @@ def fitted(
     return problem.averaged(state, air, models, converged), others
 
 
+def residuals(window: Window, fit: Fit, given: Assumptions) -> np.ndarray:
+    """Velocities of the cells less those of a fit (n,), m/s."""
+    problem = _Problem(window, given, fit.time, fit.reference)
+    return window.velocity - problem.predicted(fit.state)[0]
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     window: Window
@@ -188,7 +194,7 @@ class _Problem:
         """Lower factor of the covariance of the cells."""
         full = self.turbulence[LENGTHS.index(air.length)]
         covariance = air.sigma**2 * full + self.window.noise
-        covariance[np.diag_indices_from(covariance)] += _JITTER * air.sigma**2 * full[0, 0]
+        covariance[np.diag_indices_from(covariance)] += _ROUNDING * air.sigma**2 * full[0, 0]
         return scipy.linalg.cholesky(covariance, lower=True, check_finite=False)
 
     def predicted(self, state: State) -> tuple[np.ndarray, np.ndarray]:

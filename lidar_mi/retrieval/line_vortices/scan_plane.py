@@ -38,6 +38,10 @@ class PlaneScan:
         Angle that the beam moves through in the time of a line, rad.
     azimuth : float
         Of the y axis, degrees.
+    sweep : int
+        Its number in the data set.
+    stated : bool
+        Whether the noise is known, not estimated.
     """
 
     start: np.datetime64
@@ -48,6 +52,8 @@ class PlaneScan:
     variance: np.ndarray
     span: float
     azimuth: float
+    sweep: int
+    stated: bool
 
     def at(self, seconds: float) -> np.datetime64:
         """Time of day of so many seconds after the start."""
@@ -116,6 +122,8 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneSca
         variance,
         float(np.median(np.diff(angle[order]))),
         float(np.rad2deg(along) % 360),
+        number,
+        "radial_velocity_stderr" in lines or noise is not None,
     )
 
 

@@ -5,6 +5,8 @@ them and the relative rate of decay of their circulations. Vortices move with th
 induction (`swirl.motion`).
 """
 
+from typing import Any
+
 import numpy as np
 import scipy
 import xarray as xr
@@ -73,7 +75,9 @@ def tracked(found: xr.Dataset, ground: float | None) -> xr.Dataset:
         for k, (state, covariance) in zip(scans, states, strict=True):
             values[k] = state[: 4 * number]
             stderr[k] = np.sqrt(np.diag(covariance))[: 4 * number]
-    more = {"track_used": ("scan", used, {"long_name": "whether the track uses the fit"})}
+    more: dict[str, Any] = {
+        "track_used": ("scan", used, {"long_name": "whether the track uses the fit"})
+    }
     for n, name in enumerate(NUMBERS):
         for suffix, part in (("tracked", values), ("tracked_stderr", stderr)):
             about = {

@@ -12,9 +12,10 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.vortex import Model
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
+from lidar_mi.progress import Notice
 from lidar_mi.retrieval.line_vortices.dataset import ScanVortices, VortexFlag, vortex_dataset
 from lidar_mi.retrieval.line_vortices.detection import SEPARATIONS, detect
-from lidar_mi.retrieval.line_vortices.fit import Air, Assumptions, Fit, fitted
+from lidar_mi.retrieval.line_vortices.fit import Air, Assumptions, Fit, fitted, residuals
 from lidar_mi.retrieval.line_vortices.scan_plane import PlaneScan, plane_scans
 from lidar_mi.retrieval.line_vortices.track import tracked
 from lidar_mi.retrieval.line_vortices.turbulence import LENGTHS
@@ -43,6 +44,7 @@ def fit_vortices_to_lines(
     gate_length: float | None = None,
     noise: float | None = None,
     false_alarm: float = FALSE_ALARM,
+    notice: Notice | None = None,
 ) -> xr.Dataset:
     r"""Vortices of a wake from vertical slices (RHI) of a Doppler lidar on the ground.
 
@@ -71,6 +73,8 @@ def fit_vortices_to_lines(
         the differences of neighbouring lines.
     false_alarm : float
         Of scans without a wake, the fraction in which one may be found.
+    notice : callable, optional
+        Called with what is being fitted and how far it is, 0 to 1.
 
     Returns
     -------
@@ -132,9 +136,12 @@ def fit_vortices_to_lines(
     if span is not None:
         separations = tuple(math.pi / 4 * span * factor for factor in (0.85, 1.0, 1.2))
     found = []
-    for one in sets:
+    for number, one in enumerate(sets):
         lidar = _lidar(one, pulse_length, gate_length)
-        for scan in plane_scans(one, noise):
+        scans = list(plane_scans(one, noise))
+        for k, scan in enumerate(scans):
+            if notice is not None:
+                notice("fitting vortices", (number + k / len(scans)) / len(sets))
             found.append(_scan(scan, lidar, given, kind, separations, false_alarm))
     about = {"profile": profile, "kind": kind, "false_alarm_limit": false_alarm}
     vortices = vortex_dataset(found, about)
@@ -177,6 +184,9 @@ def _scan(
     length = min(LENGTHS, key=lambda one: abs(math.log(one / seen.air.length)))
     starts = [one.vortices for one in seen.candidates]
     fit, others = fitted(window, starts, Air(seen.air.sigma, length), given)
+    if not scan.stated:
+        window = window.with_noise_of(residuals(window, fit, given))
+        fit, _ = fitted(window, [fit.state.vortices], fit.air, given)
     return ScanVortices(scan, seen, fit, _flag(scan, fit, others, lidar), 1 if single else 2)
 
 

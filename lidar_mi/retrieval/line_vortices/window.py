@@ -1,8 +1,9 @@
 """The part of a scan around vortices: averages of neighbouring lines, gates that hardly overlap."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.retrieval.line_vortices.scan_plane import PlaneScan
@@ -14,6 +15,9 @@ CELL = 1.5
 
 MOST_CELLS = 750
 """Of a window: the covariance of more is too slow."""
+
+_NEIGHBOURS = 7, 3  # lines and gates of an estimate of the noise
+_LEAST_NOISE = 0.005  # m/s: rounding of the velocities
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,19 +47,47 @@ class Window:
         """Covariances (lengths, n, n) of turbulence of unit variance that drifts with the wind."""
         lines = self.lines
         ranges, angle = lines.ranges[self.gate], lines.angle[self.line]
-        time = lines.time[self.line]
-        moved = wind * (time[:, None] - time)
-        along = ranges[:, None] - ranges - moved * np.cos(angle)
-        across = (ranges[:, None] + ranges) / 2 * (angle[:, None] - angle) + moved * np.sin(angle)
+        middle = lines.angle.mean()
+        # in the frame of the air, along the middle line and across it
+        drift = wind * lines.time[self.line]
+        along = ranges * np.cos(angle - middle) - drift * np.cos(middle)
+        across = ranges * np.sin(angle - middle) + drift * np.sin(middle)
         cell = float(np.median(lines.span)) * float(lines.ranges.mean())
-        full = of_gates(along, across, self.lidar, lengths, cell)
-        # drift and range are those of one of the two
-        return (full + full.transpose(0, 2, 1)) / 2
+        return of_gates(along[:, None] - along, across[:, None] - across, self.lidar, lengths, cell)
+
+    def with_noise_of(self, residual: np.ndarray) -> "Window":
+        """The same with the noise that the residuals (n,) of neighbouring lines show.
+
+        From their second differences over seven lines and three gates: where the vortices widen the
+        spectra, velocities are less certain than elsewhere.
+        """
+        lines = self.lines
+        full = np.full((len(lines.time), len(lines.ranges)), np.nan)
+        full[self.line, self.gate] = residual
+        square = np.full(full.shape, np.nan)
+        square[1:-1] = (full[:-2] - 2 * full[1:-1] + full[2:]) ** 2 / 6
+        known = np.isfinite(square)
+        total, number = (
+            scipy.ndimage.uniform_filter(one, _NEIGHBOURS, mode="constant")
+            for one in (np.where(known, square, 0.0), known.astype(float))
+        )
+        everywhere = float(square[known].mean())
+        local = np.where(number > 0.3, total / np.maximum(number, 0.01), everywhere)
+        size = np.sqrt(np.maximum(local[self.line, self.gate], _LEAST_NOISE**2))
+        return replace(self, noise=_noise(self.line, self.gate, size, lines.ranges, self.lidar))
 
     @property
     def height(self) -> np.ndarray:
         """Of the cells above the lidar, m."""
         return self.lines.ranges[self.gate] * np.sin(self.lines.angle[self.line])
+
+
+def _noise(
+    line: np.ndarray, gate: np.ndarray, size: np.ndarray, ranges: np.ndarray, lidar: CoherentLidar
+) -> np.ndarray:
+    """Covariance of the noise of cells of standard deviations (n,)."""
+    shared = overlap(ranges, lidar.gate_length)[gate[:, None], gate]
+    return shared * (line[:, None] == line) * size[:, None] * size
 
 
 def window_of(
@@ -94,8 +126,7 @@ def window_of(
     if line.size < 24 or np.unique(line).size < 4 or np.unique(gate).size < 3:
         return None
     size = np.sqrt(noise[line, gate])
-    shared = overlap(scan.ranges[gates], lidar.gate_length)[gate[:, None], gate]
-    covariance = shared * (line[:, None] == line) * size[:, None] * size
+    covariance = _noise(line, gate, size, scan.ranges[gates], lidar)
     rate = np.gradient(time, angle) if len(angle) > 1 else np.zeros(1)
     return Window(
         lines_of(time, angle, counts * scan.span, rate, scan.ranges[gates], lidar),
