@@ -88,7 +88,7 @@ def line_vortices(
     log.bar("fitting vortices to lines of sight", None)
     ground = -doppler.position[2] if doppler.passage.ground and wake.vortex_pair else None
     lines = _at_the_echo(coherent_lines, doppler)
-    found = fit_vortices_to_lines(lines, ground=ground)
+    found = fit_vortices_to_lines(lines, ground=ground, notice=log.bar)
     seconds = _seconds(found["time"])
     peer = _by_peer(lines, doppler, passing_air, found.attrs["profile"])
     true = _nearer_first(doppler, passing_air, np.stack([seconds, seconds], -1))
