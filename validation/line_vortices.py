@@ -171,9 +171,9 @@ def families(effort) -> Check:
     )
     text = (
         "Medians of the errors; of Burnham-Hallock's vortices and of the simulated ones the mean "
-        "circulation from 5 to 15 m, else the whole; place relative to the separation (of one vortex, 47 m). RV: method "
-        "of radial velocities with the true core radius, on the same scans. Coverage of y, z and "
-        "circulation together, and of the circulation."
+        "circulation from 5 to 15 m, else the whole; place relative to the separation (of one "
+        "vortex, 47 m). RV: method of radial velocities with the true core radius, on the same "
+        "scans. Coverage of y, z and circulation together, and of the circulation."
     )
     return Check("Wakes", text, tuple(rows), comparison=Comparison(heads, tuple(lines)))
 

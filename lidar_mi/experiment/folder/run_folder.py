@@ -52,6 +52,9 @@ RESULTS = {
     "wind_volume": "wind_volume.nc",
     "v_los": "v_los.nc",
     "lines": "lines_of_sight.nc",
+    "coherent_lines": "lines_of_sight.nc",
+    "line_winds": "wind_profiles.nc",
+    "line_vortices": "line_vortices.nc",
     "wind3d": "wind3d.nc",
     "vortices": "vortex.json",
 }
@@ -216,7 +219,8 @@ class RunFolder:
     def data_files(self) -> list[str]:
         """Names of the files beside the report, for links to them."""
         there = self._those((*RENDERED, *PREVIEWS))
-        there += [self.path / name for name in RESULTS.values() if (self.path / name).exists()]
+        names = dict.fromkeys(RESULTS.values())
+        there += [self.path / name for name in names if (self.path / name).exists()]
         return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
 
     def store_verdict(

@@ -94,8 +94,11 @@ def make_truth(
     >>> truth.wind["v"].dims, len(truth.extinction)
     (('z', 'y'), 2)
     """
-    if experiment.wake is None:
-        raise InputError(f"wake: missing in {experiment.name}; expected the section of a wake")
+    if experiment.imaged_wake is None:
+        raise InputError(
+            f"wake: missing in {experiment.name}; expected the section of a wake that a "
+            "backscatter lidar observes"
+        )
     if flows is None:
         flows = flows_of(experiment, None if beside is None else Path(beside))
     return call(true_air, experiment, flows=flows, advected=advected)
