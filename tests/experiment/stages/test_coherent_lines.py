@@ -216,3 +216,21 @@ def test_what_cannot_be_measured_is_refused(doppler, wake, message):
     with pytest.raises(InputError) as error:
         prepare(experiment(doppler, wake))
     assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize(("exhaust", "flagged"), [("tracer", True), (None, False)])
+def test_slices_of_an_uneven_echo_are_flagged(exhaust, flagged):
+    """Exhaust in the cores hides the air around them from gates of 30 m: no error bar says so."""
+    wake = {"file": "wake_slab_40s.nc", "time": "40 s", "extinction": {"tracer": exhaust}}
+    wake["extinction"]["aerosol"] = None
+    scan = {"count": 1, "elevations": ["3 deg", "13 deg"], "rate": "4 deg/s"}
+    given = experiment({"scan": scan, "passage": {"height": "100 m"}}, wake)
+    air, lines = measured(given)
+    found = call(line_vortices, given, coherent_lines=lines, passing_air=air)
+    meanings, masks = (
+        found["flag"].attrs["flag_meanings"].split(),
+        found["flag"].attrs["flag_masks"],
+    )
+    mask = int(masks[meanings.index("uneven_echo")])
+    assert bool(int(found["flag"][0]) & mask) == flagged
+    assert len(meanings) == len(masks) == len(set(masks.tolist()))
