@@ -74,7 +74,9 @@ def vortices(
     ] = None,
     noise: Annotated[
         str | None,
-        typer.Option(help="Standard error of every velocity: '0.1 m/s'. Default: from the lines."),
+        typer.Option(
+            help="Least standard error of the velocities: '0.1 m/s'. Default: from the lines."
+        ),
     ] = None,
     false_alarm: Annotated[
         float, typer.Option(help="Of scans without a wake, the fraction that may show one.")

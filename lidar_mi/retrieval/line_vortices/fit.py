@@ -148,7 +148,7 @@ def fitted(
 
     Turbulence is estimated from the residuals; ``air`` is the first guess.
     """
-    first = _Problem(window, given, crossing_time(window, starts[0]), float(starts[0][:, 1].mean()))
+    first = Problem(window, given, crossing_time(window, starts[0]), float(starts[0][:, 1].mean()))
     factor = first.factor(air)
     ends = []
     for start in starts:
@@ -172,12 +172,22 @@ def fitted(
 
 def residuals(window: Window, fit: Fit, given: Assumptions) -> np.ndarray:
     """Velocities of the cells less those of a fit (n,), m/s."""
-    problem = _Problem(window, given, fit.time, fit.reference)
+    problem = Problem(window, given, fit.time, fit.reference)
     return window.velocity - problem.predicted(fit.state)[0]
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class Problem:
+    """The velocities of a window as a function of a state, and how likely they are.
+
+    Attributes
+    ----------
+    window : Window
+    given : Assumptions
+    time, reference : float
+        At which the vortices are where the state says, s, and height (m) of the wind's polynomial.
+    """
+
     window: Window
     given: Assumptions
     time: float

@@ -5,6 +5,7 @@ Plane: y horizontal distance from the lidar along the azimuth of the scan, z hei
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -40,8 +41,8 @@ class PlaneScan:
         Of the y axis, degrees.
     sweep : int
         Its number in the data set.
-    stated : bool
-        Whether the noise is known, not estimated.
+    stated : {"gates", "least", "none"}
+        Whether the noise is known for every gate, is the least one, or is estimated.
     """
 
     start: np.datetime64
@@ -53,7 +54,7 @@ class PlaneScan:
     span: float
     azimuth: float
     sweep: int
-    stated: bool
+    stated: Literal["gates", "least", "none"]
 
     def at(self, seconds: float) -> np.datetime64:
         """Time of day of so many seconds after the start."""
@@ -105,11 +106,12 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneSca
     part = slice(gates[0], gates[-1] + 1)
     velocity = velocity[:, part]
     if "radial_velocity_stderr" in lines:
+        stated: Literal["gates", "least", "none"] = "gates"
         variance = lines["radial_velocity_stderr"].values.astype(float)[order][:, part] ** 2
     elif noise is not None:
-        variance = np.full(velocity.shape, noise**2)
+        variance, stated = np.full(velocity.shape, noise**2), "least"
     else:
-        variance = _noise_variance(velocity)
+        variance, stated = _noise_variance(velocity), "none"
     velocity = np.where(np.isfinite(variance), velocity, np.nan)
     time = lines["time"].values
     seconds = (time - time.min()) / np.timedelta64(1, "s")
@@ -123,7 +125,7 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneSca
         float(np.median(np.diff(angle[order]))),
         float(np.rad2deg(along) % 360),
         number,
-        "radial_velocity_stderr" in lines or noise is not None,
+        stated,
     )
 
 

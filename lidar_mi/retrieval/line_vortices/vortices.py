@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import scipy
@@ -69,8 +69,8 @@ def fit_vortices_to_lines(
         Full width at half maximum of the pulse in range (c tau / 2), and length of the time window
         of a gate, m. Default: attributes of the data set of these names; of the pulse, the gate's.
     noise : float, optional
-        Standard error of every velocity, m/s, where the data set does not state it. Default: from
-        the differences of neighbouring lines.
+        Least standard error of the velocities, m/s, where the data set does not state it for every
+        gate; residuals of neighbouring lines show where it is larger. Default: from these alone.
     false_alarm : float
         Of scans without a wake, the fraction in which one may be found.
     notice : callable, optional
@@ -128,6 +128,11 @@ def fit_vortices_to_lines(
         gate_length=gate_length,
         noise=noise,
     )
+    for name, value, choice in (("kind", kind, Kind), ("profile", profile, Model)):
+        if value not in get_args(choice):
+            raise InputError(
+                f"{name}: {value!r} is not allowed; expected {' or '.join(get_args(choice))}"
+            )
     if not 0 < false_alarm < 1:
         raise InputError(f"false_alarm: {false_alarm} is not allowed; expected between 0 and 1")
     core = core_radius or (0.05 * span if span else _LIKELY_CORE)
@@ -137,7 +142,7 @@ def fit_vortices_to_lines(
         separations = tuple(math.pi / 4 * span * factor for factor in (0.85, 1.0, 1.2))
     found = []
     for number, one in enumerate(sets):
-        lidar = _lidar(one, pulse_length, gate_length)
+        lidar = lidar_of(one, pulse_length, gate_length)
         scans = list(plane_scans(one, noise))
         for k, scan in enumerate(scans):
             if notice is not None:
@@ -154,7 +159,7 @@ def _check(**numbers: float | None) -> None:
             raise InputError(f"{name}: {value} is not allowed; expected a number above 0")
 
 
-def _lidar(lines: xr.Dataset, pulse: float | None, gate: float | None) -> CoherentLidar:
+def lidar_of(lines: xr.Dataset, pulse: float | None, gate: float | None) -> CoherentLidar:
     """What the lidar averages over; gates of unknown length touch each other."""
     ranges = lines["range"].values if "range" in lines.variables else np.zeros(0)
     if len(ranges) < 2:
@@ -184,8 +189,9 @@ def _scan(
     length = min(LENGTHS, key=lambda one: abs(math.log(one / seen.air.length)))
     starts = [one.vortices for one in seen.candidates]
     fit, others = fitted(window, starts, Air(seen.air.sigma, length), given)
-    if not scan.stated:
-        window = window.with_noise_of(residuals(window, fit, given))
+    if scan.stated != "gates":
+        left = residuals(window, fit, given)
+        window = window.with_noise_of(left, limited=scan.stated == "least")
         fit, _ = fitted(window, [fit.state.vortices], fit.air, given)
     return ScanVortices(scan, seen, fit, _flag(scan, fit, others, lidar), 1 if single else 2)
 

@@ -55,8 +55,10 @@ class Window:
         cell = float(np.median(lines.span)) * float(lines.ranges.mean())
         return of_gates(along[:, None] - along, across[:, None] - across, self.lidar, lengths, cell)
 
-    def with_noise_of(self, residual: np.ndarray) -> "Window":
+    def with_noise_of(self, residual: np.ndarray, *, limited: bool) -> "Window":
         """The same with the noise that the residuals (n,) of neighbouring lines show.
+
+        If ``limited``, no less than the present one.
 
         From their second differences over seven lines and three gates: where the vortices widen the
         spectra, velocities are less certain than elsewhere.
@@ -73,7 +75,8 @@ class Window:
         )
         everywhere = float(square[known].mean())
         local = np.where(number > 0.3, total / np.maximum(number, 0.01), everywhere)
-        size = np.sqrt(np.maximum(local[self.line, self.gate], _LEAST_NOISE**2))
+        least = np.diag(self.noise) if limited else _LEAST_NOISE**2
+        size = np.sqrt(np.maximum(local[self.line, self.gate], least))
         return replace(self, noise=_noise(self.line, self.gate, size, lines.ranges, self.lidar))
 
     @property
