@@ -126,80 +126,100 @@ def _mark(axes: Axes, pair: xr.Dataset) -> None:
 
 def _track(vortices: xr.Dataset) -> Plate:
     figure = Figure(figsize=(13, 4.2), layout="constrained")
-    age = vortices["age"].values
-    valid = (vortices["flag"] == 0).values
-    for axes, (name, label) in zip(
-        figure.subplots(1, 3),
-        (
-            ("circulation_5_15", "|circulation|, 5 to 15 m / (m²/s)"),
-            ("y", "distance from the lidar / m"),
-            ("z", "height above the lidar / m"),
-        ),
-        strict=True,
-    ):
-        for k, (marker, side) in enumerate(_SIDES):
-            one = vortices.isel(vortex=k)
-            sign = np.sign(one[f"{name}_true"].values) if name == "circulation_5_15" else 1.0
-            colour = f"C{k}"
-            axes.plot(age, sign * one[f"{name}_true"], color=colour, lw=1, label=f"{side}, true")
-            if f"{name}_tracked" in one:
-                middle, spread = one[f"{name}_tracked"], 1.96 * one[f"{name}_tracked_stderr"]
-                axes.fill_between(age, middle - spread, middle + spread, color=colour, alpha=0.25)
-            axes.errorbar(
-                age[valid],
-                (sign * one[name].values)[valid],
-                yerr=1.96 * one[f"{name}_stderr"].values[valid],
-                fmt=marker,
-                color=colour,
-                ms=4,
-                lw=0.8,
-                label=f"{side}, fitted",
-            )
-        axes.set(xlabel="age of the wake / s", ylabel=label)
-        if name != "y":
-            axes.set_ylim(bottom=0)
-    figure.axes[0].legend(fontsize=8)
-    return figure, (
-        "Markers: every slice by itself, with 95 % intervals; those with a flag are left out. "
-        "Bands: 95 % intervals by all slices together."
-    )
+    strength, path = figure.subplots(1, 2, width_ratios=(1, 1.4))
+    age, valid = vortices["age"].values, (vortices["flag"] == 0).values
+    name = "circulation_5_15"
+    for k, (marker, side) in enumerate(_SIDES):
+        one, colour = vortices.isel(vortex=k), f"C{k}"
+        sign = np.sign(one[f"{name}_true"].values)
+        strength.plot(age, sign * one[f"{name}_true"], color=colour, lw=1, label=f"{side}, true")
+        strength.errorbar(
+            age[valid],
+            (sign * one[name].values)[valid],
+            yerr=1.96 * one[f"{name}_stderr"].values[valid],
+            fmt=marker,
+            color=colour,
+            ms=4,
+            lw=0.8,
+            label=f"{side}, fitted",
+        )
+        path.plot(one["y_true"], one["z_true"], color=colour, lw=1, label=f"{side}, true")
+        seen = one.isel(scan=valid)
+        path.errorbar(
+            seen["y"],
+            seen["z"],
+            xerr=1.96 * seen["y_stderr"].values,
+            yerr=1.96 * seen["z_stderr"].values,
+            fmt=marker,
+            color=colour,
+            ms=4,
+            lw=0.8,
+            label=f"{side}, fitted",
+        )
+    strength.set(xlabel="age of the wake / s", ylabel="|circulation|, 5 to 15 m / (m²/s)")
+    strength.set_ylim(bottom=0)
+    strength.legend(fontsize=8)
+    path.set(xlabel="distance from the lidar / m", ylabel="height above the lidar / m")
+    path.set_ylim(bottom=0)
+    return figure, "Every slice by itself, with 95 % intervals; those with a flag are left out."
 
 
 def _errors(vortices: xr.Dataset) -> Plate:
     errors = vortex_errors(vortices)
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    age = errors["age"].values
-    left, middle, right = figure.subplots(1, 3)
-    for axes, name, label, limit in (
-        (left, "circulation_error", "error of the circulation / %", "circulation_error"),
-        (middle, "place_error", "error of the place / % of the separation", "place_error"),
+    figure = Figure(figsize=(13, 7.5), layout="constrained")
+    panels = figure.subplots(2, 2)
+    age, valid = errors["age"].values, (vortices["flag"] == 0).values
+    for axes, name, label in (
+        (panels[0, 0], "circulation_5_15", "error of the circulation / %"),
+        (panels[0, 1], "y", "error of the distance / m"),
+        (panels[1, 0], "z", "error of the height / m"),
     ):
         for k, (marker, side) in enumerate(_SIDES):
-            size = 100 * np.abs(errors[name].isel(vortex=k))
-            axes.plot(age, size, marker, color=f"C{k}", ms=4, label=side)
-        everyone = 100 * np.abs(errors[name].values)
-        axes.axhline(100 * PUBLISHED[limit], color="0.4", ls="--", lw=1, label="published")
-        if np.isfinite(everyone).any():
-            axes.axhline(np.nanmedian(everyone), color="k", lw=1, label="median")
-        axes.set(xlabel="age of the wake / s", ylabel=label, ylim=(0, None))
-        axes.legend(fontsize=8)
+            one, colour = vortices.isel(vortex=k), f"C{k}"
+            true = one[f"{name}_true"].values
+            scale = 100 / np.abs(true) if name == "circulation_5_15" else np.ones_like(true)
+            error = scale * (one[name].values - true) * np.sign(true)
+            axes.errorbar(
+                age[valid],
+                error[valid],
+                yerr=(1.96 * scale * one[f"{name}_stderr"].values)[valid],
+                fmt=marker,
+                color=colour,
+                ms=4,
+                lw=0.8,
+                label=side,
+            )
+            if f"{name}_tracked" in one:
+                middle = one[f"{name}_tracked"].values - true
+                spread = 1.96 * one[f"{name}_tracked_stderr"].values
+                axes.fill_between(age, middle - spread, middle + spread, color=colour, alpha=0.2)
+        axes.axhline(0, color="0.5", lw=0.8)
+        axes.set(xlabel="age of the wake / s", ylabel=label)
+    panels[0, 0].legend(fontsize=8)
+    _normalised(panels[1, 1], errors)
+    published = ", ".join(f"{100 * one:.0f} %" for one in PUBLISHED.values())
+    return figure, (
+        "Errors of single slices with 95 % intervals; bands: those of the places by all slices "
+        "together. Published for simulated scans with known truth, of strength and of place in "
+        f"separations: {published}. Last panel: where standard errors hold, curves follow the "
+        "dashed one."
+    )
+
+
+def _normalised(axes: Axes, errors: xr.Dataset) -> None:
+    """How many errors are below a number of standard errors."""
+    from scipy.special import erf
+
     grid = np.linspace(0, 4, 201)
     for name, text in (("circulation", "circulation"), ("y", "distance"), ("z", "height")):
         values = np.abs(errors[f"{name}_normalised"].values)
         values = np.sort(values[np.isfinite(values)])
         if values.size:
             part = np.searchsorted(values, grid, side="right") / values.size
-            right.plot(grid, 100 * part, drawstyle="steps-post", label=text)
-    # the error function, of a normal distribution
-    from scipy.special import erf
-
-    right.plot(grid, 100 * erf(grid / np.sqrt(2)), "k--", lw=1, label="normal")
-    right.set(xlabel="size of the error / standard errors", ylabel="errors below it / %")
-    right.legend(fontsize=8)
-    return figure, (
-        "Errors of single scans. Dashed: what is published for simulated scans with known truth. "
-        "Right: where standard errors hold, curves follow the dashed one."
-    )
+            axes.plot(grid, 100 * part, drawstyle="steps-post", label=text)
+    axes.plot(grid, 100 * erf(grid / np.sqrt(2)), "k--", lw=1, label="normal")
+    axes.set(xlabel="size of the error / standard errors", ylabel="errors below it / %")
+    axes.legend(fontsize=8)
 
 
 def _profiles(winds: xr.Dataset) -> Plate:

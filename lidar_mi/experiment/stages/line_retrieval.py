@@ -1,5 +1,7 @@
 """What the lines of a coherent lidar tell: vortices of vertical slices, winds of other scans."""
 
+import math
+
 import numpy as np
 import xarray as xr
 
@@ -14,6 +16,11 @@ from lidar_mi.experiment.truth.passing_wake import PassingWake
 from lidar_mi.instrument.coherent.measurement import START
 from lidar_mi.instrument.coherent.scans import directions
 from lidar_mi.instrument.coherent.weighting import echo_shift
+
+_UNEVEN_ECHO = 1 << 8
+_UNEVEN, _PART = 1.5, 0.99
+"""Factor by which the signals of a slice may differ from those of all at the same range, but for a
+hundredth of them."""
 
 
 def has_profiles(experiment: Experiment) -> bool:
@@ -89,6 +96,7 @@ def line_vortices(
     ground = -doppler.position[2] if doppler.passage.ground and wake.vortex_pair else None
     lines = _at_the_echo(coherent_lines, doppler)
     found = fit_vortices_to_lines(lines, ground=ground, notice=log.bar)
+    found = _flagged(found, lines)
     seconds = _seconds(found["time"])
     peer = _by_peer(lines, doppler, passing_air, found.attrs["profile"])
     true = _nearer_first(doppler, passing_air, np.stack([seconds, seconds], -1))
@@ -121,6 +129,26 @@ def _nearer_first(doppler: CoherentDoppler, air: PassingWake, seconds: np.ndarra
         order = np.argsort(both[..., 0], axis=1)
         true[known, k] = np.take_along_axis(both, order[..., None], axis=1)[:, k]
     return true
+
+
+def _flagged(found: xr.Dataset, lines: xr.Dataset) -> xr.Dataset:
+    """Slices whose echo is uneven have the flag uneven_echo.
+
+    A fit takes the echo for even within a gate. Of exhaust in the cores, which scatters more than
+    the air around, a gate sees the cores alone, and neither residuals nor standard errors show it.
+    """
+    ratio, sweep = lines["snr"].values, lines["sweep"].values
+    away = np.abs(np.log(ratio / np.median(ratio, axis=0)))
+    spread = np.array([np.quantile(away[sweep == number], _PART) for number in np.unique(sweep)])
+    flag = found["flag"]
+    masks = np.append(flag.attrs["flag_masks"], _UNEVEN_ECHO).astype(np.uint16)
+    about = {
+        "flag_masks": masks,
+        "flag_values": masks,
+        "flag_meanings": f"{flag.attrs['flag_meanings']} uneven_echo",
+    }
+    uneven = np.where(spread > math.log(_UNEVEN), _UNEVEN_ECHO, 0).astype(flag.dtype)
+    return found.assign(flag=("scan", flag.values | uneven, flag.attrs | about))
 
 
 def _by_peer(
