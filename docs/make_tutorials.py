@@ -48,7 +48,7 @@ def page(notebook: nbformat.NotebookNode, name: str, pictures: list[str]) -> str
         if cell.cell_type == "markdown":
             parts.append(linked(cell.source))
             continue
-        parts.append(f"```python\n{cell.source}\n```")
+        parts.append(code(cell))
         if said := printed(cell):
             parts.append(f"```text\n{said}\n```")
         for output in cell.outputs:
@@ -58,6 +58,11 @@ def page(notebook: nbformat.NotebookNode, name: str, pictures: list[str]) -> str
     title, _, first = parts[0].partition("\n\n")
     about = f"*[{name}.ipynb](../../examples/{name}.ipynb) is this page as a notebook.*"
     return "\n\n".join([title, NOTE.format(name=name), first, about, *parts[1:]]) + "\n"
+
+
+def code(cell: nbformat.NotebookNode) -> str:
+    """The code of a cell as a block; the semicolon that hides its result is the notebook's."""
+    return f"```python\n{cell.source.removesuffix(';')}\n```"
 
 
 def printed(cell: nbformat.NotebookNode) -> str:

@@ -28,9 +28,9 @@ def test_page_has_what_its_notebook_has(name):
     notebook = nbformat.read(SCRIPT["EXAMPLES"] / f"{name}.ipynb", as_version=4)
     place = 0
     for cell in notebook.cells:
-        code = cell.cell_type == "code"
-        text = f"```python\n{cell.source}\n```" if code else SCRIPT["linked"](cell.source)
-        for part in [text] if code else text.split("\n\n"):
+        is_code = cell.cell_type == "code"
+        parts = [SCRIPT["code"](cell)] if is_code else SCRIPT["linked"](cell.source).split("\n\n")
+        for part in parts:
             assert part in page[place:], f"{name}: run python docs/make_tutorials.py {name}"
             place += page[place:].index(part) + len(part)
     for number, seen in enumerate(SCRIPT["SEEN"][name], 1):
