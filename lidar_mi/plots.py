@@ -115,7 +115,9 @@ def plot_wind(wind: xr.Dataset, ax: "Axes | None" = None) -> "Axes":
         )
         if colour == "white":
             length = float(f"{limit:.1g}") or 1.0
-            ax.quiverkey(arrows, 0.9, 1.03, length, f"{length:g} m s$^{{-1}}$", labelpos="W")
+            label = f"{length:g} m s$^{{-1}}$"
+            ax.quiverkey(arrows, 0.9, 1.04, length, label, labelpos="W", color="black")
+    ax.set_title(ax.get_title() or " ")  # room for the key
     return ax
 
 

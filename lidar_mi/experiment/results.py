@@ -143,13 +143,17 @@ class Run(Tabular):
             A run without images of the backscatter lidar, or without wind from them.
         """
         from lidar_mi.assessment.figures.backscatter import overview
+        from lidar_mi.io.png import png_bytes
 
         if self.truth is None or "wind" not in self.results or not self.scans:
             raise InputError(
                 f"plot: {self.experiment.name} has no wind from images of the backscatter lidar; "
                 "expected one that has, or its folder's figures"
             )
-        return overview(self.truth, self.scans, self.results["wind"], self.cores)[0]
+        figure, _ = overview(self.truth, self.scans, self.results["wind"], self.cores)
+        # a notebook shows figures that pyplot made; of others it asks this
+        vars(figure)["_repr_png_"] = lambda: png_bytes(figure)
+        return figure
 
     def thumbnail(self) -> bytes | None:
         """The `plot` as PNG; None: there is nothing to draw."""

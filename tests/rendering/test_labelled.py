@@ -61,7 +61,7 @@ def test_axes_are_the_places_of_the_beams():
 
 @pytest.mark.usefixtures("variant")
 def test_backscatter_is_that_of_the_air():
-    """beta exp(-2 sigma r) in the middle of the first gate; Rayleigh: beta = 1.5 sigma / (4 pi)."""
+    """beta exp(-2 sigma r), r the middle of the first gate; beta is 1.5 sigma / (4 pi)."""
     import mitsuba as mi
 
     scene = mi.load_dict(lidar(1, 1, azimuth_min_deg=0.0, azimuth_max_deg=0.0))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+import lidar_mi.plots  # noqa: F401 - truth.wind.lidar.plot()
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from lidar_mi.atmosphere.texture import corrsin_obukhov
