@@ -62,6 +62,14 @@ the same number, at least two. Samples are independent; the random numbers of a 
 on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
+S0 to S3 of all orders are differentiable, in reverse and forward mode (``dr.backward`` and
+``dr.forward_to`` of what ``mi.render(scene, params)`` returns), with the gated estimator: with
+respect to extinction coefficients and albedos, to weights of a ``blendphase``, g of ``hg``, tables
+of :ref:`mueller <phase-mueller>`, and the flow of a :ref:`moving_volume <volume-moving_volume>`.
+The samples are others than those of the image. Memory does not grow with the orders. Gradients
+with respect to anything else are refused in one line. What a loss takes from other channels,
+standard errors among them, has no gradient.
+
 A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
 extinction coefficient, an albedo or a weight of a blend outside 0 to 1, if ``hg`` has a g beyond
 0.99 in magnitude, or if a shape or volume has a transform that is not finite. Values are checked
