@@ -21,6 +21,13 @@ CORE_SPREAD = 0.5
 OTHER_PROFILE = 0.3
 """Standard deviation of the fraction of the other profile: real vortices have neither."""
 
+UNEVEN_SWIRL = 0.03
+"""Standard deviation of the departure of a real swirl from a round one, relative.
+
+Chosen on planes of one simulated wake: with it 90 % of the errors are within 95 % intervals, without
+it 84 %; 0.06 makes intervals of circulations too wide.
+"""
+
 _ROUNDS, _FIRST_ROUNDS = 20, 12
 _SAME = 9.0  # of the misfit: another fit that is nearly as likely
 _ENOUGH = 1e-3  # of the misfit, at which iterations end
@@ -162,6 +169,7 @@ def fitted(
         first, time=crossing_time(window, vortices), reference=float(vortices[:, 1].mean())
     )
     problem.__dict__["turbulence"] = first.turbulence
+    problem = problem.with_uneven_swirl(best)
     best = start_state(window, vortices)
     air, _ = problem.likeliest(problem.minimised(best, factor, air)[0], air, (air.length,))
     state, converged = problem.minimised(best, problem.factor(air), air)
@@ -186,12 +194,37 @@ class Problem:
     given : Assumptions
     time, reference : float
         At which the vortices are where the state says, s, and height (m) of the wind's polynomial.
+    uneven : (n, n) array or 0
+        Covariance of the swirl's departure from round vortices, (m/s)^2.
     """
 
     window: Window
     given: Assumptions
     time: float
     reference: float
+    uneven: np.ndarray | float = 0.0
+
+    def with_uneven_swirl(self, state: State) -> "Problem":
+        """The same with the covariance of what real vortices differ from round ones by.
+
+        In the cells, in proportion to the velocities of each vortex there, correlated over its core
+        across the lines and over a gate along them.
+        """
+        lines = self.window.lines
+        ranges, angle = lines.ranges[self.window.gate], lines.angle[self.window.line]
+        across = ranges.mean() * (angle[:, None] - angle)
+        along = (ranges[:, None] - ranges) / self.window.lidar.gate_length
+        _, time = node_angles(lines)
+        total = np.zeros(across.shape)
+        for vortex in state.vortices:
+            places = np.broadcast_to(vortex[:2], (*time.shape, 2))
+            value, _ = seen(lines, places, vortex[2:], self.given.ground, self.given.model)
+            size = UNEVEN_SWIRL * value[self.window.line, self.window.gate]
+            near = np.exp(-((across * np.exp(-vortex[3])) ** 2 + along**2) / 2)
+            total += np.outer(size, size) * near
+        found = replace(self, uneven=total)
+        found.__dict__["turbulence"] = self.turbulence
+        return found
 
     @cached_property
     def turbulence(self) -> np.ndarray:
@@ -203,7 +236,7 @@ class Problem:
     def factor(self, air: Air) -> np.ndarray:
         """Lower factor of the covariance of the cells."""
         full = self.turbulence[LENGTHS.index(air.length)]
-        covariance = air.sigma**2 * full + self.window.noise
+        covariance = air.sigma**2 * full + self.window.noise + self.uneven
         covariance[np.diag_indices_from(covariance)] += _ROUNDING * air.sigma**2 * full[0, 0]
         return scipy.linalg.cholesky(covariance, lower=True, check_finite=False)
 
