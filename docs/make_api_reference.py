@@ -39,8 +39,8 @@ PAGES = (
     ),
     (
         "lines_of_sight",
-        "Wind from lines of sight",
-        ("retrieval.lines_of_sight",),
+        "Wind and vortices from lines of sight",
+        ("retrieval.lines_of_sight", "retrieval.line_vortices"),
         "[lines of sight](../guide/doppler_lines.md)",
     ),
     ("vortices", "Vortices", ("retrieval.vortices",), "[methods](../guide/methods.md)"),

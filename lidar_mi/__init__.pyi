@@ -24,6 +24,7 @@ from .rendering.labelled import to_xarray
 from .rendering.variant import use_variant
 from .retrieval.images.common_grid import on_one_grid
 from .retrieval.images.quality import Flag
+from .retrieval.line_vortices.vortices import fit_vortices_to_lines
 from .retrieval.lines_of_sight.winds import fit_winds_to_lines
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
@@ -63,6 +64,7 @@ __all__ = [
     "export",
     "export_control",
     "fit_vortices",
+    "fit_vortices_to_lines",
     "fit_vortices_to_wind",
     "fit_winds_to_lines",
     "fly",

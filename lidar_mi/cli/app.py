@@ -20,6 +20,7 @@ from lidar_mi.cli import (
     rings,
     run,
     v_los,
+    vortices,
     winds,
 )
 from lidar_mi.cli import list as listing
@@ -61,6 +62,7 @@ app.command(epilog=examples(*rings.EXAMPLES))(rings.rings)
 app.command(epilog=examples(*calibrate.EXAMPLES))(calibrate.calibrate)
 app.add_typer(campaign.app, name="campaign")
 app.command("v_los", epilog=examples(*v_los.EXAMPLES))(v_los.v_los)
+app.command(epilog=examples(*vortices.EXAMPLES))(vortices.vortices)
 app.command(epilog=examples(*winds.EXAMPLES))(winds.winds)
 app.command(epilog=examples(*doctor.EXAMPLES))(doctor.doctor)
 

@@ -84,7 +84,7 @@ def winds(
     check_target(figure, files, overwrite=overwrite, suffixes=(".png",))
     lines = read_lines_of_sight(
         files,
-        names=_names(name or ()),
+        names=names_of(name or ()),
         min_cnr=min_cnr,
         blind_range=quantity("--blind-range", blind_range, "m", "90 m"),
         range_step=quantity("--range-step", range_step, "m", "3 m"),
@@ -108,7 +108,8 @@ def winds(
     output.print(f"figure   {figure}")
 
 
-def _names(pairs: Sequence[str]) -> dict[str, str]:
+def names_of(pairs: Sequence[str]) -> dict[str, str]:
+    """The names of ``--name OURS=THEIRS``."""
     found = {}
     for pair in pairs:
         ours, sign, theirs = pair.partition("=")

@@ -87,8 +87,8 @@ class Run(Tabular):
 
     @property
     def lines(self) -> xr.Dataset | None:
-        """Lines of sight of the Doppler lidar through the slab, in a sensor of both lidars."""
-        return self.results.get("lines")
+        """Lines of sight: through the slab, in a sensor of both lidars, or of a coherent lidar."""
+        return self.results.get("lines", self.results.get("coherent_lines"))
 
     @property
     def wind3d(self) -> xr.Dataset | None:
@@ -115,7 +115,7 @@ class Run(Tabular):
         """The answer, the experiment and its main errors."""
         from lidar_mi.assessment.report.summary import summary
 
-        doppler = self.experiment.doppler
+        doppler = self.experiment.fringes
         seconds = sum(self.seconds.values())
         rows = [("experiment", self.experiment.name), ("computed in", f"{seconds:.1f} s")]
         if self.folder is not None:

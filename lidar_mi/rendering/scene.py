@@ -89,7 +89,7 @@ def render_file(
         image.attrs["scene"] = scene_path.name
         write_fringes(out, image)
         return image
-    integrator.shares = True
+    integrator.shares, integrator.covariance = True, bool(mi.is_polarized)
     # what a scene does not say is the plugin's default
     given = integrator.samples_per_pass
     integrator.samples_per_pass = samples_at_once(

@@ -26,7 +26,8 @@ from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
 from lidar_mi.experiment import shipped
-from lidar_mi.experiment.schema import air, keys, reading, rings, scattering, wake
+from lidar_mi.experiment.run import prepare
+from lidar_mi.experiment.schema import air, coherent, keys, reading, rings, scattering, wake
 from lidar_mi.experiment.schema import experiment as schema
 from lidar_mi.experiment.truth import extinction as truth
 from lidar_mi.instrument import motion
@@ -168,11 +169,19 @@ def test_page_of_wake_changing_has_its_table():
 def leaves(model=schema.Experiment, path=()):
     """Every key of an experiment file: dotted name, section's model, field."""
     for name, field in model.model_fields.items():
-        section = next((t for t in _parts(field.annotation) if _is_model(t)), None)
-        if section is None or section in OPTIONAL:
+        sections = dict.fromkeys(t for t in _parts(field.annotation) if _is_model(t))
+        if not sections or set(sections) & set(OPTIONAL):
             yield ".".join((*path, name)), model, field
-        if section is not None:
-            yield from leaves(section, (*path, name))
+        for section in sections:
+            # the kind of a section is a key of every kind
+            yield from (one for one in leaves(section, (*path, name)) if not _said(one, sections))
+
+
+def _said(leaf, sections):
+    """Whether a key is one of an earlier kind of its section, too."""
+    name, model, _ = leaf
+    earlier = list(sections)[: list(sections).index(model)] if model in sections else []
+    return any(name.rpartition(".")[2] in other.model_fields for other in earlier)
 
 
 def _is_model(kind):
@@ -268,6 +277,8 @@ def _value(name, model, *given):
     data = copy.deepcopy(BASE)
     if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors
         data |= {"doppler": {}, "retrieval": {"methods": ["variational"]}}
+    if model.__module__ == coherent.__name__:
+        data["doppler"] = {"kind": "coherent"}
     if name.split(".")[0] == "volume":  # it needs air in three dimensions
         data["wake"] |= {"file": "wake_volume_40s.nc", "depth": "volume"}
         data["scan"] = {"gate_count": 24}
@@ -393,8 +404,10 @@ def check_yaml(block):
     elif block.file:
         Path(block.file).write_text(block.text)
         for experiment in reading.load_variants(block.file).values() or [reading.load(block.file)]:
-            if experiment.wake:
+            if experiment.imaged_wake:
                 truth.make_truth(experiment)
+            elif experiment.coherent:
+                prepare(experiment)
     else:
         loaded = reading.check({**BASE, **data}, block.place)
         scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables

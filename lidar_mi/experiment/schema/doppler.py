@@ -72,8 +72,14 @@ _MODES = Within(0.1, 1e15, "from a pixel that sees part of a mode to white light
 
 
 class Doppler(Section):
-    """The fringe-imaging Doppler lidar and the winds along its line of sight."""
+    """The fringe-imaging Doppler lidar and the winds along its line of sight.
 
+    With `kind: coherent`, the keys are those of a coherent lidar on the ground.
+    """
+
+    kind: Literal["fringes", "coherent"] = Field(
+        "fringes", description="an etalon's fringes on a camera, or a coherent lidar on the ground"
+    )
     v_los: tuple[Annotated[Speed, Within(-12000, 12000, "escape velocity")], ...] = Field(
         (50.0, -300.0, -100.0, 0.0, 300.0),
         min_length=1,

@@ -6,6 +6,7 @@ import scipy
 from lidar_mi.errors import InputError
 
 _NODES = np.linspace(-12.0, 12.0, 1201)
+_MANY = 200  # ratios, above which they are interpolated
 
 
 def peak_ratio(snr: np.ndarray, width: np.ndarray, bandwidth: float) -> np.ndarray:
@@ -48,11 +49,21 @@ def cramer_rao(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: fl
     Parameters as of `rye_hardesty`.
     """
     _check(snr, width, bandwidth, samples)
-    alpha = np.asarray(peak_ratio(snr, width, bandwidth))[..., None]
-    shape = np.exp(-(_NODES**2) / 2)
-    squares = (_NODES * alpha * shape / (1 + alpha * shape)) ** 2
-    information = scipy.integrate.simpson(squares, x=_NODES, axis=-1)
+    alpha = np.asarray(peak_ratio(snr, width, bandwidth))
+    information = _information(alpha.ravel()).reshape(alpha.shape)
     return np.sqrt(bandwidth * np.asarray(width) / (samples * information))
+
+
+def _information(alpha: np.ndarray) -> np.ndarray:
+    """J (n,) of the peak ratios (n,); of many, by a spline of its logarithm, to 1e-6."""
+    if alpha.size > _MANY:
+        low, high = np.log(alpha.min()), np.log(alpha.max())
+        nodes = np.linspace(low - 0.1, high + 0.1, _MANY)
+        spline = scipy.interpolate.CubicSpline(nodes, np.log(_information(np.exp(nodes))))
+        return np.asarray(np.exp(spline(np.log(alpha))))
+    shape = np.exp(-(_NODES**2) / 2)
+    squares = (_NODES * alpha[:, None] * shape / (1 + alpha[:, None] * shape)) ** 2
+    return np.asarray(scipy.integrate.simpson(squares, x=_NODES, axis=-1))
 
 
 def _check(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: float) -> None:

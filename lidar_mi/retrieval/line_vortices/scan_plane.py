@@ -1,0 +1,152 @@
+"""Lines of sight of one vertical slice (RHI) as arrays in its plane.
+
+Plane: y horizontal distance from the lidar along the azimuth of the scan, z height above it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.errors import InputError
+
+_OUT_OF_PLANE = 0.05  # sine of the angle of a line with the plane: 3 degrees
+_LEAST_LINES = 8
+_LEAST_GATES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneScan:
+    """One slice, its lines in the order of their angle.
+
+    Attributes
+    ----------
+    start : datetime64
+        Time of the first line.
+    time : (lines,) array
+        s after the start.
+    angle : (lines,) array
+        From the y axis upwards, rad; above pi/2: over the top.
+    ranges : (gates,) array
+        m.
+    velocity : (lines, gates) array
+        Away from the lidar, m/s; NaN: not usable.
+    variance : (lines, gates) array
+        Of the noise, (m/s)^2.
+    span : float
+        Angle that the beam moves through in the time of a line, rad.
+    azimuth : float
+        Of the y axis, degrees.
+    sweep : int
+        Its number in the data set.
+    stated : {"gates", "least", "none"}
+        Whether the noise is known for every gate, is the least one, or is estimated.
+    """
+
+    start: np.datetime64
+    time: np.ndarray
+    angle: np.ndarray
+    ranges: np.ndarray
+    velocity: np.ndarray
+    variance: np.ndarray
+    span: float
+    azimuth: float
+    sweep: int
+    stated: Literal["gates", "least", "none"]
+
+    def at(self, seconds: float) -> np.datetime64:
+        """Time of day of so many seconds after the start."""
+        return self.start + np.timedelta64(round(1e9 * seconds), "ns")
+
+
+def plane_scans(lines: xr.Dataset, noise: float | None) -> Iterator[PlaneScan]:
+    """The slices of a data set of `read_lines_of_sight`, in the order of time.
+
+    Raises
+    ------
+    InputError
+        A data set without lines of sight; lines that are not in one vertical plane; a slice of less
+        than 8 lines or 4 gates with usable values.
+    """
+    for name in ("radial_velocity", "flag", "azimuth", "elevation", "range", "time"):
+        if name not in lines.variables:
+            raise InputError(
+                f"lines: {name} is missing; expected a data set of read_lines_of_sight"
+            )
+    count = lines.sizes["time"]
+    sweep = lines["sweep"].values if "sweep" in lines.coords else np.zeros(count, int)
+    for number in np.unique(sweep):
+        yield _plane_scan(lines.isel(time=np.flatnonzero(sweep == number)), noise, int(number))
+
+
+def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneScan:
+    azimuth, elevation = np.deg2rad(lines["azimuth"].values), np.deg2rad(lines["elevation"].values)
+    along = _azimuth(azimuth, elevation)
+    forward = np.cos(elevation) * np.cos(azimuth - along)
+    aside = np.abs(np.cos(elevation) * np.sin(azimuth - along)).max()
+    if not aside < _OUT_OF_PLANE:
+        raise InputError(
+            f"lines: scan {number} leaves the vertical plane of azimuth {np.rad2deg(along):.1f} "
+            f"degrees by {np.rad2deg(np.arcsin(min(aside, 1))):.1f} degrees; expected an RHI"
+        )
+    angle = np.arctan2(np.sin(elevation), forward)
+    order = np.argsort(angle, kind="stable")
+    usable = (lines["flag"].values == 0) & np.isfinite(lines["radial_velocity"].values)
+    velocity = np.where(usable, lines["radial_velocity"].values.astype(float), np.nan)[order]
+    gates = np.flatnonzero(usable.any(0))
+    if usable.any(1).sum() < _LEAST_LINES or gates.size < _LEAST_GATES:
+        raise InputError(
+            f"lines: scan {number} has {usable.any(1).sum()} lines and {gates.size} gates with "
+            f"usable values; expected {_LEAST_LINES} and {_LEAST_GATES} or more"
+        )
+    if not np.ptp(angle) > 0:
+        raise InputError(f"lines: scan {number} looks in one direction; expected an RHI")
+    part = slice(gates[0], gates[-1] + 1)
+    velocity = velocity[:, part]
+    if "radial_velocity_stderr" in lines:
+        stated: Literal["gates", "least", "none"] = "gates"
+        variance = lines["radial_velocity_stderr"].values.astype(float)[order][:, part] ** 2
+    elif noise is not None:
+        variance, stated = np.full(velocity.shape, noise**2), "least"
+    else:
+        variance, stated = _noise_variance(velocity), "none"
+    velocity = np.where(np.isfinite(variance), velocity, np.nan)
+    time = lines["time"].values
+    seconds = (time - time.min()) / np.timedelta64(1, "s")
+    return PlaneScan(
+        time.min(),
+        seconds[order],
+        angle[order],
+        lines["range"].values.astype(float)[part],
+        velocity,
+        variance,
+        float(np.median(np.diff(angle[order]))),
+        float(np.rad2deg(along) % 360),
+        number,
+        stated,
+    )
+
+
+def _azimuth(azimuth: np.ndarray, elevation: np.ndarray) -> float:
+    """Azimuth of the plane, rad: the one of the lines, or of most of those over the top."""
+    # twice the angle is the same on both sides of the zenith
+    weight = np.cos(elevation) ** 2
+    double = np.arctan2((weight * np.sin(2 * azimuth)).sum(), (weight * np.cos(2 * azimuth)).sum())
+    sign = np.sum(np.cos(elevation) * np.cos(azimuth - double / 2))
+    return float(double / 2 + (np.pi if sign < 0 else 0.0))
+
+
+def _noise_variance(velocity: np.ndarray) -> np.ndarray:
+    """Variance of independent noise from second differences of three lines, each gate its own.
+
+    Robust, by the median of their absolute values; the air adds to it what differs from line to
+    line.
+    """
+    second = velocity[:-2] - 2 * velocity[1:-1] + velocity[2:]
+    known = np.isfinite(second).any(0)
+    size = np.full(velocity.shape[1], np.nan)
+    size[known] = 1.4826 * np.nanmedian(np.abs(second[:, known]), axis=0)
+    size = np.where(known, size, np.nanmedian(size))
+    return np.broadcast_to(np.maximum(size, 0.01) ** 2 / 6, velocity.shape).copy()
