@@ -9,6 +9,7 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.io.flo_file import write_flo
 
+from . import turbulent
 from .cases import ENERGIES, Case, names, settings
 
 DT = 0.1
@@ -25,14 +26,18 @@ def make(folder: Path, only: str = "") -> None:
 
 def write_pair(folder: Path, case: Case, level: str) -> None:
     """Render a pair; ``truth.flo`` comes last."""
-    experiment = lm.load_experiment(case.base, **settings(case, ENERGIES[level]))
-    result = lm.run(experiment, notice=lambda text, fraction: None)
+    folder.mkdir(parents=True, exist_ok=True)
+    keys = settings(case, ENERGIES[level])
+    if case.turbulence:
+        file = folder / "wake.nc"
+        turbulent.write(file.absolute(), keys.pop("wake.vortex_pair"), case.turbulence, case.seed)
+        keys |= {"wake.file": str(file.absolute()), "wake.extinction.aerosol": None}
+    result = lm.run(lm.load_experiment(case.base, **keys), notice=lambda text, fraction: None)
     first, second = (scan["Y_noisy"].values.astype(float) for scan in result.scans)
     if case.defect:
         first, second = case.defect(first, second)
     grid = {axis: result.scans[0][axis] for axis in ("z", "y")}
     truth = result.truth.wind[["v", "w"]].interp(grid).transpose("z", "y").astype(np.float32)
-    folder.mkdir(parents=True, exist_ok=True)
     scale = FULL / max(first.max(), second.max())
     counts = [
         np.clip(np.rint(image * scale), 0, FULL).astype(np.uint16) for image in (first, second)
