@@ -35,6 +35,7 @@ from .retrieval.vortices.vector_fit import fit_vortices_to_wind
 from .retrieval.wind.options import VectorValidation, WindowSizes
 from .retrieval.wind.pair import retrieve_wind
 from .retrieval.wind.series import retrieve_winds
+from .retrieval.wind.standard_errors import standard_errors
 from .retrieval.wind.volume import retrieve_wind_volume
 from .system.doctor import doctor
 
@@ -86,6 +87,7 @@ __all__ = [
     "run",
     "run_campaign",
     "scene_file",
+    "standard_errors",
     "to_xarray",
     "use_variant",
     "write_vortices",
