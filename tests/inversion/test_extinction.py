@@ -153,6 +153,7 @@ def test_oblique_beams_share_the_profile(variant, signal):
     [
         ({"counts": np.ones((3, 1, 1))}, r"counts: shape \(3, 1, 1\) or values are not allowed"),
         ({"counts": np.full((GATES, 1, 1), 2.0)}, "counts: 24 in all gates is not above the back"),
+        ({"counts": "many"}, "counts: 'many' is not allowed; expected numbers"),
         ({"counts_per_signal": 0.0}, "counts_per_signal: 0.0 is not allowed"),
         ({"background": -1.0}, "background: -1.0 is not allowed; expected 0 counts or more"),
         ({"calibration_error": 1.0}, "calibration_error: 1.0 is not allowed"),
