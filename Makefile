@@ -2,7 +2,7 @@
 # ARGS goes to the command behind a target: make test ARGS="tests/system/test_llvm.py -x"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all fuzz bench validate docs lint clean
+.PHONY: help setup demo test test-all fuzz bench validate reference docs lint clean
 
 PYTHON_ENV := .venv/bin/python
 EXPERIMENT := wake_sensor
@@ -41,10 +41,15 @@ validate: setup ## check against closed forms, published numbers and other progr
 		|| $(PYTHON_ENV) -m pip install -q -e ".[test]"
 	$(PYTHON_ENV) -m validation $(ARGS)
 
-docs: setup ## check the spelling of the documentation and build it as a site in site/, readable offline
+reference: setup ## write the pages of keys, commands, public names and plugins anew, from the code
+	@for page in key command api plugin; do $(PYTHON_ENV) docs/make_$${page}_reference.py || exit 1; done
+
+docs: setup ## check words, links and lengths of the pages and build them as a site in site/, readable offline
 	@$(PYTHON_ENV) -c "import codespell_lib, furo, latex2mathml, myst_parser" 2>/dev/null \
 		|| $(PYTHON_ENV) -m pip install -q -e ".[docs]"
-	$(PYTHON_ENV) -m codespell_lib --skip "*.png,*.gif" docs README.md CONTRIBUTING.md CHANGELOG.md
+	$(PYTHON_ENV) -m codespell_lib --skip "*.png,*.gif,*.nc,*.vol,*.html" \
+		docs *.md paper examples scenes lidar_mi plugins
+	$(PYTHON_ENV) -m pytest -q -n0 tests/docs -m "not slow" -k "link or short or screen or listed or images or up_to_date or tutorials"
 	$(PYTHON_ENV) -m sphinx -q -W --keep-going -d build/doctrees docs site $(ARGS)
 	@echo "open site/index.html"
 

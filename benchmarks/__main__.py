@@ -13,6 +13,7 @@ from .measure import fresh_process
 COMPARISONS = (
     "estimators",
     "candidates",
+    "gradients",
     "dense",
     "transient",
     "velocimetry",

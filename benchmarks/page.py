@@ -25,6 +25,7 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "fringes": {"width": 240, "height": 195},
     "transient": {"columns": 40, "rows": 30, "samples": 16},
     "candidates": {"columns": 60, "rows": 40},
+    "gradients": {"samples": 4000},
     "gpu": {},
 }
 """Comparisons of the page, with the arguments that make them small; JSON has the others, too."""

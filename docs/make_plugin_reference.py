@@ -1,4 +1,4 @@
-"""Write docs/plugins.md from the docstrings of the plugins.
+"""Write docs/plugins.md and a page for each plugin in docs/plugins from the plugins' docstrings.
 
 Usage: ``python docs/make_plugin_reference.py``.
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from lidar_mi.plugins import PLUGINS
 
-PAGE = Path(__file__).with_name("plugins.md")
+FOLDER = Path(__file__).parent
 
 HEAD = """\
 # Plugins
@@ -23,20 +23,32 @@ Mitsuba plugins of lidar-mi: types and parameters as in XML scenes and Python di
 [theory](theory/index.md), whole scenes in the [user guide](guide/xml_scenes.md).
 
 <!-- Written by docs/make_plugin_reference.py from the docstrings in plugins/; edit those. -->
+
+| plugin | kind | |
+| --- | --- | --- |
 """
 
+_NOTE = "<!-- Written by docs/make_plugin_reference.py from the plugin's docstring; edit that. -->"
 _RULE = re.compile(r"=+(?: +=+)+")
 _KINDS = {"phase": "phase function"}
 
 
-def page() -> str:
-    """The whole page as GitHub-flavoured Markdown."""
-    sections = [section(inspect.getdoc(plugin)) for plugin in PLUGINS]
-    contents = [
-        f"- [{_title(plugin)}](#{_anchor(plugin)}), {_KINDS.get(plugin.KIND, plugin.KIND)}"
+def pages() -> dict[str, str]:
+    """Texts of all pages as GitHub-flavoured Markdown, by their places under docs."""
+    rows = [
+        f"| [`{plugin.NAME}`](plugins/{plugin.NAME}.md) | {_KINDS.get(plugin.KIND, plugin.KIND)} | "
+        f"{_title(plugin).partition(' (`')[0]} |"
         for plugin in PLUGINS
     ]
-    return "\n".join([HEAD, *contents, ""]) + "\n" + "\n".join(sections)
+    contents = ["```{toctree}", ":hidden:", "", *(f"plugins/{p.NAME}" for p in PLUGINS), "```", ""]
+    index = HEAD + "\n".join([*rows, "", *contents])
+    return {"plugins.md": index} | {f"plugins/{plugin.NAME}.md": page(plugin) for plugin in PLUGINS}
+
+
+def page(plugin) -> str:
+    """One plugin's page."""
+    title, _, text = section(inspect.getdoc(plugin)).partition("\n")
+    return f"{title}\n\n{_NOTE}\n{text}"
 
 
 def _title(plugin) -> str:
@@ -57,7 +69,7 @@ def section(text: str) -> str:
         if re.fullmatch(r"\.\. _[\w-]+:", line):
             i += 1  # a label: Markdown makes its own from the title
         elif i + 1 < len(lines) and re.fullmatch(r"-{3,}", lines[i + 1]):
-            out.append(f"## {_inline(line)}")
+            out.append(f"# {_inline(line)}")
             i += 2
         elif _RULE.fullmatch(line):
             stop = _closing_rule(lines, i)
@@ -115,7 +127,7 @@ def _inline(text: str) -> str:
     names = {f"{plugin.KIND}-{plugin.NAME}": plugin for plugin in PLUGINS}
 
     def link(match: re.Match) -> str:
-        return f"[{match[1]}](#{_anchor(names[match[2]])})"
+        return f"[{match[1]}]({names[match[2]].NAME}.md)"
 
     text = re.sub(r":ref:`([^<`]+?)\s+<([\w-]+)>`", link, text)
     if re.search(r":\w+:`", text):
@@ -123,11 +135,8 @@ def _inline(text: str) -> str:
     return re.sub(r"``([^`]+)``", r"`\1`", text)
 
 
-def _anchor(plugin) -> str:
-    """GitHub's name for the heading of a plugin's section."""
-    return re.sub(r"[^\w\- ]", "", _title(plugin).lower()).replace(" ", "-")
-
-
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
-    print(f"{PAGE}: {len(PLUGINS)} plugins")
+    (FOLDER / "plugins").mkdir(exist_ok=True)
+    for name, text in pages().items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
+    print(f"{FOLDER}: {len(PLUGINS)} plugins")

@@ -11,7 +11,7 @@ import lazy_loader
 from lidar_mi.system.llvm import select_llvm
 from lidar_mi.system.mitsuba_import import register_plugins_with_mitsuba
 
-__version__ = "0.1.0"
+__version__ = "1.0.0rc1"
 
 select_llvm()
 register_plugins_with_mitsuba()

@@ -20,6 +20,7 @@ from .io.images import read_image, read_noise
 from .io.lines_of_sight.read import read_lines_of_sight
 from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
+from .rendering.labelled import to_xarray
 from .rendering.variant import use_variant
 from .retrieval.images.common_grid import on_one_grid
 from .retrieval.images.quality import Flag
@@ -34,6 +35,7 @@ from .retrieval.vortices.vector_fit import fit_vortices_to_wind
 from .retrieval.wind.options import VectorValidation, WindowSizes
 from .retrieval.wind.pair import retrieve_wind
 from .retrieval.wind.series import retrieve_winds
+from .retrieval.wind.standard_errors import standard_errors
 from .retrieval.wind.volume import retrieve_wind_volume
 from .system.doctor import doctor
 
@@ -85,6 +87,8 @@ __all__ = [
     "run",
     "run_campaign",
     "scene_file",
+    "standard_errors",
+    "to_xarray",
     "use_variant",
     "write_vortices",
 ]

@@ -39,7 +39,7 @@ def parts_of_shape(shape: Shape) -> "list[Body | Sheet]":
     corners = _corners(shape)
     if (affine := _affine(corners)) is not None:
         return [Cube(shape, *affine)]
-    faces = np.array(shape.faces_buffer()).reshape(-1, 3)
+    faces = _faces(shape)
     pieces = _pieces(corners, faces)
     volumes = [_volume(corners, faces) if closed else 0 for faces, closed in pieces]
     boxes = [(corners[faces].min((0, 1)), corners[faces].max((0, 1))) for faces, _ in pieces]
@@ -345,6 +345,9 @@ def _sheets(faces: np.ndarray) -> list[np.ndarray]:
 def _mesh(corners: np.ndarray, faces: np.ndarray) -> Shape:
     """A mesh of some faces."""
     used, faces = np.unique(faces, return_inverse=True)
+    if hasattr(mi.Mesh, "positions"):  # Mitsuba 3.10
+        parts = mi.TensorXu(faces.reshape(-1, 3)), mi.TensorXf(corners[used])
+        return mi.Mesh("part", faces=parts[0], positions=parts[1])
     mesh = mi.Mesh("part", len(used), faces.size // 3)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(corners[used].ravel())
@@ -371,4 +374,12 @@ def _volume(corners: np.ndarray, faces: np.ndarray) -> float:
 
 
 def _corners(mesh: Shape) -> np.ndarray:
-    return np.array(mesh.vertex_positions_buffer(), float).reshape(-1, 3)
+    """Corners (P, 3), which are a tensor from Mitsuba 3.10 on and a flat buffer before."""
+    found = mesh.positions() if hasattr(mi.Mesh, "positions") else mesh.vertex_positions_buffer()
+    return np.array(found, float).reshape(-1, 3)
+
+
+def _faces(mesh: Shape) -> np.ndarray:
+    """Numbers of the corners of every face (F, 3)."""
+    found = mesh.faces() if hasattr(mi.Mesh, "positions") else mesh.faces_buffer()
+    return np.array(found).reshape(-1, 3)

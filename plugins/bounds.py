@@ -21,8 +21,9 @@ from .variant_types import Cell, Float, Medium, MediumPtr, Point, Tensor, UInt, 
 # optical depth of an axis, at the difference of the field's bounds, for which one more block pays.
 CELLS, BLOCKS, DEPTH = 4, 64, 0.5
 
-Source: TypeAlias = tuple[int, float, int, bytes]
-"""What the blocks of a grid depend on: its array's index, scale, channel and place."""
+Source: TypeAlias = tuple[int, float, int, bytes, bool]
+"""What the blocks of a grid depend on: its array's index, scale, channel, place, whether a flow
+carries it."""
 
 UNKNOWN, UNIFORM, BLOCKED = 0, 1, 2
 """What is known of a medium: its majorant alone, that it is the same everywhere, its blocks."""
@@ -146,7 +147,8 @@ def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
     # an array has its index for as long as it is in use, and `known` uses it: an equal index is
     # the same values, without reading them
     array = mi.Float(dr.detach(data.array))
-    source = array.index, scale, channel, to_local.tobytes()
+    carried = volume is not None and hasattr(volume, "carried") and volume.carried()
+    source = array.index, scale, channel, to_local.tobytes(), carried
     if known and known.source and known.source[0] == source:
         return known
     # states, z, y, x, channels; a grid that does not change has one state
@@ -158,6 +160,9 @@ def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
     # an even field gains nothing from blocks, whose borders each cost a step
     wanted = np.clip((outside[2] - outside[0]) * extents / DEPTH, 1, BLOCKS)
     edges = np.maximum(CELLS, np.ceil(mean.shape / wanted)).astype(int)
+    if carried:
+        # a value may come from anywhere
+        edges = np.array(mean.shape)
     for axis, edge in enumerate(edges):
         least = _reduced(np.minimum, least, axis, edge)
         most = _reduced(np.maximum, most, axis, edge)

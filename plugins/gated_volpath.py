@@ -21,9 +21,9 @@ Parameter                    Type    Meaning                                    
                                      bright slab needs 25 to 50 times fewer samples, each of
                                      which takes twice as long
 ``orders``                   bool    also give S0 of every scattering order                  false
-``covariance``               bool    also give the standard error of S1 and the correlation  false
-                                     of the errors of S0 and S1 (for the error of the
-                                     depolarisation ratio)
+``covariance``               bool    also give the standard errors of S1, S2 and S3 and the  false
+                                     correlation of the errors of S0 and S1 (for the error of
+                                     the depolarisation ratio)
 ``shares``                   bool    also give the largest share of one sample in the        false
                                      variance of S0
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
@@ -43,8 +43,8 @@ parts of the gate and the pulse. Gradients, and scenes with open surfaces betwee
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
 ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
 each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... after these, with ``covariance``
-``gateNNN.S1_stderr`` and ``gateNNN.S0_S1_correlation`` after these, with ``shares``
-``gateNNN.S0_largest_share`` after all.
+``gateNNN.S1_stderr``, ``gateNNN.S0_S1_correlation``, ``gateNNN.S2_stderr`` and
+``gateNNN.S3_stderr`` after these, with ``shares`` ``gateNNN.S0_largest_share`` after all.
 
 A standard error to which one sample contributes half of the variance or more is known to a factor
 of two at best, and most of the light may not have been sampled. Without ``shares``, a warning says
@@ -61,6 +61,14 @@ The gated estimator distributes them evenly over the gates and rounds up, so tha
 the same number, at least two. Samples are independent; the random numbers of a sample depend only
 on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
+
+S0 to S3 of all orders are differentiable, in reverse and forward mode (``dr.backward`` and
+``dr.forward_to`` of what ``mi.render(scene, params)`` returns), with the gated estimator: with
+respect to extinction coefficients and albedos, to weights of a ``blendphase``, g of ``hg``, tables
+of :ref:`mueller <phase-mueller>`, and the flow of a :ref:`moving_volume <volume-moving_volume>`.
+The samples are others than those of the image. Memory does not grow with the orders. Gradients
+with respect to anything else are refused in one line. What a loss takes from other channels,
+standard errors among them, has no gradient.
 
 A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
 extinction coefficient, an albedo or a weight of a blend outside 0 to 1, if ``hg`` has a g beyond
@@ -134,10 +142,12 @@ import mitsuba as mi
 import numpy as np
 
 from .bounds import Bounds
+from .differentiable import differentiable
 from .laser import channel_of
 from .parameters import choice, fail, whole
 from .passes import Batches, Progress, stored_passes
-from .path_sampling import Lidar, add
+from .path_gradients import gradients
+from .path_sampling import Lidar, Sample, add
 from .physical import Physical
 from .registration import register
 from .supported import check_air, check_supported
@@ -152,8 +162,10 @@ Moments: TypeAlias = tuple[int, list[Float], list[Float], Float]
 """Of the samples of some cells: their number, means, summed products of deviations and the largest
 squared deviation of S0. Numbers by cell, but for the first."""
 
-# products of deviations that are summed: S0's alone, or all that the errors of S0 and S1 need
-PRODUCTS = ((0, 0), (1, 1), (0, 1))
+# products of deviations that are summed: that of S0 alone, or all that the errors of components and
+# of the depolarisation ratio need
+PRODUCTS = ((0, 0), (1, 1), (0, 1), (2, 2), (3, 3))
+COVARIANCE = ("S1_stderr", "S0_S1_correlation", "S2_stderr", "S3_stderr")
 # Deviations are multiplied by it before they are squared: a signal of 1e-19 has squares that
 # underflow in single precision. A power of two, so that nothing is rounded.
 MAGNIFIED = 2.0**50
@@ -178,6 +190,8 @@ def define() -> type:
             # pixels of the last image that receive light, and those of them whose standard error
             # is unreliable
             self.lit, self.untrusted = 0, 0
+            # of the orders that count, for comparing order by order
+            self.lowest_order = 1
             self.physical = Physical(NAME)
             self.bounds = Bounds()
             # set by whoever renders
@@ -190,7 +204,7 @@ def define() -> type:
         def quantities(self) -> list[str]:
             """Quantities that are rendered for every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
-            more = ("S1_stderr", "S0_S1_correlation") if self.covariance else ()
+            more = COVARIANCE if self.covariance else ()
             by_order = (f"order{order}.S0" for order in orders)
             shares = ("S0_largest_share",) if self.shares else ()
             return [*STOKES, "S0_stderr", *by_order, *more, *shares]
@@ -216,8 +230,9 @@ def define() -> type:
             gates, beams = sensor.gate_count, sensor.beam_count
             quantities = len(self.quantities())
             trace = self._gated if self.estimator == "gated" else self._analog
-            before, arrays = stored_passes(self.batches, self.samples_per_pass)
-            image = _float(arrays.get("image"), beams * gates * quantities)
+            size = beams * gates * quantities
+            before, arrays = stored_passes(self.batches, self.samples_per_pass, size)
+            image = _float(arrays.get("image"), size)
             done, total = 0, _moments(arrays)
             # of the finished pixels that receive light: how many there are, and how many of them
             # have an unreliable standard error
@@ -266,10 +281,12 @@ def define() -> type:
             seed: int = 0,
             spp: int = 0,
         ) -> None:
-            """Gradients of the scene from those of the image (of S0 to S3; S0_stderr has none)."""
-            for means, places in self._differentiable(scene, sensor, seed, spp):
-                grads = [dr.gather(mi.Float, grad_in.array, place) for place in places]
-                dr.backward(sum(dr.sum(m * g) for m, g in zip(means, grads, strict=True)))
+            """Gradients of the scene from those of S0 to S3; other channels have none."""
+            _, phases = differentiable(NAME, scene)
+            orders = self.lowest_order, self.max_order
+            for lidar, sample, cell, low, high, part in self._replayed(scene, sensor, seed, spp):
+                weights = [dr.gather(mi.Float, grad_in.array, c) * part for c in cell]
+                gradients(lidar, sample, low, high, orders, phases, weights)
 
         def render_forward(
             self,
@@ -279,40 +296,42 @@ def define() -> type:
             seed: int = 0,
             spp: int = 0,
         ) -> Tensor:
-            """Gradients of the image (of S0 to S3) from those of the scene."""
+            """Gradients of S0 to S3 from those of the scene; other channels have none."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             width, height = sensor.film().size()
             shape = (height, width, sensor.gate_count * len(self.quantities()))
             image = dr.zeros(mi.Float, shape[0] * shape[1] * shape[2])
-            for means, places in self._differentiable(scene, sensor, seed, spp):
-                dr.forward_to(means)
-                for mean, place in zip(means, places, strict=True):
-                    dr.scatter_reduce(dr.ReduceOp.Add, image, dr.grad(mean), place)
+            wanted, phases = differentiable(NAME, scene)
+            orders = self.lowest_order, self.max_order
+            # what plugins have made of their parameters, which kernels look up
+            dr.enqueue(dr.ADMode.Forward, wanted)
+            dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
+            for lidar, sample, cell, low, high, part in self._replayed(scene, sensor, seed, spp):
+                found = gradients(lidar, sample, low, high, orders, phases)
+                for value, place in zip(found, cell, strict=True):
+                    add(image, value * part, place)
+                dr.eval(image)
             return mi.TensorXf(image, shape)
 
-        def _differentiable(
+        def _replayed(
             self, scene: Scene, sensor: Sensor | int, seed: int, spp: int
-        ) -> Iterator[tuple[list[Float], list[UInt]]]:
-            """Means of passes, differentiable in the parameters, and their image indices."""
-            if self.estimator != "gated" or self.max_order > 1:
-                fail(
-                    NAME,
-                    "gradients",
-                    f"{self.estimator}, max_order {self.max_order}",
-                    "the gated estimator with max_order 1",
-                )
+        ) -> Iterator[tuple[Lidar, Sample, list[UInt], Float, Float, Float]]:
+            """Samples of all passes: as `_samples`, cells as image indices of S0 to S3.
+
+            The last one is a sample's part in the mean.
+            """
+            if self.estimator != "gated":
+                fail(NAME, "gradients", self.estimator, "the gated estimator")
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
-            for first, count, start, now, _ in self._passes(sensor, samples):
-                # Mitsuba's derivatives call this with gradients suspended
-                with dr.resume_grad():
-                    _, means, *_ = self._gated(
+            with _nothing_freed():
+                for first, count, start, now, _ in self._passes(sensor, samples):
+                    lidar, sample, cell, low, high = self._samples(
                         scene, sensor, seed, first, count, start, now, differentiable=True
                     )
-                    # passes of one image are added up: each has its part of the samples
-                    fraction = now * gates / samples
-                    means = [m * fraction for m in means[: len(STOKES)]]
-                    yield means, self._places(first * gates, count * gates)[: len(STOKES)]
+                    place = (cell + dr.opaque(mi.UInt32, first * gates)) * len(self.quantities())
+                    places = [place + index for index in range(len(STOKES))]
+                    yield lidar, sample, places, low, high, _opaque(gates / samples)
 
         def _prepare(
             self, scene: Scene, sensor: Sensor | int, seed: int, spp: int
@@ -377,7 +396,7 @@ def define() -> type:
             cell = (dr.arange(mi.UInt32, cells) + dr.opaque(mi.UInt32, first)) * quantities
             return [cell + index for index in range(quantities)]
 
-        def _gated(
+        def _samples(
             self,
             scene: Scene,
             sensor: Sensor,
@@ -387,8 +406,11 @@ def define() -> type:
             start: int,
             rounds: int,
             differentiable: bool = False,
-        ) -> Moments:
-            """Means and summed products of deviations, last collisions forced into the gates."""
+        ) -> tuple[Lidar, Sample, UInt, Float, Float]:
+            """Samples of the gates: lidar, samples, cells, twice the nearest and farthest range.
+
+            Of light emitted later there is less before the gate: the sample's delay is taken off.
+            """
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * gates * rounds)
             # opaque, so that neither the number of samples nor the pass is compiled into the kernel
@@ -399,26 +421,40 @@ def define() -> type:
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, self.bounds, differentiable)
             sample = lidar.emit(seed, beam, number)
-
             low, high = sensor.ranges(sample.frame.n, sample.start)
-            # whole paths, twice the ranges; light emitted later has less of it before the gate
+            # whole paths, twice the ranges
             width = 2 * (high - low) / gates
             near = 2 * (low - sample.delay) + width * gate
-            path = near, near + width, sample.rng.next_float32()
+            return lidar, sample, cell, near, near + width
+
+        def _gated(
+            self,
+            scene: Scene,
+            sensor: Sensor,
+            seed: UInt,
+            first: int,
+            count: int,
+            start: int,
+            rounds: int,
+        ) -> Moments:
+            """Means and summed products of deviations, last collisions forced into the gates."""
+            gates = sensor.gate_count
+            lidar, sample, cell, low, high = self._samples(
+                scene, sensor, seed, first, count, start, rounds
+            )
+            path = low, high, sample.rng.next_float32()
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
-            # where extinction is 0 it has a gradient, but is never selected
-            if self.candidates == 1 or differentiable or lidar.air.sheets:
-                stokes = lidar.single(sample, dr.lerp(*path), path[1] - path[0])
+            if self.candidates == 1 or lidar.air.sheets:
+                stokes = lidar.single(sample, dr.lerp(*path), high - low)
             else:
                 # candidates have delays of their own
-                start_of_gate = 2 * low + width * gate
                 chosen, place, weight = lidar.by_contribution(
                     sample,
-                    start_of_gate,
-                    start_of_gate + width,
+                    low + 2 * sample.delay,
+                    high + 2 * sample.delay,
                     dr.opaque(mi.UInt32, self.candidates),
                 )
-                stokes = lidar.single(chosen, place, weight * width)
+                stokes = lidar.single(chosen, place, weight * (high - low))
             if self.orders:
                 add(by_order, stokes[0], cell * self.max_order)
             if self.max_order > 1:
@@ -430,7 +466,7 @@ def define() -> type:
             # single precision
             off = [
                 MAGNIFIED * (s - dr.gather(mi.Float, m, cell))
-                for s, m in zip(stokes[:2], means[:2], strict=True)
+                for s, m in zip(stokes, means, strict=True)
             ]
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
@@ -474,7 +510,7 @@ def define() -> type:
             dr.eval(sums, products, largest, by_order)
             number = _opaque(rounds)
             means = [s / number for s in sums]
-            large = [MAGNIFIED * mean for mean in means[:2]]
+            large = [MAGNIFIED * mean for mean in means]
             # here contributions are scattered to their gates before a mean is known; most are 0,
             # so that squares exceed the mean's by far and hardly cancel
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
@@ -574,7 +610,7 @@ def _merge(first: Moments, second: Moments) -> Moments:
     fraction, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
     off = [b - a for a, b in zip(means1, means2, strict=True)]
     means = [a + o * fraction for a, o in zip(means1, off, strict=True)]
-    off = [MAGNIFIED * o for o in off[:2]]
+    off = [MAGNIFIED * o for o in off[: len(STOKES)]]
     deviations = [
         a + b + off[i] * off[j] * weight
         for a, b, (i, j) in zip(deviations1, deviations2, PRODUCTS[: len(deviations1)], strict=True)
@@ -584,13 +620,14 @@ def _merge(first: Moments, second: Moments) -> Moments:
 
 
 def _errors(number: Float, deviations: list[Float]) -> list[Float]:
-    """Standard error of S0, and with all three sums that of S1 and their correlation."""
-    variances = [dr.maximum(s, 0) / (number * (number - 1.0)) for s in deviations[:2]]
-    errors = [dr.sqrt(v) / MAGNIFIED for v in variances]
+    """Standard error of S0, and with the sums of all `PRODUCTS` the quantities `COVARIANCE`."""
+    errors = [dr.sqrt(dr.maximum(s, 0) / (number * (number - 1.0))) / MAGNIFIED for s in deviations]
     if len(deviations) == 1:
         return errors
-    both = dr.sqrt(dr.maximum(deviations[0], 0)) * dr.sqrt(dr.maximum(deviations[1], 0))
-    return [*errors, dr.select(both > 0, dr.clip(deviations[2] / both, -1, 1), 0)]
+    first, second, mixed, *_ = deviations
+    both = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
+    errors[2] = dr.select(both > 0, dr.clip(mixed / both, -1, 1), 0)
+    return errors
 
 
 def _warn_of_unreliable(lit: int, unreliable: int) -> None:

@@ -57,31 +57,30 @@ def transmittance(
     exp((t + RAISED) / MAJORANT) - 1, with t the optical depth of what exceeds the control.
 
     With ``differentiable``, gradients are unbiased too: d ln T, the integral of -d(extinction), is
-    estimated at one uniform place of the line, independent of the estimate of T.
+    estimated at one place of the line, independent of the estimate of T.
     """
-    where = rng.next_float32(active) * distance if differentiable else mi.Float(-1)
     # a loop cannot be differentiated backwards without storing its states: the derivative is
     # estimated outside of it
     with dr.suspend_grad():
-        value, end, between = _walk(
+        value, end, place, between, length = _walk(
             air,
             bounds,
             medium,
             dr.detach(origin),
             dr.detach(direction),
             dr.detach(distance),
-            where,
             channel,
             wavelengths,
             time,
             rng,
             active,
+            differentiable,
         )
     if differentiable:
-        mei = interaction(between, origin + direction * where, direction, wavelengths, time)
+        mei = interaction(between, origin + direction * place, direction, wavelengths, time)
         inside = active & (between != None)
         _, extinction = coefficients(between, mei, channel, inside)
-        depth = dr.select(inside, extinction * distance, 0)
+        depth = dr.select(inside, extinction * length, 0)
         # 1, whose derivative is that of -depth
         value *= dr.exp(dr.detach(depth) - depth)
     return value, end
@@ -95,27 +94,39 @@ def _walk(
     origin: Point,
     direction: Vector,
     distance: Float,
-    where: Float,
     channel: int,
     wavelengths: Float,
     time: Float,
     rng: Generator,
     active: Mask,
-) -> tuple[Float, MediumPtr, MediumPtr]:
-    """Transmittance, medium at the end, and medium at the distance ``where``."""
+    chooses: bool,
+) -> tuple[Float, MediumPtr, Float, MediumPtr, Float]:
+    """Transmittance and medium at the end.
+
+    With ``chooses`` also a random place in a medium, its medium, and the inverse of its density.
+    That varies as the medium's majorant and, for the thin ones, an optical depth of 1 along the
+    whole line.
+    """
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
     travelled, value = mi.Float(0), mi.Float(1)
-    between = mi.MediumPtr(medium)
+    chosen, between, total, rate = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0), mi.Float(1)
     crossings = air.crossings(origin, direction)
     while dr.hint(active, label="transmittance"):
         end, hit, passes, medium, behind = air.next_surface(
             crossings, origin, direction, travelled, distance, medium, active
         )
-        between = dr.select(active & (travelled <= where), medium, between)
         inside = active & (medium != None)
         kind = bounds.kind(medium)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
+        if dr.hint(chooses, mode="scalar"):
+            here = medium.get_majorant(mei, inside)[channel] + dr.rcp(distance)
+            part = dr.select(inside, here * (end - travelled), 0)
+            total += part
+            takes = inside & (rng.next_float32(inside) * total < part)
+            anywhere = dr.lerp(travelled, end, rng.next_float32(inside))
+            chosen, rate = dr.select(takes, anywhere, chosen), dr.select(takes, here, rate)
+            between = dr.select(takes, medium, between)
         # in closed form, without a random number
         uniform = inside & (kind == UNIFORM)
         _, extinction = coefficients(medium, mei, channel, uniform)
@@ -160,7 +171,7 @@ def _walk(
         medium = dr.select(hit, behind, medium)
         travelled = end
         active &= hit & (value > 0)
-    return value, medium, between
+    return value, medium, chosen, between, total / rate
 
 
 @dr.syntax

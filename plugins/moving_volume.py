@@ -17,12 +17,21 @@ Parameter                  Type           Meaning
 ``time_start, time_stop``  float          time of the first and of the last state, s
 ``to_world``               transform      from the unit cube, which the grid fills, to its
                                           place
+``flow``                   tensor, string optional: Z x Y x X x 3 numbers, or a ``.npy`` file of
+                                          them: the wind in m/s along the world's axes at the
+                                          centres of cells of a grid that fills the same cube,
+                                          of any size. It carries the one state of ``data``
 ========================== ============== ==================================================
 
 Values are linear between states and between cells, and those of the nearest state or cell beyond
 the ends. A pattern of wavelength L that moves by d from one state to the next is displaced by at
 most 0.63 d^3 / L^2 in between, and its amplitude is smaller by at most 5 (d / L)^2, for d well
-below L. ``data`` (with a last axis of one channel, differentiable), ``time_start`` and
+below L. With a ``flow`` u there is one state, at ``time_start``; s seconds later the value at p is
+that at p - s u(p - s u(p) / 2): frozen air, followed back in one step of the midpoint rule. Air
+that comes from beyond the ends has the value of the nearest cell, and bounds of the extinction are
+those of the whole grid.
+
+``data`` (with a last axis of one channel) and ``flow``, both differentiable, ``time_start`` and
 ``time_stop`` can be changed through ``mi.traverse`` without recompilation. Other integrators than
 :ref:`gated_volpath <integrator-gated_volpath>` use the time of their rays.
 
@@ -49,7 +58,19 @@ import numpy as np
 from .parameters import fail, number
 from .parameters import table as read_table
 from .registration import register
-from .variant_types import Cell, Float, Interaction, Mask, Properties, Spectrum, Table, Traversal
+from .variant_types import (
+    Cell,
+    Float,
+    Interaction,
+    Mask,
+    Point,
+    Properties,
+    Spectrum,
+    Table,
+    Tensor,
+    Traversal,
+    Vector,
+)
 
 NAME, KIND = "moving_volume", "volume"
 
@@ -76,33 +97,31 @@ def define() -> type:
             self.m_to_local = mi.Matrix3f(inverse[:3, :3])
             self.m_offset = mi.Vector3f(inverse[:3, 3])
             dr.make_opaque(self.m_to_local, self.m_offset)
+            self.m_flow: Tensor = None
+            if "flow" in props:
+                self.m_flow = mi.TensorXf(read_flow(props["flow"]))
             self._check()
 
         def eval_1(self, it: Interaction, active: Mask = True) -> Float:
             """Values at the places and times of interactions."""
+            place = mi.Point3f(it.p)
+            if self.m_flow is not None:
+                age = it.time - self.m_start
+                half = place - 0.5 * age * self._wind(place, active)
+                place -= age * self._wind(half, active)
             time = (it.time - self.m_start) * self.m_rate
-            place = self.m_to_local @ mi.Vector3f(it.p) + self.m_offset
-            # time first, as in the table; an axis of one node has nothing to be interpolated
-            coordinates = [time, *((place[k] * self.m_cells[k] - 0.5) for k in (2, 1, 0))]
-            lookups = [(mi.UInt32(0), mi.Float(1))]
-            for coordinate, nodes, last in zip(
-                coordinates, self.m_data.shape, self.m_last, strict=False
-            ):
-                if nodes == 1:
-                    continue
-                coordinate = dr.clip(coordinate, 0, last)
-                low = dr.minimum(mi.UInt32(coordinate), mi.UInt32(last) - 1)
-                weight = coordinate - mi.Float(low)
-                nodes = mi.UInt32(last) + 1
-                steps = ((low, 1 - weight), (low + 1, weight))
-                lookups = [
-                    (index * nodes + node, value * part)
-                    for (index, value), (node, part) in product(lookups, steps)
-                ]
-            return sum(
-                weight * dr.gather(mi.Float, self.m_data.array, index, active)
-                for index, weight in lookups
-            )
+            # time first, as in the table
+            places = [time, *self._cells(place, self.m_cells)]
+            return lookup(self.m_data.array, places, self.m_data.shape, self.m_last, active)[0]
+
+        def _cells(self, place: Point, cells: Sequence[Float]) -> list[Float]:
+            """Places in a grid, from centre to centre, along z, y and x."""
+            local = self.m_to_local @ mi.Vector3f(place) + self.m_offset
+            return [local[k] * cells[k] - 0.5 for k in (2, 1, 0)]
+
+        def _wind(self, place: Point, active: Mask) -> Vector:
+            flow, places = self.m_flow, self._cells(place, self.m_flow_cells)
+            return mi.Vector3f(lookup(flow.array, places, flow.shape, self.m_flow_last, active, 3))
 
         def eval(self, it: Interaction, active: Mask = True) -> Spectrum:
             return mi.UnpolarizedSpectrum(self.eval_1(it, active))
@@ -113,6 +132,10 @@ def define() -> type:
             matrix[:3, :3] = np.array(self.m_to_local)[..., 0]
             matrix[:3, 3] = np.array(self.m_offset).ravel()
             return matrix
+
+        def carried(self) -> bool:
+            """Whether values are found elsewhere than where they are."""
+            return self.m_flow is not None
 
         def max(self) -> float:
             return float(dr.max(dr.detach(self.m_data.array))[0])
@@ -125,6 +148,8 @@ def define() -> type:
 
         def traverse(self, callback: Traversal) -> None:
             callback.put("data", self.m_data, mi.ParamFlags.Differentiable)
+            if self.m_flow is not None:
+                callback.put("flow", self.m_flow, mi.ParamFlags.Differentiable)
             callback.put("time_start", self.m_start, mi.ParamFlags.NonDifferentiable)
             callback.put("time_stop", self.m_stop, mi.ParamFlags.NonDifferentiable)
 
@@ -140,9 +165,12 @@ def define() -> type:
                 fail(NAME, "time_stop", stop, f"a time after time_start = {start:g} s")
             if shape[0] > 1 and start == stop:
                 fail(NAME, "time_stop", stop, f"a time after the first of {shape[0]} states")
+            if self.m_flow is not None:
+                check_flow(shape, self.m_flow)
+                self.m_flow_last, self.m_flow_cells = _sizes(self.m_flow.shape[:3])
             # opaque, so that grids of other sizes and times run in the same kernel
-            self.m_last = [dr.opaque(mi.Float, nodes - 1) for nodes in shape[:4]]
-            self.m_cells = [dr.opaque(mi.Float, nodes) for nodes in shape[3:0:-1]]
+            last, self.m_cells = _sizes(shape[1:4])
+            self.m_last = [dr.opaque(mi.Float, shape[0] - 1), *last]
             rate = (shape[0] - 1) / (stop - start) if shape[0] > 1 else 0.0
             self.m_rate = dr.opaque(mi.Float, rate)
             dr.make_opaque(self.m_start, self.m_stop)
@@ -155,6 +183,57 @@ def define() -> type:
     return MovingVolume
 
 
+def lookup(
+    values: Float,
+    places: Sequence[Float],
+    shape: Sequence[int],
+    last: Sequence[Float],
+    active: Mask,
+    channels: int = 1,
+) -> list[Float]:
+    """Values of a grid between its nodes, linear along each axis.
+
+    Parameters
+    ----------
+    values : Float
+        Of the nodes, with all axes in a row and the channels last.
+    places : sequence of Float
+        Along each axis, in nodes from the first one; beyond the ends they are those of the ends.
+    shape : sequence of int
+        Nodes along each axis.
+    last : sequence of Float
+        One less, opaque.
+    channels : int
+    """
+    lookups = [(mi.UInt32(0), mi.Float(1))]
+    for coordinate, nodes, most in zip(places, shape, last, strict=False):
+        # an axis of one node has nothing to be interpolated
+        if nodes == 1:
+            continue
+        coordinate = dr.clip(coordinate, 0, most)
+        low = dr.minimum(mi.UInt32(coordinate), mi.UInt32(most) - 1)
+        weight = coordinate - mi.Float(low)
+        nodes = mi.UInt32(most) + 1
+        steps = ((low, 1 - weight), (low + 1, weight))
+        lookups = [
+            (index * nodes + node, value * part)
+            for (index, value), (node, part) in product(lookups, steps)
+        ]
+    return [
+        sum(
+            weight * dr.gather(mi.Float, values, index * channels + channel, active)
+            for index, weight in lookups
+        )
+        for channel in range(channels)
+    ]
+
+
+def _sizes(shape: Sequence[int]) -> tuple[list[Float], list[Float]]:
+    """Of a grid by z, y and x: last nodes in this order, and cells along x, y and z."""
+    last = [dr.opaque(mi.Float, nodes - 1) for nodes in shape]
+    return last, [dr.opaque(mi.Float, nodes) for nodes in shape[::-1]]
+
+
 def read_states(source: Table) -> np.ndarray:
     """States of a grid (tensor or file name), (times, z, y, x)."""
     states = read_table(NAME, "data", source, 4)
@@ -163,6 +242,22 @@ def read_states(source: Table) -> np.ndarray:
     if not np.isfinite(states).all():
         fail(NAME, "data", f"{np.sum(~np.isfinite(states))} values that are none", "finite ones")
     return states.astype(np.float32)
+
+
+def read_flow(source: Table) -> np.ndarray:
+    """Wind on a grid (tensor or file name), (z, y, x, 3)."""
+    return read_table(NAME, "flow", source, 3).astype(np.float32)
+
+
+def check_flow(states: Sequence[int], flow: Tensor) -> None:
+    """Refuse a flow that is no wind on a grid, or that has several states to carry."""
+    shape = flow.shape
+    if len(shape) != 4 or shape[3] != 3 or min(shape) < 1:
+        fail(NAME, "flow", f"shape {shape}", "z x y x x x 3 numbers")
+    if states[0] > 1:
+        fail(NAME, "flow", f"a wind of {states[0]} states", "a wind of one state")
+    if not np.isfinite(flow.numpy()).all():
+        fail(NAME, "flow", "numbers that are none", "finite ones")
 
 
 register(KIND, NAME, define)

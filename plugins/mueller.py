@@ -22,7 +22,7 @@ The matrix has the rows (a1, b1, 0, 0), (b1, a2, 0, 0), (0, 0, a3, b2), (0, 0, -
 to the scattering plane, Q > 0 parallel to it. The table is scaled so that a1 integrates to one
 over the sphere (values are then per steradian); all elements are scaled by the same factor.
 ``table`` can be changed through ``mi.traverse``, also to one of other angles, and is
-scaled as well.
+scaled as well. Its elements are differentiable; a change of their angles has no gradient.
 
 .. code-block:: xml
 
@@ -51,7 +51,9 @@ from .variant_types import (
     Point,
     Properties,
     Spectrum,
+    Tensor,
     Traversal,
+    UInt,
     Vector,
 )
 
@@ -72,8 +74,8 @@ def define() -> type:
             if "table" not in props:
                 fail(NAME, "table", None, "a tensor of N x 7 numbers or a file name")
             table = read_table(NAME, "table", props["table"], 7)
-            self._tabulate(table)
             self.m_table = mi.TensorXf(np.array(table, np.float32))
+            self._tabulate(table)
             self.m_flags = +mi.PhaseFunctionFlags.Isotropic
 
         def _tabulate(self, table: np.ndarray) -> None:
@@ -82,11 +84,15 @@ def define() -> type:
             table = _refined(table)
             self.m_angle = mi.Float(np.radians(table[:, 0]))
             self.m_elements = [mi.Float(column) for column in table[:, 1:].T]
+            if dr.grad_enabled(self.m_table):
+                attached = _attached(self.m_table, table[:, 0])
+                pairs = zip(self.m_elements, attached, strict=True)
+                self.m_elements = [dr.replace_grad(exact, one) for exact, one in pairs]
             # probability of every cell but for the factor of 2 pi, exact for a1 linear in angle
             self.m_cell = mi.DiscreteDistribution(mi.Float(_cells(table)))
 
         def traverse(self, callback: Traversal) -> None:
-            callback.put("table", self.m_table, mi.ParamFlags.NonDifferentiable)
+            callback.put("table", self.m_table, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             self._tabulate(self.m_table.numpy())
@@ -208,10 +214,36 @@ def _refined(table: np.ndarray) -> np.ndarray:
 
 def _cells(table: np.ndarray) -> np.ndarray:
     """Integral of a1 sin(angle) over each cell of a table, for a1 linear in angle."""
-    theta, a1 = np.radians(table[:, 0]), table[:, 1]
-    slope = np.diff(a1) / np.diff(theta)
-    cells = a1[:-1] * np.cos(theta[:-1]) - a1[1:] * np.cos(theta[1:])
-    return cells + slope * np.diff(np.sin(theta))
+    low, high = _shares(table[:, 0])
+    return low * table[:-1, 1] + high * table[1:, 1]
+
+
+def _shares(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What both ends of each cell, each of a1 = 1, add to the integral over it; degrees."""
+    theta = np.radians(angle)
+    slope = np.diff(np.sin(theta)) / np.diff(theta)
+    return np.cos(theta[:-1]) - slope, slope - np.cos(theta[1:])
+
+
+def _attached(table: Tensor, nodes: np.ndarray) -> list[Float]:
+    """Elements at nodes (degrees) as functions of a stated table's, single precision."""
+    angle = table.numpy()[:, 0].astype(float)
+    low = np.clip(np.searchsorted(angle, nodes, "right") - 1, 0, len(angle) - 2)
+    part = mi.Float((nodes - angle[low]) / (angle[low + 1] - angle[low]))
+    low, shares = mi.UInt32(low), np.zeros(len(angle))
+    near, far = _shares(angle)
+    shares[:-1] += near
+    shares[1:] += far
+    whole = _column(table, 1, dr.arange(mi.UInt32, len(angle))) * mi.Float(shares)
+    scale = 1 / (dr.two_pi * dr.sum(whole))
+    return [
+        scale * dr.lerp(_column(table, k, low), _column(table, k, low + 1), part)
+        for k in range(1, 7)
+    ]
+
+
+def _column(table: Tensor, column: int, row: UInt) -> Float:
+    return dr.gather(mi.Float, table.array, row * 7 + column)
 
 
 def _integral(first: Float, step: Float, low: Float, slope: Float) -> Float:

@@ -22,15 +22,16 @@ class Batches(Protocol):
 
 
 def stored_passes(
-    batches: Batches | None, samples_per_pass: int
+    batches: Batches | None, samples_per_pass: int, values: int | None = None
 ) -> tuple[int, Mapping[str, np.ndarray]]:
     """Number of passes that need not be traced again, and their arrays.
 
     None, if those stored are of another size, for another machine's memory: they end at other
-    samples.
+    samples. None either, if their image has not so many ``values``: it is one of other quantities.
     """
     if batches is not None:
         passes, arrays = batches.stored()
-        if passes and int(arrays.get("samples_per_pass", -1)) == samples_per_pass:
+        same = values is None or np.size(arrays.get("image", ())) == values
+        if passes and same and int(arrays.get("samples_per_pass", -1)) == samples_per_pass:
             return passes, arrays
     return 0, {}

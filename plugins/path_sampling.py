@@ -153,17 +153,18 @@ class Lidar:
         """
         medium = mi.MediumPtr(self.sensor.get_medium())
         closure, volume = closed(sample.origin, sample.direction, sample.aperture, path)
-        return self._connect(
+        (received,) = self._connect(
             sample,
             sample.rng,
             sample.origin,
             sample.direction,
             closure,
             medium,
-            sample.stokes,
+            [sample.stokes],
             width * volume,
             (path > 0) & (closure > 0),
         )
+        return received
 
     @dr.syntax
     def by_contribution(
@@ -290,20 +291,8 @@ class Lidar:
             active &= (weight > 0) & (rng.next_float32(active) < survival)
             stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
             path -= flight
-
-            away = position - aperture
-            distance = dr.norm(away)
-            away, excess = away / distance, path - distance
-            active &= excess > 0
-            _, reach = slabs(self.low, self.high, position, -away)
-            # as long as the path is open, its remainder exceeds the straight way back
-            rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
-            closing, scattered, leg, volume = self._last_flight(
-                rng, sample, medium, mei, stokes, rest, active
-            )
-            gain = self._connect(
-                sample, rng, position, closing, leg, medium, scattered, width * volume, volume > 0
-            )
+            rest, gains, active = self._close(sample, rng, medium, mei, stokes, path, width, active)
+            gain = gains[0]
             total = _sum(total, gain)
             if dr.hint(split, mode="scalar"):
                 add(by_order, gain[0], cell * max_order + order - 1, active)
@@ -315,6 +304,46 @@ class Lidar:
             )
             active &= weight > 0
         return total
+
+    def _close(
+        self,
+        sample: Sample,
+        rng: Generator,
+        medium: MediumPtr,
+        mei: Interaction,
+        stokes: Stokes,
+        path: Float,
+        width: Float,
+        active: Mask,
+        others: Sequence[Stokes] = (),
+    ) -> tuple[OpenPath, list[Stokes], Mask]:
+        """The path closed by one more vertex.
+
+        Returns what remains of it at the vertex, the Stokes vectors of the light about e_h of
+        ``stokes`` and of ``others``, and where the path is still open.
+        """
+        away = mei.p - sample.aperture
+        distance = dr.norm(away)
+        away, excess = away / distance, path - distance
+        active = active & (excess > 0)
+        _, reach = slabs(self.low, self.high, mei.p, -away)
+        # as long as the path is open, its remainder exceeds the straight way back
+        rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
+        with dr.suspend_grad():
+            closing, scattered, leg, volume = self._last_flight(
+                rng, sample, medium, mei, stokes, rest, active
+            )
+        if self.differentiable:
+            # of a direction that stays where it was drawn
+            scattered, _ = self._scatter(medium, mei, stokes, closing, volume > 0)
+        several = [scattered]
+        if others:
+            more, _ = self._scatter_all(medium, mei, others, closing, volume > 0)
+            several += more
+        gains = self._connect(
+            sample, rng, mei.p, closing, leg, medium, several, width * volume, volume > 0
+        )
+        return rest, gains, active
 
     def _first_flight(
         self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
@@ -469,11 +498,11 @@ class Lidar:
         direction: Vector,
         distance: Float,
         medium: MediumPtr,
-        stokes: Stokes,
+        several: Sequence[Stokes],
         volume: Float,
         active: Mask,
-    ) -> Stokes:
-        """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
+    ) -> list[Stokes]:
+        """Scatter at ``distance`` along a flight, where the path closes: Stokes vectors about e_h.
 
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
         """
@@ -496,7 +525,7 @@ class Lidar:
         mei = interaction(medium, vertex, direction, self.wavelengths, sample.time)
         active = active & (medium != None)
         scattering, _ = coefficients(medium, mei, self.channel, active)
-        return self._receive(sample, rng, medium, mei, stokes, active, out * scattering * volume)
+        return self._receive(sample, rng, medium, mei, several, active, out * scattering * volume)
 
     def _receive(
         self,
@@ -504,10 +533,10 @@ class Lidar:
         rng: Generator,
         medium: MediumPtr,
         mei: Interaction,
-        stokes: Stokes,
+        several: Sequence[Stokes],
         active: Mask,
         weight: Float,
-    ) -> Stokes:
+    ) -> list[Stokes]:
         """Next-event estimation from an interaction to the telescope point."""
         back = sample.aperture - mei.p
         distance = dr.norm(back)
@@ -530,24 +559,38 @@ class Lidar:
         # the telescope's point is uniform on its disc: area, cosine and distance make it a solid
         # angle
         weight = weight * out * self.area * -dr.dot(wo, sample.axes.n) / (distance * distance)
-        received, _ = self._scatter(medium, mei, stokes, wo, active)
-        if not mi.is_polarized:
-            received = [*received, mi.Float(0), mi.Float(0), mi.Float(0)]
-        else:
-            received = rotate_stokes(
-                received, wo, mi.mueller.stokes_basis(wo), transverse(sample.axes.s, wo)
-            )
-        return [dr.select(active, r * weight, 0) for r in received]
+        several, _ = self._scatter_all(medium, mei, several, wo, active)
+        axis = mi.mueller.stokes_basis(wo) if mi.is_polarized else None
+        found = []
+        for received in several:
+            if not mi.is_polarized:
+                received = [*received, mi.Float(0), mi.Float(0), mi.Float(0)]
+            else:
+                received = rotate_stokes(received, wo, axis, transverse(sample.axes.s, wo))
+            found.append([dr.select(active, r * weight, 0) for r in received])
+        return found
 
     def _scatter(
         self, medium: MediumPtr, mei: Interaction, stokes: Stokes, wo: Vector, active: Mask
     ) -> tuple[Stokes, Float]:
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
+        (scattered,), pdf = self._scatter_all(medium, mei, [stokes], wo, active)
+        return scattered, pdf
+
+    def _scatter_all(
+        self,
+        medium: MediumPtr,
+        mei: Interaction,
+        several: Sequence[Stokes],
+        wo: Vector,
+        active: Mask,
+    ) -> tuple[list[Stokes], Float]:
+        """The same of several Stokes vectors."""
         if self.rounded:
             # Mitsuba's tables are 0 where rounding puts a cosine beyond 1
             wo = off_the_poles(mei.wi, wo)
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
-        return apply_phase_function(value, stokes, self.channel), pdf
+        return [apply_phase_function(value, stokes, self.channel) for stokes in several], pdf
 
     @dr.syntax
     def analog(
@@ -606,7 +649,8 @@ class Lidar:
             fraction = (range_ - low) / (high - low)
             counts = active & (fraction >= 0) & (fraction < 1)
             # the distance to the last vertex is drawn, not forced: it has no weight of its own
-            gain = self._receive(sample, rng, medium, mei, stokes, counts, mi.Float(1))
+            gains = self._receive(sample, rng, medium, mei, [stokes], counts, mi.Float(1))
+            gain = gains[0]
             now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
             done = now != gate
             _deposit(sums, products, largest, magnified, base + gate, held, done)

@@ -94,8 +94,9 @@ def test_public_function_has_an_example(name):
 
 
 def test_every_public_name_has_its_place_in_the_documentation():
-    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text()
-    named = re.findall(r"^\.\. auto\w+:: lidar_mi\.(\w+)$", page, re.MULTILINE)
+    pages = (Path(__file__).parents[1] / "docs" / "api").glob("*.md")
+    text = "\n".join(page.read_text() for page in pages)
+    named = re.findall(r"^\.\. auto\w+:: lidar_mi\.(\w+)$", text, re.MULTILINE)
     assert sorted([*named, "__version__"]) == sorted(lm.__all__)
 
 

@@ -4,14 +4,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .gradients_of_orders import orders
 from .lidar_equation import equation
 from .report import Check, Row, mean_and_error
 from .scenes import box, grid, scene
 
 TITLE = "Gradients"
 INTRODUCTION = (
-    "The image is differentiable with respect to the extinction grid. In a slab that varies only "
-    "along the beam, single scattering has the derivatives of the lidar equation."
+    "The image is differentiable with respect to extinction, albedo, phase functions and the flow "
+    "that carries the air. In a slab that varies only along the beam, single scattering has the "
+    "derivatives of the lidar equation. Those of all orders are compared with differences of "
+    "images."
 )
 
 KEY = "slab.interior_medium.sigma_t.data"
@@ -80,4 +83,4 @@ def derivatives(effort):
     )
 
 
-CHECKS = (derivatives,)
+CHECKS = (derivatives, orders)

@@ -51,6 +51,63 @@ class DopplerDescription(Protocol):
     def retrieval(self) -> RingMethods: ...
 
 
+class CoherentLaser(Protocol):
+    """Pulses and gates of a coherent lidar; m."""
+
+    @property
+    def wavelength(self) -> float: ...
+    @property
+    def pulse_length(self) -> float: ...
+    @property
+    def gate_length(self) -> float: ...
+    @property
+    def gate_spacing(self) -> float: ...
+    @property
+    def first_gate(self) -> float: ...
+
+
+class CoherentScan(Protocol):
+    """How a coherent lidar scans; accumulation of a line in s."""
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def accumulation(self) -> float: ...
+
+
+class CoherentSignal(Protocol):
+    """Carrier-to-noise ratio in dB at a range in m."""
+
+    @property
+    def cnr(self) -> float: ...
+    @property
+    def range(self) -> float: ...
+
+
+class Passage(Protocol):
+    """Height of a wake that passes a lidar on the ground, m."""
+
+    @property
+    def height(self) -> float: ...
+
+
+class CoherentDescription(Protocol):
+    """A coherent lidar on the ground, its place in m."""
+
+    @property
+    def laser(self) -> CoherentLaser: ...
+    @property
+    def scan(self) -> CoherentScan: ...
+    @property
+    def signal(self) -> CoherentSignal: ...
+    @property
+    def position(self) -> Sequence[float]: ...
+    @property
+    def passage(self) -> Passage: ...
+
+
 class Platform(Protocol):
     """Speed in m/s, time between both images in s."""
 
@@ -190,7 +247,11 @@ class ExperimentDescription(Protocol):
     @property
     def wake(self) -> Wake | None: ...
     @property
-    def doppler(self) -> DopplerDescription | None: ...
+    def imaged_wake(self) -> Wake | None: ...
+    @property
+    def fringes(self) -> DopplerDescription | None: ...
+    @property
+    def coherent(self) -> CoherentDescription | None: ...
     @property
     def platform(self) -> Platform: ...
     @property

@@ -20,6 +20,10 @@ EXAMPLES = (
 )
 
 
+_LABELS = {"vortices": "vortices", "line_vortices": "vortices", "coherent_lines": "lines   "}
+"""Of results that are no winds."""
+
+
 def run(
     experiment: RunName,
     variant: Variant = None,
@@ -45,7 +49,7 @@ def run(
     variants = reading.load_variants(path, changes)
     loaded = next(iter(variants.values())) if variants else reading.load(path, changes)
     if variant:
-        sections = {"render": loaded.wake, "doppler.render": loaded.doppler}
+        sections = {"render": loaded.imaged_wake, "doppler.render": loaded.fringes}
         changes += [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
     if variants:
         _run_study(reading.load_variants(path, changes), out, path, overwrite)
@@ -66,7 +70,7 @@ def run(
     output.print(f"figures  {folder / 'figures'}")
     for result, file in RESULTS.items():
         if done.results.get(result) is not None:
-            label = "vortices" if result == "vortices" else "winds   "
+            label = _LABELS.get(result, "winds   ")
             output.print(f"{label} {folder / file}")
 
 
@@ -96,4 +100,4 @@ def _run_study(
 
 def _averaged(experiment: "Experiment") -> tuple[int, ...]:
     """Numbers of images of rings that an experiment averages."""
-    return experiment.doppler.retrieval.averaged if experiment.doppler else ()
+    return experiment.fringes.retrieval.averaged if experiment.fringes else ()

@@ -169,7 +169,7 @@ def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
     if sensor.timing is not None:
         raise InputError("sensor.timing: not allowed in an encounter; expected none")
     experiment = at_the_slabs(experiment, gates)
-    doppler = experiment.doppler
+    doppler = experiment.fringes
     assert doppler is not None  # as there is a sensor
     # refuses numbers of pulses that have no frame of the laser
     reference_frames(sensor.pulses, doppler.reference.every, PULSES)
@@ -195,7 +195,7 @@ def at_the_slabs(experiment: Experiment, gates: Gates) -> Experiment:
     InputError
         Its own range is another one.
     """
-    doppler = experiment.doppler
+    doppler = experiment.fringes
     if experiment.sensor is None or doppler is None:
         return experiment
     lidar = doppler.lidar

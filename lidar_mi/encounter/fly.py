@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
@@ -26,8 +26,12 @@ from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import load_experiment
+from lidar_mi.plots import plot_flights
 from lidar_mi.progress import Notice, progress
 from lidar_mi.tables import Table, Tabular
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,6 +86,36 @@ class Flights(Tabular):
                 self.series.attrs.get(MET, "wake"),
             ),
         ]
+
+    def plot(self, name: str = "roll", ax: "Axes | None" = None) -> "Axes":
+        """Draw a time series of every flight, angles in degrees.
+
+        Parameters
+        ----------
+        name : str
+            Variable of ``series``.
+        ax : matplotlib Axes, optional
+            Default: of a new figure.
+
+        Raises
+        ------
+        InputError
+            No such time series.
+        """
+        if name not in self.series:
+            names = ", ".join(map(str, self.series.data_vars))
+            raise InputError(f"plot: no time series {name}; expected one of {names}")
+        return plot_flights(self.series, ax, name)
+
+    def thumbnail(self) -> bytes:
+        """The bank angles as PNG."""
+        from matplotlib.figure import Figure
+
+        from lidar_mi.io.png import png_bytes
+
+        figure = Figure(figsize=(7.5, 4.2), layout="compressed")
+        plot_flights(self.series, figure.subplots())
+        return png_bytes(figure)
 
     def show(self) -> None:
         """Show the numbers, and the report in a browser."""

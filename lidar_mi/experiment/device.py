@@ -35,20 +35,21 @@ def on_its_device(experiment: Experiment) -> Experiment:
         "device": retrieval if rendering == retrieval else None,
         "render": _of(experiment.render, rendering),
     }
-    if experiment.doppler:
-        render = _of(experiment.doppler.render, rendering)
-        update["doppler"] = experiment.doppler.model_copy(update={"render": render})
+    if experiment.fringes:
+        render = _of(experiment.fringes.render, rendering)
+        update["doppler"] = experiment.fringes.model_copy(update={"render": render})
     return experiment.model_copy(update=update).read_from(experiment.folder)
 
 
 def devices_in_words(experiment: Experiment) -> str:
     """Where an experiment that is on its device renders and retrieves, for the log."""
     sections = (
-        experiment.wake and experiment.render,
-        experiment.doppler and experiment.doppler.render,
+        experiment.imaged_wake and experiment.render,
+        experiment.fringes and experiment.fringes.render,
     )
     variants = dict.fromkeys(section.variant for section in sections if section)
-    return f"rendering in {' and '.join(variants)}, retrieval on {experiment.device or CPU}"
+    rendering = f"rendering in {' and '.join(variants)}, " if variants else ""
+    return f"{rendering}retrieval on {experiment.device or CPU}"
 
 
 def _found(asked: str) -> tuple[str, str]:

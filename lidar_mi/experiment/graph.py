@@ -4,6 +4,7 @@ A stage is a function. Each of its parameters is, by its name,
 
 - the result of another stage (``truth``);
 - a section or a value of the experiment, with ``_`` for the dots (``scan``, ``doppler_camera``);
+  None for a section of another kind than the parameter's, such as a Doppler lidar's;
 - what a run provides: ``log``, ``search_path`` (the folder in which files that an experiment names
   are searched first) and, for a stage that gives its result in parts, ``missing`` and ``store``.
 
@@ -23,6 +24,7 @@ from pydantic import BaseModel
 
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.section import sections_in
 
 PROVIDED = ("log", "search_path", "missing", "store")
 
@@ -67,6 +69,8 @@ class Parameter(NamedTuple):
         Whether it may be omitted.
     marks : tuple
         `Only`, `But`, `Guard`.
+    kinds : tuple of type
+        Sections that it may be, if it is one.
     """
 
     name: str
@@ -74,6 +78,7 @@ class Parameter(NamedTuple):
     optional: bool
     default: bool
     marks: tuple[Any, ...]
+    kinds: tuple[type[BaseModel], ...] = ()
 
 
 class Store(Protocol):
@@ -172,7 +177,8 @@ def parameters(function: Callable[..., Any]) -> tuple[Parameter, ...]:
             else get_origin(kind) in (Union, types.UnionType) and type(None) in get_args(kind)
         )
         default = given.default is not given.empty
-        found.append(Parameter(name, section_path(name), optional, default, marks))
+        kinds = () if isinstance(kind, str) else tuple(sections_in(kind))
+        found.append(Parameter(name, section_path(name), optional, default, marks, kinds))
     return tuple(found)
 
 
@@ -182,28 +188,31 @@ def section_path(name: str, model: type[BaseModel] = Experiment) -> str | None:
     for key, field in model.model_fields.items():
         if name == key:
             return key
-        # the model of a section that may be None is an argument of its union
-        inner = next(
-            (k for k in (field.annotation, *get_args(field.annotation)) if _is_model(k)), None
-        )
         # keys contain _ themselves: every key that the name begins with is tried
-        if inner is not None and name.startswith(f"{key}_"):
+        for inner in sections_in(field.annotation) if name.startswith(f"{key}_") else ():
             rest = section_path(name[len(key) + 1 :], inner)
             if rest is not None:
                 return f"{key}.{rest}"
     return None
 
 
-def _is_model(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
 def section(experiment: Experiment, path: str) -> Any:
-    """A section or a value of an experiment, by its dotted key; None below a missing section."""
+    """A section or a value of an experiment, by its dotted key.
+
+    None below a missing section, or one of a kind that has no such key.
+    """
     found: Any = experiment
     for key in path.split("."):
-        found = None if found is None else getattr(found, key)
+        found = getattr(found, key, None)
     return found
+
+
+def _given(experiment: Experiment, parameter: Parameter) -> Any:
+    """The section or value of a parameter; None where it is a section of another kind."""
+    assert parameter.path is not None
+    found = section(experiment, parameter.path)
+    wrong = isinstance(found, BaseModel) and parameter.kinds
+    return None if wrong and not isinstance(found, parameter.kinds) else found
 
 
 def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
@@ -223,7 +232,7 @@ def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
         if parameter.name in provided:
             arguments[parameter.name] = provided[parameter.name]
         elif parameter.path is not None:
-            arguments[parameter.name] = section(experiment, parameter.path)
+            arguments[parameter.name] = _given(experiment, parameter)
     return function(**arguments)
 
 
@@ -288,7 +297,7 @@ class Graph:
             if parameter.name in self._names:
                 if parameter.name not in names:
                     return False
-            elif parameter.path and section(self.experiment, parameter.path) is None:
+            elif parameter.path and _given(self.experiment, parameter) is None:
                 return False
         return True
 
@@ -335,7 +344,7 @@ class Graph:
                 else:
                     found[parameter.name] = None
             elif parameter.path is not None:
-                found[parameter.name] = section(self.experiment, parameter.path)
+                found[parameter.name] = _given(self.experiment, parameter)
         return found
 
     def call(self, function: Callable[..., T], results: Mapping[str, Any]) -> T:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 
+from lidar_mi.assessment.metrics.coherent import lines_metrics, profile_metrics, vortex_scan_metrics
 from lidar_mi.assessment.metrics.images import light_metrics, noise_metrics
 from lidar_mi.assessment.metrics.names import budget_key, timing_key
 from lidar_mi.assessment.metrics.pointing import pointing_metrics
@@ -50,10 +51,16 @@ def measure(
     if "error_budget" in results:
         for method, budget in results["error_budget"].items():
             metrics |= {budget_key(method, key): value for key, value in budget.items()}
-    if experiment.doppler is not None and "v_los" in results:
-        averaged = experiment.doppler.retrieval.averaged
+    if experiment.fringes is not None and "v_los" in results:
+        averaged = experiment.fringes.retrieval.averaged
         metrics |= ring_budget_metrics(results["ring_budget"], averaged)
         metrics |= velocity_metrics(results["v_los"])
+    if "coherent_lines" in results:
+        metrics |= lines_metrics(results["coherent_lines"])
+    if "line_winds" in results:
+        metrics |= profile_metrics(results["line_winds"])
+    if "line_vortices" in results:
+        metrics |= vortex_scan_metrics(results["line_vortices"])
     if "lines" in results:
         metrics |= _sensor(results)
         metrics |= margin_metrics(judged(experiment, results, metrics), experiment.platform.speed)
@@ -114,7 +121,7 @@ def measured(
     Points are lines of sight where velocities along them are required, else valid vectors whose
     windows do not overlap.
     """
-    doppler, sensor = experiment.doppler, experiment.sensor
+    doppler, sensor = experiment.fringes, experiment.sensor
     # requirements are read for the sensor alone, which has both lidars
     assert doppler is not None and sensor is not None
     retrieval, depth = experiment.retrieval, doppler.lidar.range_bin

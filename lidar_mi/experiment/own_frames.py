@@ -39,11 +39,11 @@ def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") ->
         An experiment without one.
     """
     experiment = instrument if isinstance(instrument, Experiment) else load_experiment(instrument)
-    if experiment.doppler is None:
+    if experiment.fringes is None:
         raise InputError(
             f"{name}: experiment {experiment.name!r} has no section doppler; expected one"
         )
-    return experiment.doppler
+    return experiment.fringes
 
 
 def electrons(counts: np.ndarray, ccd: CCD) -> np.ndarray:

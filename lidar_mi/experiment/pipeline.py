@@ -14,9 +14,16 @@ from lidar_mi.atmosphere.line import Line
 from lidar_mi.experiment.graph import Graph, Stage
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.coherent_lines import check_scan, coherent_lines, passing_air
 from lidar_mi.experiment.stages.error_budget import error_budgets
 from lidar_mi.experiment.stages.eye_safety import scan_safety
 from lidar_mi.experiment.stages.image_remarks import image_remarks
+from lidar_mi.experiment.stages.line_retrieval import (
+    has_profiles,
+    has_slices,
+    line_vortices,
+    line_winds,
+)
 from lidar_mi.experiment.stages.lines import (
     check_lines,
     measure_lines,
@@ -67,6 +74,7 @@ from lidar_mi.experiment.stages.vortices import (
 from lidar_mi.experiment.stages.winds import check_windows, cross_flow_winds
 from lidar_mi.experiment.truth.extinction import Truth, true_air
 from lidar_mi.experiment.truth.flows import Flows, read_flows
+from lidar_mi.experiment.truth.passing_wake import PassingWake
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.phase import Scatterer
@@ -82,7 +90,7 @@ RING_RETRIEVAL = "doppler_retrieve"
 
 def has_wake(experiment: Experiment) -> bool:
     """Whether a backscatter lidar observes a wake."""
-    return experiment.wake is not None
+    return experiment.imaged_wake is not None
 
 
 def has_volume(experiment: Experiment) -> bool:
@@ -102,14 +110,14 @@ def is_without_volume(experiment: Experiment) -> bool:
 
 def has_error_budget(experiment: Experiment) -> bool:
     """Whether winds are also retrieved without each cause of error."""
-    return experiment.wake is not None and experiment.retrieval.error_budget
+    return has_wake(experiment) and experiment.retrieval.error_budget
 
 
 def has_image_vortices(experiment: Experiment) -> bool:
     """Whether vortex pairs are fitted to the backscatter lidar's measurements alone."""
     fitted = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
     alone = experiment.volume is None and experiment.sensor is None
-    return experiment.wake is not None and fitted and alone
+    return has_wake(experiment) and fitted and alone
 
 
 def has_vortices(experiment: Experiment) -> bool:
@@ -134,7 +142,7 @@ def has_given_samples(experiment: Experiment) -> bool:
 STAGES = (
     # the truth, the scans, the air
     Stage("footprint", Footprint, preflight=True),
-    Stage("flows", read_flows, preflight=True, timing="truth"),
+    Stage("flows", read_flows, has_wake, preflight=True, timing="truth"),
     Stage("truth", true_air, preflight=True, timing="truth"),
     Stage("plans", scan_plans, preflight=True, timing="truth"),
     Stage("air", scattering_air, has_wake, preflight=True),
@@ -170,6 +178,11 @@ STAGES = (
     Stage("v_los", line_of_sight_winds, timing=RING_RETRIEVAL),
     Stage("ring_budget", ring_budget, timing=RING_RETRIEVAL),
     Stage("exposure", exposure, figure_only=True),
+    # the coherent lidar on the ground
+    Stage("passing_air", passing_air, preflight=True, check=check_scan, timing="truth"),
+    Stage("coherent_lines", coherent_lines, timing="lines"),
+    Stage("line_winds", line_winds, has_profiles, timing="retrieve"),
+    Stage("line_vortices", line_vortices, has_slices, timing="retrieve"),
     # both as one sensor
     Stage("requirements", requirement_tables, preflight=True),
     Stage("slab_wind", slab_wind, has_sensor, preflight=True),
@@ -219,6 +232,10 @@ class Results(TypedDict, total=False):
     v_los: xr.Dataset
     ring_budget: RingBudget
     exposure: Exposure
+    passing_air: PassingWake
+    coherent_lines: xr.Dataset
+    line_winds: xr.Dataset
+    line_vortices: xr.Dataset
     requirements: Mapping[tuple[str, str], RequirementTable]
     slab_wind: xr.Dataset
     states: xr.Dataset

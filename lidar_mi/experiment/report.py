@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from lidar_mi.assessment.figures import backscatter as backscatter_figures
+from lidar_mi.assessment.figures import coherent as coherent_figures
 from lidar_mi.assessment.figures import doppler as doppler_figures
 from lidar_mi.assessment.figures import error_budget as budget_figures
 from lidar_mi.assessment.figures import pointing as pointing_figures
@@ -15,6 +16,7 @@ from lidar_mi.assessment.figures import vortices as vortex_figures
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.assessment.metrics.sensor import COMPONENTS
 from lidar_mi.assessment.report.backscatter import backscatter_chapter
+from lidar_mi.assessment.report.coherent import coherent_chapter
 from lidar_mi.assessment.report.doppler import doppler_chapter
 from lidar_mi.assessment.report.error_budget import budget_chapter
 from lidar_mi.assessment.report.page import Chapter
@@ -107,7 +109,7 @@ def _error_budget(
 def _doppler(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
-    doppler = experiment.doppler
+    doppler = experiment.fringes
     assert doppler is not None  # whose results these are
     drawn = doppler_figures.draw_all(
         folder,
@@ -136,6 +138,19 @@ def _sensor(
     return sensor_chapter(experiment, metrics, verdicts, drawn, vectors)
 
 
+def _coherent(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
+    lines, vortices = results["coherent_lines"], results.get("line_vortices")
+    if vortices is not None:
+        drawn = coherent_figures.draw_slices(folder, lines, vortices, log)
+    elif "line_winds" in results:
+        drawn = coherent_figures.draw_profiles(folder, results["line_winds"], log)
+    else:
+        drawn = coherent_figures.draw_stare(folder, lines, log)
+    return coherent_chapter(metrics, drawn, vortices)
+
+
 def _vortices(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
@@ -154,6 +169,7 @@ _CHAPTERS: tuple[tuple[str, str, Callable[..., Chapter]], ...] = (
     ("pointing", "figures", _pointing),
     ("error_budget", "figures", _error_budget),
     ("v_los", "doppler_figures", _doppler),
+    ("coherent_lines", "figures", _coherent),
     ("lines", "figures", _sensor),
     ("vortices", "figures", _vortices),
 )

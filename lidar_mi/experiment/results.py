@@ -10,6 +10,7 @@ import xarray as xr
 from rich.console import Console
 
 from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.errors import InputError
 from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import Results
@@ -18,6 +19,8 @@ from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.tables import Table, Tabular
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from lidar_mi.experiment.stages.vortices import VortexFits
 
 
@@ -84,8 +87,8 @@ class Run(Tabular):
 
     @property
     def lines(self) -> xr.Dataset | None:
-        """Lines of sight of the Doppler lidar through the slab, in a sensor of both lidars."""
-        return self.results.get("lines")
+        """Lines of sight: through the slab, in a sensor of both lidars, or of a coherent lidar."""
+        return self.results.get("lines", self.results.get("coherent_lines"))
 
     @property
     def wind3d(self) -> xr.Dataset | None:
@@ -112,7 +115,7 @@ class Run(Tabular):
         """The answer, the experiment and its main errors."""
         from lidar_mi.assessment.report.summary import summary
 
-        doppler = self.experiment.doppler
+        doppler = self.experiment.fringes
         seconds = sum(self.seconds.values())
         rows = [("experiment", self.experiment.name), ("computed in", f"{seconds:.1f} s")]
         if self.folder is not None:
@@ -127,15 +130,38 @@ class Run(Tabular):
         first = [Table("answer", [(line,) for line in self.answer])] if self.metrics else []
         return [*first, Table("run", rows), *summary(self.metrics, averaged), *vortices]
 
-    def thumbnail(self) -> bytes | None:
-        """Image of the backscatter lidar and cross-flow wind, where there are any, as PNG."""
+    def plot(self) -> "Figure":
+        """Image of the backscatter lidar and cross-flow wind, side by side.
+
+        Returns
+        -------
+        matplotlib Figure
+
+        Raises
+        ------
+        InputError
+            A run without images of the backscatter lidar, or without wind from them.
+        """
         from lidar_mi.assessment.figures.backscatter import overview
         from lidar_mi.io.png import png_bytes
 
         if self.truth is None or "wind" not in self.results or not self.scans:
-            return None
+            raise InputError(
+                f"plot: {self.experiment.name} has no wind from images of the backscatter lidar; "
+                "expected one that has, or its folder's figures"
+            )
         figure, _ = overview(self.truth, self.scans, self.results["wind"], self.cores)
-        return png_bytes(figure)
+        # a notebook shows figures that pyplot made; of others it asks this
+        vars(figure)["_repr_png_"] = lambda: png_bytes(figure)
+        return figure
+
+    def thumbnail(self) -> bytes | None:
+        """The `plot` as PNG; None: there is nothing to draw."""
+        from lidar_mi.io.png import png_bytes
+
+        if self.truth is None or "wind" not in self.results or not self.scans:
+            return None
+        return png_bytes(self.plot())
 
     def show(self) -> None:
         """Show the results: in a notebook with an image, else as text, and the report in a browser.

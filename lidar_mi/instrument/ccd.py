@@ -40,9 +40,9 @@ class CCD(Description):
 
     quantum_efficiency: Annotated[
         Number, Within(1e-9, 1, "one photoelectron per photon at most")
-    ] = Field(1.0, description="photoelectrons per photon")
+    ] = Field(1.0, description="photoelectrons per photon; 1, as the paper counts detected photons")
     read_noise: Annotated[Number, Within(0, 1e6, "capacity of the largest pixels")] = Field(
-        5.0, description="rms per pixel"
+        5.0, description="rms per pixel of the image, electrons, behind a gain"
     )
     dark_current: Annotated[Frequency, Within(0, 1e12, "one electron per picosecond")] = Field(
         quantity("1 Hz"), description="photoelectrons per pixel in the dark"
@@ -51,7 +51,11 @@ class CCD(Description):
         quantity("10 ms"), description="from one read-out to the next; a laser of 100 Hz"
     )
     full_well: Annotated[Number, Within(1, 1e12, "from a single photon to whole rows added")] = (
-        Field(20e3, description="most a pixel of the chip holds; no blooming")
+        Field(
+            20e3,
+            description="capacity of a pixel of the chip, electrons; the maxima of the rings must "
+            "stay below",
+        )
     )
     register_well: (
         Annotated[Number, Within(1, 1e12, "from a single photon to whole rows added")] | None
@@ -59,10 +63,14 @@ class CCD(Description):
         None, description="most a cell of the output register holds, multiplied; null: no limit"
     )
     binning: Annotated[int, Within(1, 10000, "one pixel from a whole chip")] = Field(
-        1, description="pixels of the chip along each side of a pixel of the image"
+        1,
+        description="pixels of the chip along each side of a pixel of doppler.camera, which is "
+        "read once",
     )
     multiplication: Literal["none", "emccd", "iccd"] = Field(
-        "none", description="gain before the read-out"
+        "none",
+        description="gain before the read-out: a register on the chip, or an image intensifier in "
+        "front of it",
     )
     multiplication_gain: Annotated[
         Number, Within(1, 1e7, "from no gain to two channel plates in a row")
@@ -80,7 +88,9 @@ class CCD(Description):
         0, description="selects the chip: its responses are the same in every image"
     )
     hot_pixels: Annotated[Number, Within(0, 0.1, "no camera is sold with more")] = Field(
-        0.0, description="fraction of pixels that have a dark current of their own"
+        0.0,
+        description="fraction of the pixels that are hot; response_seed selects them, a "
+        "calibration masks them",
     )
     hot_current: Annotated[Frequency, Within(0, 1e12, "as of the dark current")] = Field(
         quantity("500 kHz"), description="photoelectrons per hot pixel in the dark"

@@ -53,7 +53,7 @@ class Detector(Description):
     speckle: bool = Field(True, description="whether the coherence of the laser causes speckle")
     line_width: Annotated[
         Frequency, Within(1, 1e15, "from the narrowest lasers to white light")
-    ] = Field(quantity("30 GHz"), description="of the echo, full width half maximum")
+    ] = Field(quantity("30 GHz"), description="of the echo, full width at half maximum")
     speckle_modes: (
         Annotated[Number, Within(1, 1e15, "from one mode to white light for a second")] | None
     ) = Field(

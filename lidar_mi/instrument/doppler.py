@@ -56,7 +56,11 @@ class DopplerLidar(Description):
     )
     laser_width: Annotated[
         Frequency, Within(1, 1e13, "from the narrowest lasers to 4 nm at 355 nm")
-    ] = Field(quantity("100 MHz"), description="full width half maximum")
+    ] = Field(
+        quantity("100 MHz"),
+        description="full width at half maximum of the emitted line, at least the Fourier limit "
+        "of the pulse",
+    )
     beam_radius: Annotated[
         Length, Within(1e-6, 10, "from the mode of a fibre to the largest telescope")
     ] = Field(0.025, description="of the outgoing beam")
@@ -73,7 +77,9 @@ class DopplerLidar(Description):
         Number, Within(1e-9, 1, "from a blocking filter of 90 dB to all light")
     ] = Field(0.15, description="efficiency of the lidar")
     counted: Literal["detected", "before_etalon"] = Field(
-        "detected", description="which photons the lidar equation counts"
+        "detected",
+        description="photons that the lidar equation counts: detected on the CCD, or in front of "
+        "the etalon",
     )
     range: Annotated[
         Length, Within(0.1, 100000, "from a wind tunnel to the top of the atmosphere")
@@ -92,14 +98,14 @@ class DopplerLidar(Description):
     )
     aerosol_fraction: Annotated[Number, Within(0, 1, "definition of a fraction")] = Field(
         0.0,
-        description="of the backscattered photons",
+        description="fraction of the backscattered photons that aerosol scatters",
         validation_alias=AliasChoices("aerosol_fraction", "aerosol_share"),  # its former name
     )
     line_shape: Literal["rayleigh", "rayleigh_brillouin"] = Field(
         "rayleigh_brillouin", description="spectral line of the molecular backscatter"
     )
     sky_radiance: Annotated[SpectralRadiance, Within(0, 1e14, "the disc of the sun has 3e13")] = (
-        Field(quantity("0.18 W/m^2/sr/nm"), description="background")
+        Field(quantity("0.18 W/m^2/sr/nm"), description="spectral radiance of the sky's background")
     )
     filter_bandwidth: Annotated[
         Length, Within(1e-16, 1e-5, "from 100 kHz at 355 nm to no filter")

@@ -61,7 +61,10 @@ class Etalon(Description):
 
     gap: Annotated[
         Length, Within(1e-6, 1, "from a few wavelengths to the coherence length of the laser")
-    ] = Field(13.7e-3, description="distance of the mirrors")
+    ] = Field(
+        13.7e-3,
+        description="distance of the mirrors; derived, as the paper does not state its etalon",
+    )
     order_fraction: Annotated[Number, Within(0, 1, "definition of a fraction", "[)")] | None = (
         Field(
             0.5,
@@ -90,7 +93,7 @@ class Etalon(Description):
         description="(index, thickness) from plate to gap, instead of reflectivity and absorption",
     )
     plate_index: Annotated[Number, Within(1, 4, "from air to germanium")] = Field(
-        1.476, description="of the plates; fused silica"
+        1.476, description="refractive index of the plates; default: fused silica"
     )
 
     @model_validator(mode="after")

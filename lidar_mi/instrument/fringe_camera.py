@@ -66,7 +66,9 @@ class FringeCamera(Description):
         780, description="pixels of a column"
     )
     centre: tuple[_Place, _Place] | None = Field(
-        None, description="(x, y) of the rings in pixels; default: the middle of the image"
+        None,
+        description="(x, y) of the rings, pixels to the right and down from the top left one; "
+        "default: the middle of the image",
     )
     illumination_radius: Annotated[
         Length, Within(1e-6, 1000, "from a pixel to wider than any CCD", or_infinite=True)

@@ -19,7 +19,11 @@ class BackscatterLidar(Description):
 
     wavelength: Annotated[
         Length, Within(1e-7, 2e-5, "from the vacuum ultraviolet to the far infrared")
-    ] = Field(532e-9, description="vacuum wavelength of the laser")
+    ] = Field(
+        532e-9,
+        description="vacuum wavelength of the laser; that of named aerosols, photon energies and "
+        "the channel of RGB variants, too",
+    )
     beam_radius: Annotated[
         Length, Within(1e-6, 10, "from the mode of a fibre to the largest telescope")
     ] = Field(0.1, description="1/e^2 radius of the beam at the aperture")
@@ -35,9 +39,15 @@ class BackscatterLidar(Description):
     )
     pulse_energy: Annotated[
         Energy, Within(1e-15, 10000, "from thousands of photons to the lasers of fusion")
-    ] = Field(1e-3, description="energy of a pulse in one beam")
+    ] = Field(
+        1e-3,
+        description="energy of a pulse in one beam; images are normalised by it, the detector's "
+        "noise depends on it",
+    )
     pulse_duration: Annotated[Time, Within(0, 0.001, "a millisecond is 150 km of air")] = Field(
-        0.0, description="full width at half maximum of the pulse"
+        0.0,
+        description="full width at half maximum of the Gaussian pulse, which limits the range "
+        "resolution",
     )
     aperture_radius: Annotated[
         Length, Within(1e-6, 10, "from the core of a fibre to the largest telescope")

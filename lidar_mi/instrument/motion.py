@@ -73,9 +73,13 @@ class Attitude(Description):
 class Motion(Description):
     """How the platform departs from straight flight at its speed; nothing: not at all."""
 
-    trajectory: str | None = Field(None, description="file of t, x, y, z, roll, pitch, yaw")
+    trajectory: str | None = Field(
+        None, description="CSV or NetCDF file of t, x, y, z, roll, pitch, yaw"
+    )
     sinusoids: tuple[Sinusoid, ...] = Field((), max_length=1000, description="added up")
-    attitude: Attitude | None = Field(None, description="random, by turbulence")
+    attitude: Attitude | None = Field(
+        None, description="random attitude, by turbulence; not with trajectory"
+    )
     scanner_jitter: Annotated[Angle, Within(0, 0.1, "small angles only")] = Field(
         0.0, description="rms of every beam, on both axes, independent of each other"
     )

@@ -65,7 +65,11 @@ class Reported(Description):
     noise: Noise = Noise()
     noise_bandwidth: (
         Annotated[Frequency, Within(1e-6, 1e6, "from a day's drift to a sample each beam")] | None
-    ) = Field(None, description="of the noise; default: one error for all of a scan")
+    ) = Field(
+        None,
+        description="of the noise; default: one error for all beams of a scan, another for the "
+        "next",
+    )
     latency: Annotated[Time, Within(0, 10, "the slowest display")] = Field(
         0.0, description="age of what is reported"
     )

@@ -89,7 +89,7 @@ class ScanTiming(Description):
         "serpentine", description="order of the beams"
     )
     duration: Annotated[Time, Within(0, 10000, "the life of a wake")] | None = Field(
-        None, description="of a scan, with its turns; 0: all beams at once"
+        None, description="of a scan, with its turns, at most platform.dt; 0: all beams at once"
     )
     beam_rate: (
         Annotated[Frequency, Within(1e-4, 1e12, "from a beam in 3 h to one a picosecond")] | None
@@ -101,19 +101,29 @@ class ScanTiming(Description):
         0.0, description="of a turn between two rows, with raster and serpentine"
     )
     slow: Literal["rows", "columns"] = Field(
-        "rows", description="what follows one another: whole rows or whole columns"
+        "rows",
+        description="slow axis of raster and serpentine: row after row or column after column",
     )
     cycles: tuple[_Cycles, _Cycles] | None = Field(
-        None, description="in azimuth and elevation (lissajous), or of both prisms (risley)"
+        None,
+        description="in azimuth and elevation (lissajous, above 0), or of both prisms (risley, of "
+        "either sign), without a common divisor",
     )
-    table: str | None = Field(None, description="file of t, azimuth, elevation")
+    table: str | None = Field(
+        None, description="CSV or NetCDF file of t, azimuth, elevation, with pattern: table"
+    )
     max_rate: (
         Annotated[AngularRate, Within(1e-9, 1e9, "from the stars' to mirrors of a nanosecond")]
         | None
-    ) = Field(None, description="of the scanner, on each axis")
+    ) = Field(
+        None, description="largest angular rate of the scanner on each axis; default: unlimited"
+    )
     max_acceleration: (
         Annotated[AngularAcceleration, Within(1e-12, 1e18, "mirrors of a nanosecond")] | None
-    ) = Field(None, description="of the scanner, on each axis")
+    ) = Field(
+        None,
+        description="largest angular acceleration of the scanner on each axis; default: unlimited",
+    )
 
     @model_validator(mode="after")
     def _keys_of_the_pattern(self) -> Self:

@@ -2,9 +2,10 @@
 
 A scan's file has the pilot's view: top row = largest z, left column = largest y. Layers are
 ``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
-``gate000.order1.S0``, ... where orders of scattering were separated), and ``Y``, the attenuated
-backscatter of the first gate, corrected for range, gate length and the environment's
-transmittance, which any viewer shows. Files of a run also have
+``gate000.order1.S0``, ... where orders of scattering were separated; ``gate000.S1_stderr`` ...
+``gate000.S3_stderr`` and ``gate000.S0_S1_correlation``, of the errors, where light is polarised),
+and ``Y``, the attenuated backscatter of the first gate, corrected for range, gate length and the
+environment's transmittance, which any viewer shows. Files of a run also have
 ``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr``, and
 with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
 ``Y_noise_std``. Files of a scan whose beams have times of their own have ``beam_time``,
@@ -317,9 +318,11 @@ def unpack(
 
 def label_scan(scan: "xr.Dataset") -> "xr.Dataset":
     """The same scan with CF names and units on its variables."""
+    import lidar_mi.plots  # noqa: F401 - scan.lidar.plot()
+
     meaning = _MEANING | {
         "S0_largest_share": "largest share of one Monte Carlo sample in the variance of S0",
-        "S1_stderr": "Monte Carlo standard error of S1",
+        **{f"S{k}_stderr": f"Monte Carlo standard error of S{k}" for k in (1, 2, 3)},
         "S0_S1_correlation": "correlation of the Monte Carlo errors of S0 and S1",
         "depolarization": "linear depolarisation ratio",
         "depolarization_stderr": "standard error of the linear depolarisation ratio",

@@ -136,6 +136,7 @@ def render_scans(
     xr.Dataset
         S0 ... S3, S0_stderr, S0_largest_share (of one sample in the variance) and, with more than
         one order, each order's S0 as ``orderK.S0``, dims (gate, z, y); Y (z, y); y and z ascending.
+        Of polarised variants also S1_stderr, S2_stderr, S3_stderr and S0_S1_correlation.
         Where a plan has beams, also ``beam_time`` (s) and ``y_reported``, ``z_reported`` (m), where
         a beam as reported crosses the plane in the middle of the gates. One scan at a time, as soon
         as it is rendered.

@@ -12,11 +12,12 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.errors import InputError
-from lidar_mi.io.exr import label_scan, unpack, write_fringes, write_scan
+from lidar_mi.io.exr import write_fringes, write_scan
 from lidar_mi.io.library_name import is_text
 from lidar_mi.io.text import read_text
 from lidar_mi.io.xml import check_scene_file
 from lidar_mi.rendering.fringes import render_image
+from lidar_mi.rendering.labelled import scan_dataset
 from lidar_mi.rendering.memory import (
     MOST_AT_ONCE,
     PROGRAM,
@@ -88,7 +89,7 @@ def render_file(
         image.attrs["scene"] = scene_path.name
         write_fringes(out, image)
         return image
-    integrator.shares = True
+    integrator.shares, integrator.covariance = True, bool(mi.is_polarized)
     # what a scene does not say is the plugin's default
     given = integrator.samples_per_pass
     integrator.samples_per_pass = samples_at_once(
@@ -98,7 +99,7 @@ def render_file(
     what = f"{scene_path}: {sensor.beam_count} beams x {sensor.gate_count} gates"
     check_memory(PROGRAM + needed, None, what, "fewer beams, gates or orders")
     tensor = within_memory(integrator, lambda: np.array(mi.render(scene, spp=samples, seed=seed)))
-    scan = _as_dataset(tensor, integrator.quantities(), sensor)
+    scan = scan_dataset(tensor, integrator.quantities(), sensor)
     scan.attrs |= {
         "software": f"lidar-mi {__version__}",
         "scene": scene_path.name,
@@ -153,57 +154,6 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):  # no value of a scene need be a possible name
         return False
-
-
-def _as_dataset(image: np.ndarray, names: list[str], sensor: Any) -> xr.Dataset:
-    """The rendered tensor with the beams' places in the middle of the gates as axes.
-
-    A direction table need not form a grid; then pixel numbers serve as axes (``grid`` = 0).
-    """
-    rows, columns, _ = image.shape
-    gates = sensor.gate_count
-    start, stop = sensor.m_gate_start[0], sensor.m_gate_stop[0]
-    beams, origins = (
-        np.array(table, float).reshape(rows, columns, 3)[::-1, ::-1]
-        for table in (sensor.m_directions, sensor.m_origins)
-    )
-    centre = (start + stop) / 2
-    grid = bool((beams[..., 0] > 1e-6).all())
-    if grid:
-        along = (centre - origins[..., 0]) / beams[..., 0]
-        y, z = (origins[..., axis] + along * beams[..., axis] for axis in (1, 2))
-        grid = np.ptp(y, 0).max() < 1e-6 * centre and np.ptp(z, 1).max() < 1e-6 * centre
-    if grid:
-        y, z = y[0], z[:, 0]
-    else:
-        y, z = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
-    variables = unpack(image, names, gates)
-    oblique = 1 / beams[..., 0] if sensor.gate_kind == "planar" else 1.0
-    length = (stop - start) / gates * oblique
-    middle = (start + (stop - start) / gates / 2 - origins[..., 0]) * oblique
-    times = np.array(sensor.m_times, float).reshape(rows, columns)[::-1, ::-1]
-    if times.any():
-        variables["beam_time"] = ("z", "y"), times.astype(np.float32)
-    area = np.pi * sensor.m_aperture[0] ** 2
-    variables["Y"] = (("z", "y"), variables["S0"][1][0] * middle**2 / (area * length))
-    attributes = {
-        "grid": int(grid),
-        "gate_kind": sensor.gate_kind,
-        "gate_count": gates,
-        "gate_start": start,
-        "gate_stop": stop,
-        "wavelength": sensor.laser.wavelength,
-        "pulse_energy": sensor.laser.pulse_energy,
-        "pulse_duration": sensor.laser.pulse_duration,
-        "stokes_emitted": list(sensor.laser.stokes),
-        "beam_radius": sensor.laser.m_radius[0],
-        "divergence_full": 2 * sensor.laser.m_divergence_half[0],
-        "aperture_radius": sensor.m_aperture[0],
-        "fov_half": float(np.arctan(sensor.m_fov_tan[0])),
-    }
-    return label_scan(
-        xr.Dataset(variables, coords={"gate": np.arange(gates), "y": y, "z": z}, attrs=attributes)
-    )
 
 
 def _reason(error: Exception) -> str:

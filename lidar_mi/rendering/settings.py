@@ -40,12 +40,24 @@ class RenderSettings(Description):
     samples_per_beam: (
         Literal["auto"]
         | Annotated[int, Within(2, 2**31 - 1, "a standard error needs two; counted in 31 bits")]
-    ) = Field("auto", description="by the detector's noise; or so many")
+    ) = Field(
+        "auto",
+        description="Monte Carlo samples per beam, over all its gates: chosen by the detector's "
+        "noise, or this number",
+    )
     monte_carlo_fraction: Annotated[
         Number, Within(1e-4, 100, "from a hundredth of the detector's noise to ten times it")
-    ] = Field(0.1, description="variance of the simulation's noise over that of the detector's")
+    ] = Field(
+        0.1,
+        description="variance of the simulation's noise over that of the detector's, mean over "
+        "the beams: the target of auto",
+    )
     max_samples: Annotated[Number, Within(1e3, 1e15, "from a small image to a year of them")] = (
-        Field(3e7, description="of all beams of an image, where their number is chosen")
+        Field(
+            3e7,
+            description="samples of all beams of an image that auto takes at most: about half a "
+            "minute on two cores",
+        )
     )
     max_order: Annotated[int, Within(1, 64, "higher orders are below single precision")] = Field(
         4, description="scattering orders; 1 = single scattering"
@@ -59,7 +71,7 @@ class RenderSettings(Description):
         Field(
             1,
             description="light paths, of which the single scattering of a sample takes one by its "
-            "contribution",
+            "contribution; 16 for long pulses in bright slabs",
         )
     )
     samples_per_pass: _PerPass = Field(
@@ -68,7 +80,9 @@ class RenderSettings(Description):
         "many as it holds",
     )
     memory: Annotated[Memory, _CEILING] | None = Field(
-        None, description="that a run may take; default: half of the machine's"
+        None,
+        description="that a run may take, else it is refused before it starts; default: half of "
+        "the machine's (or container's)",
     )
 
     @property
@@ -100,10 +114,14 @@ class FringeSettings(Description):
         int, Within(2, 2**20 - 1, "a standard error needs two; it is then 0.1 %")
     ] = Field(16, description="light paths, on average")
     estimator: Literal["camera", "forward", "analog"] = Field(
-        "camera", description="from the pixels; plane waves forward; paths transmitted or rejected"
+        "camera",
+        description="paths traced from the pixels; plane waves through the lens to the CCD; or "
+        "these with each photon transmitted or rejected",
     )
     line_shape: Literal["folded", "sampled"] = Field(
-        "folded", description="mean over the line in closed form; a frequency for every path"
+        "folded",
+        description="transmission averaged over the line in closed form, or a frequency sampled "
+        "for each path",
     )
     lens: Literal["ideal", "singlet"] = Field(
         "ideal", description="ideal, or a singlet of two surfaces with its aberrations"

@@ -29,7 +29,9 @@ def command(monkeypatch):
     return run
 
 
-@pytest.mark.parametrize("name", ["design_map", "which_knob", "luck", "scan_patterns"])
+@pytest.mark.parametrize(
+    "name", ["design_map", "which_knob", "luck", "scan_patterns", "airport_design"]
+)
 def test_shipped_campaigns_can_be_run(tmp_path, name):
     assert name in campaigns()
     # every point is checked; of the coarse version, too

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster, WorkerPlugin
 
+from lidar_mi import __version__
 from lidar_mi.campaign import engine, worker
 from lidar_mi.campaign.collect import collect, open_campaign
 from lidar_mi.campaign.engine import connected, execute, prepare_campaign, run_campaign
@@ -172,7 +173,9 @@ def test_what_a_campaign_refuses(tmp_path, client):
     with pytest.raises(InputError, match=r"no campaign\.yaml in it"):
         open_campaign(tmp_path / "nothing")
     record = tmp_path / "out" / "campaign.yaml"
-    record.write_text(record.read_text().replace("version: 0.1.0", "version: 0.0.9"))
+    text = record.read_text()
+    assert f"version: {__version__}" in text
+    record.write_text(text.replace(f"version: {__version__}", "version: 0.0.9"))
     with pytest.raises(InputError, match=r"version 0.0.9; expected another folder"):
         run_campaign(path, tmp_path / "out", client=client)
 

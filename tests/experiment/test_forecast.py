@@ -36,7 +36,7 @@ def planned(**changes):
 
 
 def brightness(experiment, extinction, plan):
-    air = [xr.DataArray(np.full((1, 5, 5), extinction), dims=("x", "y", "z"))] * 2
+    air = xr.DataArray(np.full((1, 5, 5), extinction), dims=("x", "y", "z"))
     mapping = experiment.wake.extinction
     call(check_brightness, experiment, mapping=mapping, extinction=air, plan=plan, albedo=1.0)
 

@@ -59,7 +59,9 @@ def test_a_fault_of_an_experiment_file(tmp_path, command, text):
     assert not loaded & (COMPUTING | READING) and "pydantic" in loaded
 
 
-@pytest.mark.parametrize("name", ["wake_backscatter", "wake_sensor", "fringes_paper", "encounter"])
+@pytest.mark.parametrize(
+    "name", ["wake_backscatter", "wake_sensor", "fringes_paper", "airport", "encounter"]
+)
 def test_check(name):
     loaded = modules_of_command("check", name)
     assert not loaded & (COMPUTING | {"lidar_mi.experiment.preflight.cost"})

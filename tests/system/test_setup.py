@@ -37,9 +37,10 @@ case "$*" in
         mkdir -p .venv/bin; cp "$0" .venv/bin/python
         [ ! -e "$STATE/no_venv" ] ;;
     "-m pip install "*)
-        echo pip >>"$STATE/log"
+        echo "pip${PIP_EXTRA_INDEX_URL:+ $PIP_EXTRA_INDEX_URL}" >>"$STATE/log"
         if [ -e "$STATE/killed" ]; then kill -KILL $PPID; fi
         [ ! -e "$STATE/no_network" ] ;;
+    *download.pytorch.org*) [ -e "$STATE/cpu_index" ] ;;
     "-c import lidar_mi") ;;
     *) exec "$REAL_PYTHON" "$@" ;;
 esac
@@ -191,6 +192,33 @@ def test_without_network_it_reports_this_and_can_be_repeated(machine):
     machine.log()
     assert machine.set_up().returncode == 0
     assert machine.log() == ["pip"]
+
+
+CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+
+
+@pytest.mark.parametrize(
+    ("gpu", "answers", "given", "asked"),
+    [
+        (False, True, {}, f"pip {CPU_INDEX}"),
+        (False, True, {"PIP_EXTRA_INDEX_URL": "https://mine"}, f"pip https://mine {CPU_INDEX}"),
+        (False, True, {"PIP_EXTRA_INDEX_URL": CPU_INDEX}, f"pip {CPU_INDEX}"),
+        (False, False, {}, "pip"),
+        (True, True, {}, "pip"),
+    ],
+)
+def test_torch_for_the_processor_where_there_is_no_gpu(machine, gpu, answers, given, asked):
+    """It says what it did, unless there is nothing to choose."""
+    machine.program("nvidia-smi", f"#!/bin/sh\nexit {int(not gpu)}\n")
+    if answers:
+        machine.fact("cpu_index")
+    done = machine.set_up(**given)
+    assert done.returncode == 0, done.stderr
+    assert machine.log() == ["venv", asked]
+    assert ("no NVIDIA GPU here" in done.stdout) == (
+        asked.endswith(CPU_INDEX) and given != {"PIP_EXTRA_INDEX_URL": CPU_INDEX}
+    )
+    assert ("did not answer within 3 seconds" in done.stdout) == (not gpu and not answers)
 
 
 def test_without_the_venv_module_it_prints_what_to_install(machine):

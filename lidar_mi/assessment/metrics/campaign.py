@@ -102,6 +102,10 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
         *vortex,
         "sensor.rmse_v_los",
         "sensor.doppler.pulses_needed",
+        "coherent.vortices.circulation_error",
+        "coherent.vortices.place_error",
+        "coherent.vortices.valid_fraction",
+        *(f"coherent.winds.rmse_{name}" for name in "uvw"),
         *(
             f"encounter.{mode}.largest_roll"
             for mode in ("off", "autopilot", "feedforward", "perfect")

@@ -4,6 +4,8 @@ import functools
 
 _WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_", "monte_carlo_")
 _NAMED = {
+    "coherent.noise": "m/s",
+    "coherent.cnr": "dB",
     "pointing.scan_time": "s",
     "pointing.rms_y": "m",
     "pointing.rms_z": "m",

@@ -24,6 +24,7 @@ from lidar_mi.assessment.metrics.requirements import (
 )
 from lidar_mi.assessment.metrics.sensor import without_skill
 from lidar_mi.assessment.metrics.velocities import READERS
+from lidar_mi.assessment.report.coherent_lidar import coherent_answer
 from lidar_mi.assessment.report.simulation import simulation_sentence
 from lidar_mi.tables import with_error
 from lidar_mi.units import shown
@@ -59,7 +60,7 @@ def answer(
     simulated = simulation_sentence(experiment, metrics)
     lines = [simulated] if simulated else []
     lines += [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
-    speed = experiment.platform.speed if experiment.wake else 0.0
+    speed = experiment.platform.speed if experiment.imaged_wake else 0.0
     unskilled = without_skill(metrics)
     lines += [
         verdict(table, findings, unskilled) for table, findings in judged if table.applies_at(speed)
@@ -104,8 +105,10 @@ def _wind(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> It
         yield _sensor(experiment, metrics)
     elif f"{Source.BACKSCATTER}.mc_relative_error" in metrics:
         yield _images(experiment, metrics)
-    elif experiment.doppler:
-        yield from _rings(experiment.doppler, metrics)
+    elif experiment.fringes:
+        yield from _rings(experiment.fringes, metrics)
+    elif experiment.coherent:
+        yield from coherent_answer(metrics)
 
 
 def _sensor(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
@@ -172,7 +175,7 @@ def _stated(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> 
     """Standard errors that do not hold here, of the winds that the answer names."""
     if "sensor.vectors" in metrics:
         yield from _misstated("both lidars", metrics, "sensor.", "uvw")
-    elif experiment.wake:
+    elif experiment.imaged_wake:
         source = Source.NOISY if experiment.detector else Source.BACKSCATTER
         settings = experiment.volume or experiment.retrieval
         for method in settings.methods:

@@ -15,6 +15,7 @@ from lidar_mi.assessment.digits import percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
+from lidar_mi.assessment.report.coherent_lidar import coherent_described
 from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.units import shown
@@ -191,8 +192,8 @@ def simulated(
 ) -> list[tuple[str, str]]:
     """What was simulated, as (name, text): wake, instruments, seed, versions."""
     rows = []
-    if experiment.wake:
-        wake, scan, lidar = experiment.wake, experiment.scan, experiment.lidar
+    if experiment.imaged_wake:
+        wake, scan, lidar = experiment.imaged_wake, experiment.scan, experiment.lidar
         if wake.vortex_pair:
             pair = wake.vortex_pair
             model = pair.model.replace("_", "-").title()
@@ -235,8 +236,10 @@ def simulated(
         chosen = experiment.volume or experiment.retrieval
         methods = ", ".join(METHOD_NAMES[name] for name in chosen.methods)
         rows.append(("winds by", methods))
-    if experiment.doppler:
-        other = experiment.doppler.lidar
+    if experiment.coherent:
+        rows += coherent_described(experiment.coherent, experiment.wake)
+    if experiment.fringes:
+        other = experiment.fringes.lidar
         beam = (
             f"{shown(other.wavelength, 'nm')}, {shown(other.pulse_energy, 'mJ')}, "
             f"{other.range_bin:g} m at {other.range:g} m, in air of {other.altitude:g} m altitude"

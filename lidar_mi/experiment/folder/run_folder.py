@@ -52,6 +52,9 @@ RESULTS = {
     "wind_volume": "wind_volume.nc",
     "v_los": "v_los.nc",
     "lines": "lines_of_sight.nc",
+    "coherent_lines": "lines_of_sight.nc",
+    "line_winds": "wind_profiles.nc",
+    "line_vortices": "line_vortices.nc",
     "wind3d": "wind3d.nc",
     "vortices": "vortex.json",
 }
@@ -137,9 +140,10 @@ class RunFolder:
             )
         # results of another experiment must not be mistaken for those of this one
         drawn = [*self.figures.glob("*.png"), *self._those(PREVIEWS), self.log] if other else []
+        previews = [path.with_suffix(".png") for path in foreign]
 
         def remove_old() -> None:
-            for path in (*old, *drawn):
+            for path in (*old, *drawn, *previews):
                 path.unlink(missing_ok=True)
 
         # if the disk is full, the earlier run remains unchanged
@@ -183,7 +187,9 @@ class RunFolder:
         """As of `ImageStore`; an image that may be shared with other runs is also written there."""
         if self._shared:
             self._shared.store_part(part, value)
-        return self._images.store_part(part, value)
+        stored = self._images.store_part(part, value)
+        self.write_previews()  # the first thing to look at, long before the figures
+        return stored
 
     def _is_foreign(self, image: Path) -> bool:
         """Whether an image is of another experiment or version, or cannot be read."""
@@ -202,16 +208,19 @@ class RunFolder:
         return [path for pattern in patterns for path in self.path.glob(pattern)]
 
     def write_previews(self) -> None:
-        """Write a PNG of its layer Y beside each rendered image, to look at."""
+        """Write a PNG of its layer Y beside each rendered image without one, to look at."""
         from lidar_mi.io.png import write_preview
 
         for image in self._those(RENDERED):
-            write_preview(image.with_suffix(".png"), read_pixels(image))
+            preview = image.with_suffix(".png")
+            if not preview.exists():
+                write_preview(preview, read_pixels(image))
 
     def data_files(self) -> list[str]:
         """Names of the files beside the report, for links to them."""
         there = self._those((*RENDERED, *PREVIEWS))
-        there += [self.path / name for name in RESULTS.values() if (self.path / name).exists()]
+        names = dict.fromkeys(RESULTS.values())
+        there += [self.path / name for name in names if (self.path / name).exists()]
         return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
 
     def store_verdict(

@@ -17,6 +17,7 @@ from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.pipeline import Results
+from lidar_mi.experiment.preflight.coherent import coherent_rows, passage_rows
 from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.sensor import Sensor
@@ -74,20 +75,25 @@ def sections(
     # of the processor: other programs do not lengthen it
     start = time.process_time()
     prepared = experiment.prepare(asked, search_path, without_warnings(notice))
-    asked = prepared.experiment
-    preparation, results = time.process_time() - start, prepared.results
+    asked, results = prepared.experiment, prepared.results
+    if timed and asked.wake:
+        _ = results["truth"].extinction[1]  # which a run advects
+    preparation = time.process_time() - start
     chosen: Samples | None = None
-    if asked.wake:
+    if asked.imaged_wake:
         if sampled and asked.detector:
             needed = {name: results[name] for name in ("truth", "plans", "air", "flows")}
             chosen = call(chosen_samples, asked, **needed, log=Log(notice))
         truth, plan, air = results["truth"], results["plans"][0], results["air"]
-        yield from _backscatter(asked, asked.wake, truth, plan, air, chosen)
+        yield from _backscatter(asked, asked.imaged_wake, truth, plan, air, chosen)
         if asked.scan.timing:
             schedule = scan_schedule(asked.scan, plan, prepared.search_path)
             yield "scan of the backscatter lidar", _timing(asked, schedule)
-    if asked.doppler:
-        yield _doppler(asked.doppler)
+    if asked.fringes:
+        yield _doppler(asked.fringes)
+    if asked.coherent:
+        yield "coherent lidar", coherent_rows(asked.coherent)
+        yield "air that passes it", passage_rows(asked.coherent, results["passing_air"])
     if asked.sensor:
         yield _sensor(asked.sensor, asked.platform.speed, results["requirements"])
         if asked.sensor.timing:
@@ -218,13 +224,13 @@ def _time(asked: Experiment, results: Results, preparation: float) -> list[tuple
 def _memory(asked: Experiment, results: Results) -> tuple[str, str]:
     """Memory that a run takes, and that it may take."""
     beams = in_states = 0
-    if asked.wake:
+    if asked.imaged_wake:
         plan = results["plans"][0]
         beams = plan.y.size * plan.z.size
         in_states = call(values_of_states, asked, flows=results["flows"], plans=results["plans"])
     expected = call(Footprint, asked).bytes(beams, in_states) / 1e9
     # an experiment without a wake has a Doppler lidar
-    render = asked.render if asked.wake or not asked.doppler else asked.doppler.render
+    render = asked.render if asked.wake or not asked.fringes else asked.fringes.render
     allowed = ceiling(render.memory) / 1e9
     return "memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"
 

@@ -14,7 +14,9 @@ import xarray as xr
 
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.pipeline import Results, has_error_budget, has_vortices
+from lidar_mi.experiment.schema.coherent import CoherentDoppler
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.coherent_lines import line_scan
 from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images
 from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
 
@@ -51,7 +53,11 @@ RING_PEAK = 8e-8
 RING_BOUND = 6e-6
 """Seconds of a pixel, for the bound."""
 VORTICES = 2.5
-FIGURES = {"images": 8.0, "rings": 2.5, "sensor": 2.5}
+COHERENT_LINE, COHERENT_TURBULENCE = 6e-6, 10.0
+"""Seconds of a gate of a line of a coherent lidar; times so much in turbulence."""
+COHERENT_SLICE = 0.5
+"""Seconds of a vertical slice of a coherent lidar, to which vortices are fitted."""
+FIGURES = {"images": 8.0, "rings": 2.5, "sensor": 2.5, "coherent": 3.0}
 """Seconds of the figures of a chapter, and its part of the report."""
 FLIGHT_SLAB = 0.3
 """Seconds of the wind and the vortices of a slab in flight."""
@@ -93,7 +99,7 @@ def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> 
     """
     # the constants are of another machine; rendering is timed on this one
     here = slowness()
-    rendering = 2 * render_seconds(experiment, results) if experiment.wake else 0.0
+    rendering = 2 * render_seconds(experiment, results) if experiment.imaged_wake else 0.0
     return Cost(
         preparation,
         rendering,
@@ -191,7 +197,7 @@ def with_number(experiment: Experiment, samples: int) -> Experiment:
 
 def _images(experiment: Experiment, results: Results) -> float:
     """Winds from images or volumes."""
-    if not experiment.wake:
+    if not experiment.imaged_wake:
         return 0.0
     plan = results["plans"][0]
     pixels = plan.y.size * plan.z.size
@@ -213,7 +219,7 @@ def _images(experiment: Experiment, results: Results) -> float:
 
 def _rings(experiment: Experiment) -> float:
     """Images of rings, and velocities from them."""
-    doppler = experiment.doppler
+    doppler = experiment.fringes
     if not doppler:
         return 0.0
     settings, pixels = doppler.retrieval, doppler.camera.width * doppler.camera.height
@@ -234,15 +240,30 @@ def _rings(experiment: Experiment) -> float:
 
 def _lines(experiment: Experiment) -> float:
     """All lines of sight; the pulses of a line are summed, however many they are."""
-    sensor, doppler = experiment.sensor, experiment.doppler
+    if experiment.coherent:
+        return _coherent(experiment.coherent)
+    sensor, doppler = experiment.sensor, experiment.fringes
     if sensor is None or doppler is None:
         return 0.0
     directions, camera = sensor.directions, doppler.camera
     return RING_PAIR * directions.columns * directions.rows * camera.width * camera.height
 
 
+def _coherent(doppler: CoherentDoppler) -> float:
+    """Lines of a coherent lidar, and the fits to its slices."""
+    lines = line_scan(doppler.scan).time.size
+    gusts = COHERENT_TURBULENCE if doppler.air.turbulence else 1.0
+    slices = doppler.scan.count if doppler.scan.kind == "rhi" else 0
+    return gusts * COHERENT_LINE * lines * doppler.laser.gates + COHERENT_SLICE * slices
+
+
 def _figures(experiment: Experiment) -> float:
-    parts = {"images": experiment.wake, "rings": experiment.doppler, "sensor": experiment.sensor}
+    parts = {
+        "images": experiment.imaged_wake,
+        "rings": experiment.fringes,
+        "sensor": experiment.sensor,
+        "coherent": experiment.coherent,
+    }
     return sum(FIGURES[name] for name, there in parts.items() if there)
 
 

@@ -30,7 +30,9 @@ class Turbulence(Section):
         2.0, description="shortest wavelength"
     )
     evolution: Literal["frozen", "turnover", "sweeping"] = Field(
-        "frozen", description="in time, where the mean wind is at rest"
+        "frozen",
+        description="in the frame of the mean wind: at rest, changing as eddies turn over, or as "
+        "large ones sweep small ones along",
     )
     seed: Annotated[int, Within(0, 2**31 - 1, "as of the experiment's seed")] | None = Field(
         None, description="of the turbulence; default: that of the experiment"
@@ -63,10 +65,12 @@ class Gust(Section):
         None, description="largest; default: the design speed of CS 25.341 at the start's altitude"
     )
     alleviation: Annotated[Number, Within(0, 1, "a fraction", "(]")] | None = Field(
-        None, description="F_g of the design speed; default: from maximum_altitude, else 1"
+        None,
+        description="flight profile alleviation factor F_g of the design speed; default: from "
+        "maximum_altitude, else 1",
     )
     maximum_altitude: Annotated[Length, Within(1, 20000, "of operation")] | None = Field(
-        None, description="Z_mo, from which F_g follows"
+        None, description="Z_mo, from which F_g follows; one of speed, alleviation and this"
     )
     landing_weight: Annotated[Number, Within(0, 1, "of that at take-off", "(]")] = Field(
         1.0, description="largest, over that at take-off: R_1"
@@ -137,7 +141,7 @@ class Microburst(Section):
         15.0, description="the largest"
     )
     radius: Annotated[Length, Within(10, 10000, "a microburst")] = Field(
-        600.0, description="of the downdraft"
+        600.0, description="of the downdraft; the outflow is largest at 1.12 radii"
     )
     outflow_height: Annotated[Length, Within(1, 1000, "near the ground")] = Field(
         60.0, description="of the largest outflow"
@@ -165,7 +169,11 @@ class AirVolume(Section):
 class Air(Section):
     """The air about the wake, or in its place."""
 
-    wake: bool = Field(True, description="false: this air replaces the wake")
+    wake: bool = Field(
+        True,
+        description="false: this air replaces the wake, whose section still gives size, texture "
+        "and extinction of the images",
+    )
     turbulence: Turbulence | None = None
     volume: AirVolume | None = None
     gusts: tuple[Gust, ...] = ()

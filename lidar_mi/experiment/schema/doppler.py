@@ -22,7 +22,7 @@ class RingRetrieval(Section):
     methods: tuple[RingMethod, ...] = Field(
         (RingMethod.ANNULAR, RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG),
         min_length=1,
-        description="of the ring analysis",
+        description="methods of the ring analysis",
     )
     centre: tuple[RingCentre, ...] = Field(
         (RingCentre.FREE, RingCentre.KNOWN),
@@ -36,7 +36,9 @@ class RingRetrieval(Section):
         Field(8, description="averages of each kind and speed")
     )
     slow_images: Annotated[int, Within(0, 100000, "no more than images")] = Field(
-        3, description="of these, for methods other than annular, which are slow"
+        3,
+        description="how many of these averages the methods other than annular analyse, which are "
+        "slow; at most images",
     )
     aerosol_std: Annotated[Number, Within(0, 10, "a fraction that is not known at all")] = Field(
         0.5, description="uncertainty of lidar.aerosol_fraction; 0: known, not fitted"
@@ -70,25 +72,35 @@ _MODES = Within(0.1, 1e15, "from a pixel that sees part of a mode to white light
 
 
 class Doppler(Section):
-    """The fringe-imaging Doppler lidar and the winds along its line of sight."""
+    """The fringe-imaging Doppler lidar and the winds along its line of sight.
 
+    With `kind: coherent`, the keys are those of a coherent lidar on the ground.
+    """
+
+    kind: Literal["fringes", "coherent"] = Field(
+        "fringes", description="an etalon's fringes on a camera, or a coherent lidar on the ground"
+    )
     v_los: tuple[Annotated[Speed, Within(-12000, 12000, "escape velocity")], ...] = Field(
         (50.0, -300.0, -100.0, 0.0, 300.0),
         min_length=1,
         max_length=100,
-        description="positive: the air approaches; figures show the first",
+        description="speeds along the line of sight, positive: the air approaches; figures show "
+        "the first",
     )
     lidar: DopplerLidar = DopplerLidar()
     etalon: Etalon = Etalon()
     camera: FringeCamera = FringeCamera()
     ccd: CCD = CCD()
     speckle_modes: Literal["derived"] | Annotated[float, Field(allow_inf_nan=True), _MODES] = Field(
-        "derived", description="degrees of freedom of the speckle in a pixel; inf: no speckle"
+        "derived",
+        description="number of speckle modes of a pixel; derived from coherence time, gate and "
+        "field of view; inf: no speckle",
     )
     render: FringeSettings = FringeSettings()
     path_samples: Annotated[int, Within(0, 65536, "the standard error is then 0.4 %")] = Field(
         16,
-        description="light paths per pixel, each traced through a real lens",
+        description="light paths per pixel of an additional image of the laser's light through a "
+        "real lens; 0: no such image",
         validation_alias=AliasChoices("path_samples", "photon_samples"),  # its former name
     )
     reference: Reference = Reference()

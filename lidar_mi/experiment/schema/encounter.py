@@ -30,7 +30,9 @@ class Miss(Section):
     """Where the middle between the vortices is, from the path, when the aircraft arrives."""
 
     y: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
-        0.0, description="to the left of the path"
+        0.0,
+        description="place of the middle between the vortices to the left of the path, when the "
+        "aircraft arrives",
     )
     z: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
         0.0, description="above the path"
@@ -49,7 +51,8 @@ class Path(Section):
     climb_angle: _Slope = Field(quantity("-3 deg"), description="of the path; the wake is level")
     miss: Miss = Miss()
     altitude: Annotated[Length, Within(1, 15000, "the lower atmosphere")] = Field(
-        300.0, description="height above the ground (sea level) at the start"
+        300.0,
+        description="above the ground (sea level) at the start; a path into the ground is refused",
     )
     start: Annotated[Length, Within(1, 20000, "an encounter")] = Field(
         600.0, description="distance from the wake's centre at the start"
@@ -79,7 +82,8 @@ class Crow(Section):
         "grow; filaments: Biot-Savart's law, growth with the wake's age, rings once linked",
     )
     amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = Field(
-        0.0, description="of the deformation; of filaments that at age 0"
+        0.0,
+        description="of the sinusoidal deformation of both vortices; of filaments that at age 0",
     )
     wavelength: Annotated[Length, Within(1, 100000, "8.6 separations")] | None = Field(
         None, description="default: 8.6 separations"
@@ -100,7 +104,11 @@ class WakeInTime(Section):
     )
     dissipation_rate: (
         Annotated[DissipationRate, Within(0, 1, "from calm air to a thunderstorm")] | None
-    ) = Field(None, description="of turbulence, in which circulation decays (Sarpkaya 2000)")
+    ) = Field(
+        None,
+        description="of turbulence, in which circulation decays (Sarpkaya 2000); in place of "
+        "decay_time",
+    )
     crow: Crow = Crow()
     ends: Literal["mirror", "blend", "refuse"] = Field(
         "mirror",
@@ -129,7 +137,8 @@ class Aircraft(Section):
 
     model: str = Field(
         "roll",
-        description="roll: rolls only; heave: rises and pitches, too; else of JSBSim, such as 737",
+        description="roll: rolls only; heave: rises and pitches, too; else of JSBSim, such as 737 "
+        "(pip install 'lidar-mi[flight]')",
     )
     span: Annotated[Length, Within(1, 200, "aircraft")] = Field(28.9, description="of the wing")
     wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = Field(
@@ -186,7 +195,7 @@ class Window(Section):
     """Where the scan of the backscatter lidar looks."""
 
     follow: bool = Field(
-        False, description="its middle follows the pair; else it is straight ahead"
+        False, description="whether its middle follows the pair; else it is straight ahead"
     )
     reach: Annotated[Angle, Within(0, 0.8, "a scanner")] = Field(
         quantity("20 deg"), description="of its middle from straight ahead"

@@ -7,8 +7,9 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
+from lidar_mi.experiment.schema.coherent import CoherentDoppler
 from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.schema.encounter import Encounter
 from lidar_mi.experiment.schema.platform import Platform
@@ -34,6 +35,19 @@ NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
 """Allowed names of experiments and variants, which are names of folders."""
 
 
+def _kind_of(doppler: object) -> str:
+    """Of a Doppler lidar; an unknown one is the fault of the section of the default kind."""
+    kind = doppler.get("kind") if isinstance(doppler, dict) else getattr(doppler, "kind", None)
+    return "coherent" if kind == "coherent" else "fringes"
+
+
+AnyDoppler = Annotated[
+    Annotated[Doppler, Tag("fringes")] | Annotated[CoherentDoppler, Tag("coherent")],
+    Discriminator(_kind_of),
+]
+"""A Doppler lidar of either kind."""
+
+
 class Experiment(Tabular, Section):
     """One experiment: a wake for the backscatter lidar, a Doppler lidar, or both."""
 
@@ -43,11 +57,16 @@ class Experiment(Tabular, Section):
     )
     device: Literal["auto", "cpu", "cuda"] | None = Field(
         None,
-        description="that renders and retrieves; default: rendering by the variants, retrieval on "
-        "the processor",
+        description="where images are rendered and winds retrieved; default: rendering as "
+        "render.variant says, retrieval on the processor",
     )
-    wake: Wake | None = Field(None, description="observed by the backscatter lidar")
-    doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
+    wake: Wake | None = Field(
+        None, description="observed by the backscatter lidar, or by a coherent Doppler lidar"
+    )
+    doppler: AnyDoppler | None = Field(
+        None,
+        description="the Doppler lidar; {} for the paper's, kind: coherent for one on the ground",
+    )
     platform: Platform = Platform()
     lidar: BackscatterLidar = BackscatterLidar()
     detector: Detector | None = Field(None, description="adds a noisy image and its winds")
@@ -69,6 +88,21 @@ class Experiment(Tabular, Section):
         """The folder of its file, in which files that it names are searched first."""
         return self._folder
 
+    @property
+    def fringes(self) -> Doppler | None:
+        """The Doppler lidar, if it images fringes."""
+        return self.doppler if isinstance(self.doppler, Doppler) else None
+
+    @property
+    def coherent(self) -> CoherentDoppler | None:
+        """The Doppler lidar, if it is a coherent one on the ground."""
+        return self.doppler if isinstance(self.doppler, CoherentDoppler) else None
+
+    @property
+    def imaged_wake(self) -> Wake | None:
+        """The wake, if a backscatter lidar observes it."""
+        return None if self.coherent else self.wake
+
     def tables(self) -> list[Table]:
         """Keys that differ from their defaults, as they were given."""
         given = self.model_dump(
@@ -81,6 +115,33 @@ class Experiment(Tabular, Section):
         copy = self.model_copy()
         copy._folder = Path(folder)
         return copy
+
+    @model_validator(mode="after")
+    def _coherent_lidar_alone(self) -> Self:
+        if self.coherent is None:
+            return self
+        for key in ("sensor", "volume", "encounter"):
+            if getattr(self, key) is not None:
+                raise ValueError(
+                    f"{key}: not allowed with doppler.kind coherent, a lidar on the ground; "
+                    "expected doppler.kind: fringes"
+                )
+        wake = self.wake
+        if wake is not None and wake.turbine is not None:
+            raise ValueError(
+                "wake.turbine: not allowed with doppler.kind coherent; expected vortex_pair or file"
+            )
+        if wake is not None and (wake.depth == "volume" or wake.second != "advect"):
+            key = "depth" if wake.depth == "volume" else "second"
+            raise ValueError(
+                f"wake.{key}: {getattr(wake, key)} is not allowed with doppler.kind coherent, "
+                "which observes a plane as it drifts; expected the default"
+            )
+        if wake is None and self.coherent.scan.kind == "rhi":
+            raise ValueError(
+                "wake: missing; doppler.scan.kind rhi expects one (ppi and dbs measure the wind)"
+            )
+        return self
 
     @model_validator(mode="after")
     def _gates_that_make_a_volume(self) -> Self:
@@ -145,8 +206,8 @@ class Experiment(Tabular, Section):
     def _molecules_with_polarised_particles(self) -> Self:
         phase = self.scattering.phase
         if (
-            self.wake
-            and self.wake.extinction.molecules
+            self.imaged_wake
+            and self.imaged_wake.extinction.molecules
             and phase in ("isotropic", "henyey_greenstein")
         ):
             raise ValueError(
@@ -161,8 +222,9 @@ class Experiment(Tabular, Section):
             raise ValueError("expected wake, doppler or both")
         for key in BACKSCATTER:
             unused = getattr(self, key) != type(self).model_fields[key].default
-            if self.wake is None and unused:
-                raise ValueError(f"{key}: not allowed without wake; expected it under doppler")
+            if self.imaged_wake is None and unused:
+                without = "with doppler.kind coherent" if self.coherent else "without wake"
+                raise ValueError(f"{key}: not allowed {without}; expected it under doppler")
         return self
 
     @model_validator(mode="after")

@@ -2,11 +2,12 @@
 
 import difflib
 import re
+from collections.abc import Iterator
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from lidar_mi.experiment.schema.section import section_in
+from lidar_mi.experiment.schema.section import section_in, tagged_section
 from lidar_mi.units import Unit, Within, to_si
 
 A_NAME = "at most 100 letters, digits, _, . and -, a letter or digit first"
@@ -25,11 +26,12 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     faults = error.errors()
     # a misspelt key also leaves one missing: report the misspelt one
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    where, word = _key(fault["loc"]), ""
-    if len(where) < len(fault["loc"]) and fault["type"] == "literal_error":
+    where, word = _key(model, fault["loc"]), ""
+    others = [f for f in faults if f is not fault and _key(model, f["loc"]) == where]
+    if others and fault["type"] == "literal_error":
         # a word or a number: report the number's fault
         word = fault["ctx"]["expected"] + " or "
-        fault = next(f for f in faults if f is not fault and _key(f["loc"]) == where)
+        fault = others[0]
     field = ".".join(where)
     message = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
@@ -76,19 +78,35 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     return f"{field}: {shown} is not allowed; expected {expected}"
 
 
-def _key(location: tuple[int | str, ...]) -> list[str]:
+def _steps(
+    model: type[BaseModel], location: tuple[int | str, ...]
+) -> Iterator[tuple[int | str, Any, Any, bool]]:
+    """Of each part of a location: it, the field and the section there, whether it is a tag."""
+    field: Any = None
+    section: Any = model
+    for part in location:
+        tagged = tagged_section(field.annotation, part) if field else None
+        if tagged:
+            section = tagged
+        elif section and part in section.model_fields:
+            field = section.model_fields[part]
+            section = section_in(field.annotation)
+        yield part, field, section, tagged is not None
+
+
+def _key(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """A fault's location without the kinds of value that pydantic tried there."""
     kinds = ("literal[", "function-")
-    return [str(p) for p in location if p != "float" and not str(p).startswith(kinds)]
+    return [
+        str(part)
+        for part, _, _, is_tag in _steps(model, location)
+        if not is_tag and part != "float" and not str(part).startswith(kinds)
+    ]
 
 
-def _metadata_at(model: Any, location: tuple[int | str, ...], kind: type) -> Any:
+def _metadata_at(model: type[BaseModel], location: tuple[int | str, ...], kind: type) -> Any:
     """The part of a kind in the annotation of the key at a location; None if there is none."""
-    field: Any = None
-    for part in location:
-        if model and part in model.model_fields:
-            field = model.model_fields[part]
-            model = section_in(field.annotation)
+    field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     pending = [field.annotation, *field.metadata] if field else []
     while pending:
         part = pending.pop()
@@ -98,21 +116,16 @@ def _metadata_at(model: Any, location: tuple[int | str, ...], kind: type) -> Any
     return None
 
 
-def _length_at(model: Any, location: tuple[int | str, ...]) -> int:
+def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:
     """How many values a list at a location has; 1: any number."""
-    annotation: Any = None
-    for part in location:
-        if model and part in model.model_fields:
-            annotation = model.model_fields[part].annotation
-            model = section_in(annotation)
+    field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
+    annotation: Any = field.annotation if field else None
     for one in (annotation, *get_args(annotation)):
         if get_origin(one) is tuple and Ellipsis not in get_args(one):
             return len(get_args(one))
     return 1
 
 
-def _keys_at(model: Any, location: tuple[int | str, ...]) -> list[str]:
-    for part in location:
-        if model and part in model.model_fields:
-            model = section_in(model.model_fields[part].annotation)
-    return list(model.model_fields)
+def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    section = next((s for _, _, s, _ in reversed([*_steps(model, location)])), model)
+    return list(section.model_fields)

@@ -47,7 +47,9 @@ class HeaveKeys(Section):
         0.95, description="outer end of the ailerons, over half the span"
     )
     wing_mass: Annotated[Number, Within(0, 0.9, "of the aircraft's mass")] = Field(
-        0.17, description="fraction of the mass that is wing, with engines and fuel"
+        0.17,
+        description="fraction of the mass that is wing, with engines and fuel; of JSBSim's "
+        "aircraft, too",
     )
 
     @model_validator(mode="after")

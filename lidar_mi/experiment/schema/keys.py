@@ -23,7 +23,7 @@ from pydantic_core import PydanticUndefined
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.faults import A_NAME
-from lidar_mi.experiment.schema.section import section_in
+from lidar_mi.experiment.schema.section import section_in, sections_in, tagged_section
 from lidar_mi.io.yaml import to_yaml_line
 from lidar_mi.units import Unit, Within, usual
 
@@ -112,8 +112,9 @@ def explain(name: str) -> Key:
         hint = f"did you mean {' or '.join(near)}?" if near else f"expected {', '.join(sections())}"
         raise InputError(f"{name}: unknown key; {hint}")
     owner, field, listed_in = fields[name]
-    section = section_in(field.annotation)
-    text = _paragraphs(section) if section else ()
+    kinds = tuple(dict.fromkeys(sections_in(field.annotation)))
+    section = kinds[0] if kinds else None
+    text = tuple(part for kind in kinds for part in _paragraphs(kind))
     last = name.rpartition(".")[2]
     about = tuple(part for part in _paragraphs(owner)[1:] if re.search(rf"`{last}\b", part))
     unit = _first(field, Unit)
@@ -127,9 +128,18 @@ def explain(name: str) -> Key:
         allowed=", ".join(dict.fromkeys(allowed)),
         words=tuple(_words(field.annotation)),
         more=text if section else about,
-        keys=tuple(f"{name}.{key}" for key in section.model_fields) if section else (),
+        keys=tuple(dict.fromkeys(f"{name}.{key}" for kind in kinds for key in kind.model_fields)),
         listed_in=listed_in,
     )
+
+
+def keys_of(name: str, data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the keys of a section, of the kind that its data say; none: no section."""
+    if name not in _fields():
+        return ()
+    annotation = _fields()[name][1].annotation
+    section = tagged_section(annotation, data.get("kind")) or section_in(annotation)
+    return tuple(f"{name}.{key}" for key in section.model_fields) if section else ()
 
 
 def sections() -> tuple[str, ...]:
@@ -140,7 +150,11 @@ def sections() -> tuple[str, ...]:
 @cache
 def _fields() -> Mapping[str, tuple[type[BaseModel], FieldInfo, str]]:
     """Of every key: the section that has it, its field, and the list of sections that it is in."""
-    return dict(_walk(Experiment, "", ""))
+    found: dict[str, tuple[type[BaseModel], FieldInfo, str]] = {}
+    for name, one in _walk(Experiment, "", ""):
+        # of the kinds of a section, the first one describes the keys that they share
+        found.setdefault(name, one)
+    return found
 
 
 def _walk(
@@ -149,8 +163,7 @@ def _walk(
     for key, field in model.model_fields.items():
         name = f"{above}{key}"
         yield name, (model, field, listed_in)
-        section = section_in(field.annotation)
-        if section:
+        for section in sections_in(field.annotation):
             yield from _walk(section, f"{name}.", listed_in or (name if _is_list(field) else ""))
 
 

@@ -18,7 +18,11 @@ class Platform(Section):
     )
     dt: Annotated[
         Time, Within(1e-6, 10000, "from a repetition rate of 1 MHz to the life of a wake")
-    ] = Field(0.1, description="time between the two images")
+    ] = Field(
+        0.1,
+        description="time between the two images; where wake.second is a time: the difference of "
+        "both",
+    )
     motion: Motion | None = Field(None, description="departure from straight and level flight")
     reported: Reported | None = Field(
         None, description="errors of the reported pose; default: the true one is known"

@@ -218,10 +218,10 @@ def settings(experiment: Experiment, *, si: bool = False) -> dict[str, Any]:
 
     Quantities are text as they were given, or with their SI units.
     """
-    unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
+    unused = {*BACKSCATTER} if experiment.imaged_wake is None else set()
     unused |= {
         name
-        for name in ("doppler", "sensor", "volume", "encounter")
+        for name in ("wake", "doppler", "sensor", "volume", "encounter")
         if getattr(experiment, name) is None
     }
     context = None if si else AS_GIVEN

@@ -13,7 +13,9 @@ class Pointing(Section):
     """What is known of the pointing from one scan to the next."""
 
     offset: Literal["known", "free"] = Field(
-        "known", description="free: lines of sight may estimate the wind that it feigns"
+        "known",
+        description="whether the combination with lines of sight may estimate the apparent wind "
+        "by unknown pointing",
     )
     stderr: Annotated[Angle, Within(0, 0.1, "displaced by more than the image")] = Field(
         0.0, description="standard error of pitch and of yaw between the scans"
@@ -60,14 +62,18 @@ class Retrieval(Section):
         0.2, description="templates with structure in one direction only are flagged"
     )
     blur: Literal["beam"] | Annotated[Length, Within(0, 1000, "the widest beam")] = Field(
-        0.0, description="standard deviation of the beam's blur, corrected by variational"
+        0.0,
+        description="standard deviation of the beam's blur, corrected by variational; beam: half "
+        "the 1/e^2 radius of the beam at the slab",
     )
     pointing: Pointing = Pointing()
-    error_budget: bool = Field(False, description="also retrieve winds without each cause of error")
+    error_budget: bool = Field(
+        False, description="also retrieve winds without each cause of error in turn"
+    )
     sources: Literal["all", "measured"] = Field(
         "all",
-        description="also from ideal images of the truth, for comparison, or from measured ones "
-        "alone",
+        description="winds also from ideal images of the truth, for comparison; or from the "
+        "lidar's images alone, four times faster",
     )
 
     @model_validator(mode="after")

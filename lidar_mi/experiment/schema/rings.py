@@ -17,13 +17,19 @@ class Reference(Section):
     """The frame of the laser's own light: the zero of the speeds until the next one."""
 
     photons: Annotated[Number, Within(1, 1e15, "a photon to the whole pulse")] | None = Field(
-        None, description="detected; default: as many as of the echo"
+        None,
+        description="detected in the laser frame that every pulse has; default: as many as of the "
+        "echo",
     )
     every: Annotated[int, Within(1, 100000, "a quarter of an hour of pulses at 100 Hz")] = Field(
-        1, description="pulses from one frame of the laser to the next"
+        1,
+        description="pulses from one laser frame to the next; averages are of a multiple or a "
+        "divisor of it",
     )
     laser_drift: Annotated[Frequency, Within(0, 1e12, "hundreds of orders of an etalon")] = Field(
-        0.0, description="rms step of the laser's frequency from pulse to pulse, a random walk"
+        0.0,
+        description="rms step of the laser's frequency from pulse to pulse, a random walk that "
+        "every laser frame begins anew",
     )
     etalon_drift: Annotated[Temperature, Within(0, 100, "no laboratory changes faster")] = Field(
         0.0, description="rms step of the etalon's temperature from pulse to pulse, a random walk"
@@ -32,7 +38,9 @@ class Reference(Section):
         5e-7, description="relative, of the etalon's gap per K; fused silica"
     )
     laser_pupil: Annotated[Number, Within(1e-6, 1, "from a point to the whole pupil")] = Field(
-        1.0, description="radius of the laser's light in the etalon over that of the echo"
+        1.0,
+        description="radius of the laser's light in the etalon over that of the echo; with "
+        "etalon.bow an error that no image shows",
     )
     echo_shift: Annotated[Number, Within(-1, 1, "by the radius of the pupil")] = Field(
         0.0, description="of the echo's light along the wedge, over the pupil's radius"
@@ -91,7 +99,9 @@ class RingCalibration(Section):
     """Frames of the laser from which the instrument is calibrated before winds are retrieved."""
 
     frames: Annotated[int, Within(2, 1000, "two determine the drift")] = Field(
-        20, description="simulated frames of the laser"
+        20,
+        description="simulated laser frames, with noise and drift, from which the assumed "
+        "instrument is calibrated",
     )
     file: str | None = Field(
         None, description="calibration by lidar-mi calibrate, in place of simulated frames"

@@ -11,14 +11,27 @@ from lidar_mi.units import Number, Within
 class _Scatterer(Section):
     """The keys common to all kinds of scatterers."""
 
-    aerosol: str | None = Field(None, description="name of an aerosol, with phase: aerosol")
+    aerosol: str | None = Field(
+        None,
+        description="with phase: aerosol: spheroids (default), spheres, continental, sea_salt, "
+        "dust, droplets or soot",
+    )
     band: Literal["cabannes", "rayleigh"] = Field(
-        "cabannes", description="of molecules: the line transmitted by a narrow filter, or all"
+        "cabannes",
+        description="with phase: molecules: the Cabannes line alone, as through a filter narrower "
+        "than about 0.3 nm, or all Rayleigh scattering",
     )
     depolarization: Annotated[
         Number, Within(0, 0.5, "anisotropy of molecules allows no more", "[)")
-    ] = Field(0.0, description="of Rayleigh, natural light")
-    table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
+    ] = Field(
+        0.0,
+        description="depolarisation factor of Rayleigh scattering, of natural light at 90 degrees",
+    )
+    table: str | None = Field(
+        None,
+        description="with phase: table: file of a scattering matrix, in the experiment's folder "
+        "or shipped; see the mueller plugin",
+    )
 
     @model_validator(mode="after")
     def _named_what_it_needs(self: Any) -> Any:  # kinds of scatterers have a phase
@@ -54,10 +67,14 @@ class Scattering(_Scatterer):
     ] = Field("aerosol", description="phase function of slab and environment")
     asymmetry: Annotated[
         Number, Within(-0.999, 0.999, "at 0.999 the forward peak is 0.06 degrees wide")
-    ] = Field(0.0, description="of Henyey-Greenstein")
-    parts: tuple[Part, ...] | None = Field(None, min_length=1, description="of a mixture")
+    ] = Field(0.0, description="asymmetry parameter of the Henyey-Greenstein phase function")
+    parts: tuple[Part, ...] | None = Field(
+        None, min_length=1, description="components of phase: mixture"
+    )
     albedo: Annotated[Number, Within(0, 1, "definition of an albedo")] | None = Field(
-        None, description="scattered fraction of the extinction; default: the scatterers'"
+        None,
+        description="single-scattering albedo, above 0; default: that of the scatterers, 1 for a "
+        "table without one",
     )
 
     @model_validator(mode="before")

@@ -1,8 +1,9 @@
 """What the sections of an experiment file have in common."""
 
+from collections.abc import Iterator
 from typing import Any, get_args
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Tag
 
 from lidar_mi.description import Description
 
@@ -14,11 +15,25 @@ class Section(Description):
     model_config = ConfigDict(use_enum_values=True)
 
 
-def section_in(annotation: Any) -> type[BaseModel] | None:
-    """The section in an annotation such as ``tuple[Section, ...] | None``."""
+def sections_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The sections in an annotation such as ``tuple[Section, ...] | None``, one of each kind."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next(filter(None, map(section_in, get_args(annotation))), None)
+        yield annotation
+    for part in get_args(annotation):
+        yield from sections_in(part)
+
+
+def section_in(annotation: Any) -> type[BaseModel] | None:
+    """The first of them; None: there is none."""
+    return next(sections_in(annotation), None)
+
+
+def tagged_section(annotation: Any, tag: object) -> type[BaseModel] | None:
+    """That of a kind, by its tag in a discriminated union; None: there is none."""
+    if any(isinstance(part, Tag) and part.tag == tag for part in get_args(annotation)):
+        return section_in(annotation)
+    found = (tagged_section(part, tag) for part in get_args(annotation))
+    return next(filter(None, found), None)
 
 
 def each_once(key: str, values: tuple[object, ...]) -> None:

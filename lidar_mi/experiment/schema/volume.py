@@ -18,7 +18,9 @@ class Volume(Section):
         description="cross-correlation of separate windows, or a smooth flow fitted to the volumes",
     )
     template: Annotated[int, Within(4, 1024, "wider than any volume")] = Field(
-        8, description="voxels along each side of a window"
+        8,
+        description="voxels along each side of a window; also sets the knot spacing of the smooth "
+        "flow",
     )
     search: Annotated[int, Within(6, 2048, "wider than any volume")] = Field(
         16,

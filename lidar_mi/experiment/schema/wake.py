@@ -96,13 +96,17 @@ class Turbine(Section):
         Number, Within(0, 1, "in momentum theory 0 leaves no wake, 1 no wind", "()")
     ] = Field(0.75, description="thrust coefficient")
     tip_speed_ratio: Annotated[Number, Within(-100, 100, "fast rotors have 15")] = Field(
-        7.0, description="speed of the tips over that of the wind"
+        7.0,
+        description="speed of the blade tips over that of the wind; negative: the wake rotates "
+        "from +z towards +y",
     )
     wind_speed: Annotated[Speed, Within(0.01, 200, "from a calm to a tornado")] = Field(
         8.0, description="of the undisturbed wind, along x"
     )
     growth: Annotated[Number, Within(0.0001, 1, "wakes are measured to have 0.02 to 0.08")] = Field(
-        0.035, description="of the wake's width with the distance"
+        0.035,
+        description="growth rate of the wake's width with the distance: 0.02 (calm) to 0.06 "
+        "(turbulent)",
     )
     hub_core: Annotated[
         Length, Within(0.001, 100, "from models in a tunnel to the largest rotor")
@@ -114,7 +118,9 @@ class Turbine(Section):
         | None
     ) = Field(None, description="distance from the rotor; default: the middle of the gates")
     turbulence: Annotated[Number, Within(0, 0.5, "turbulence is frozen only below")] = Field(
-        0.06, description="intensity of the undisturbed wind"
+        0.06,
+        description="turbulence intensity of the undisturbed wind; 0: none, not even that added "
+        "by the rotor",
     )
     outer_scale: Annotated[
         Length, Within(0.01, 10000, "from a wind tunnel to the depth of the troposphere")
@@ -132,7 +138,9 @@ class ExtinctionMapping(Section):
     tracer: str | None = Field("tracer", description="exhaust tracer, or null for none")
     aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
     background: Annotated[Extinction, Within(0, 10, "visibility is 0.3 m in the densest smoke")] = (
-        Field(quantity("0.1 / km"), description="also of the environment")
+        Field(
+            quantity("0.1 / km"), description="extinction without exhaust; also of the environment"
+        )
     )
     maximum: Annotated[
         Extinction, Within(1e-12, 10, "from the thermosphere to the densest smoke")
@@ -142,7 +150,9 @@ class ExtinctionMapping(Section):
     )
     molecules: Annotated[Extinction, Within(0, 0.1, "air at the ground has 0.03 / m at 100 nm")] = (
         Field(
-            0.0, description="on top of it, in slab and environment: by air, which has no texture"
+            0.0,
+            description="extinction by clear air, added in slab and environment; it has no texture "
+            "and scatters in scattering.band",
         )
     )
     stretch: Annotated[Number, Within(1, 100, "1 is linear; 100 is a step")] = Field(
@@ -164,16 +174,30 @@ class Texture(Section):
 class Wake(Section):
     """The flow and the tracers in it."""
 
-    file: str | None = Field(None, description="NetCDF file; in the experiment's folder or shipped")
+    file: str | None = Field(
+        None,
+        description="NetCDF file: in the experiment's folder, with an absolute path, or shipped; "
+        "one of file, vortex_pair and turbine is needed",
+    )
     vortex_pair: VortexPair | None = None
     turbine: Turbine | None = None
-    time: _Moment | None = Field(None, description="needed when the file holds several")
-    second: Literal["advect", "advect_3d"] | _Moment = Field(
-        "advect", description="t2: advected by v, w; by u, v, w of a volume; or a time of the file"
+    time: _Moment | None = Field(
+        None, description="of the first image; needed when the file holds several"
     )
-    x: _Place | None = Field(None, description="plane placed in the middle of the gates")
+    second: Literal["advect", "advect_3d"] | _Moment = Field(
+        "advect",
+        description="state at the second image: advected by v and w, by u, v and w of a volume, "
+        "or stored at another time of the file",
+    )
+    x: _Place | None = Field(
+        None,
+        description="plane (depth: plane) or point that is placed in the middle of the gates; "
+        "needed when the file holds several planes",
+    )
     depth: Literal["plane", "volume"] = Field(
-        "plane", description="one plane extruded over the gates, or all planes of the file"
+        "plane",
+        description="one plane extruded over the gates (with second: advect_3d the mean of the "
+        "planes in them), or all planes of the file",
     )
     centre: tuple[_Place, _Place] | None = Field(
         None, description="(y, z) of the wake placed on the beam axis; default: the domain's middle"
@@ -181,7 +205,11 @@ class Wake(Section):
     spacing: Annotated[
         Length, Within(0.001, 1000, "from the smallest eddies to models of a region")
     ] = Field(0.5, description="of the nodes in y and z; also in x where air moves along x")
-    names: dict[str, str] = Field({}, description="our dimension or variable names: the file's")
+    names: dict[str, str] = Field(
+        {},
+        description="our names of dimensions and variables: those in the file; a minus sign "
+        "before one changes the sign",
+    )
     extinction: ExtinctionMapping = ExtinctionMapping()
     texture: Texture = Texture()
 

@@ -1,7 +1,6 @@
 """Whether images will have light, before they are rendered."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -26,7 +25,7 @@ def check_brightness(
     render: RenderSettings,
     detector: Detector | None,
     mapping: ExtinctionMapping,
-    extinction: Sequence[xr.DataArray],
+    extinction: xr.DataArray,
     plan: ScanPlan,
     albedo: float,
 ) -> None:
@@ -38,7 +37,7 @@ def check_brightness(
         Too few samples contribute: free flights that end elsewhere, or a field of view that
         contains hardly any of the beam; or light too weak for its error in single precision.
     """
-    inside = float(np.median([np.median(field.values) for field in extinction]))
+    inside = float(np.median(extinction.values))
     if not inside > 0:
         raise InputError(
             "wake.extinction.background: 0 is not allowed with a wake that fills less than half "
@@ -74,7 +73,7 @@ def least_samples(
     lidar: BackscatterLidar,
     render: RenderSettings,
     mapping: ExtinctionMapping,
-    extinction: Sequence[xr.DataArray],
+    extinction: xr.DataArray,
     plan: ScanPlan,
 ) -> int:
     """Samples per beam of which `CONTRIBUTIONS` bring light to a pixel of the median extinction.
@@ -85,7 +84,7 @@ def least_samples(
     in_view = overlap(lidar, distance)
     if render.estimator == "analog":
         # samples contribute if they collide in the gate
-        inside = float(np.median([np.median(field.values) for field in extinction]))
+        inside = float(np.median(extinction.values))
         around = mapping.background + mapping.molecules
         arriving = math.exp(-min(around * plan.gate_start, 300))
         fraction = in_view * inside * float(np.median(plan.gate_length())) * arriving

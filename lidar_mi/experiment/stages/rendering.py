@@ -108,7 +108,7 @@ def check_light(
         largest medium, moving air in more states than the memory holds.
     """
     # refuses beams that are too wide for a medium
-    _media(lidar, truth.extinction, plans)
+    _media(lidar, [truth.extinction[0]], plans)
     in_states = values_of_states(wake, scan, volume, flows, plans)
     columns, rows = len(plans[0].y), len(plans[0].z)
     # the flow may be that of another point of a campaign, with another footprint
@@ -119,7 +119,7 @@ def check_light(
             duration = gate_duration(plan.gate_length())
             # refuses a line narrower than that of the pulse
             speckle_modes(detector, lidar, duration, plan.ranges())
-    if not max(float(field.max()) for field in truth.extinction) > 0:
+    if not any(float(field.max()) > 0 for field in truth.extinction):
         raise InputError(
             "wake.extinction: 0 everywhere is not allowed; expected air that scatters, by its "
             "background, tracer or aerosol"
@@ -128,7 +128,7 @@ def check_light(
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
     for plan in plans:
         check_brightness(
-            lidar, render, detector, wake.extinction, truth.extinction, plan, air.albedo
+            lidar, render, detector, wake.extinction, truth.extinction[0], plan, air.albedo
         )
 
 
@@ -306,7 +306,7 @@ def chosen_samples(
     found = []
     for plan, pilot in zip(plans, pilots, strict=True):
         noisy = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, scan.pulses_per_beam)
-        least = least_samples(lidar, render, wake.extinction, truth.extinction, plan)
+        least = least_samples(lidar, render, wake.extinction, truth.extinction[0], plan)
         found.append(choose_samples(noisy, number, render, least))
     return max(found, key=lambda one: (one.number, one.fraction))
 

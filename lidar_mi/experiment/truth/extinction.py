@@ -1,11 +1,14 @@
 """The truth of an experiment: extinction at both times and wind, in the frame of the lidar."""
 
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
+import lidar_mi.plots  # noqa: F401 - truth.wind.lidar.plot()
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from lidar_mi.atmosphere.texture import corrsin_obukhov
@@ -20,6 +23,22 @@ from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.scan import Scan
 
 
+class Later(Sequence[xr.DataArray]):
+    """A field at t1 and t2; that at t2 is advected when it is first asked for.
+
+    Advection of a volume takes seconds, and nothing that is checked before a run needs it.
+    """
+
+    def __init__(self, first: xr.DataArray, second: Callable[[], xr.DataArray]) -> None:
+        self._at = (lambda: first, functools.cache(second))
+
+    def __len__(self) -> int:
+        return len(self._at)
+
+    def __getitem__(self, which: int) -> xr.DataArray:  # type: ignore[override]
+        return self._at[which]()
+
+
 @dataclass(frozen=True)
 class Truth:
     """The observed air, in the lidar's frame at t1 (metres, m^-1, m s^-1).
@@ -28,8 +47,8 @@ class Truth:
     (x, y, z); ``wind`` has v, w on (z, y), averaged over the depth of the first gate.
     """
 
-    extinction: tuple[xr.DataArray, xr.DataArray]
-    smooth: tuple[xr.DataArray, xr.DataArray]
+    extinction: Sequence[xr.DataArray]
+    smooth: Sequence[xr.DataArray]
     wind: xr.Dataset
 
     def image(self, which: int, smooth: bool = False) -> xr.DataArray:
@@ -76,8 +95,11 @@ def make_truth(
     >>> truth.wind["v"].dims, len(truth.extinction)
     (('z', 'y'), 2)
     """
-    if experiment.wake is None:
-        raise InputError(f"wake: missing in {experiment.name}; expected the section of a wake")
+    if experiment.imaged_wake is None:
+        raise InputError(
+            f"wake: missing in {experiment.name}; expected the section of a wake that a "
+            "backscatter lidar observes"
+        )
     if flows is None:
         flows = flows_of(experiment, None if beside is None else Path(beside))
     return call(true_air, experiment, flows=flows, advected=advected)
@@ -104,14 +126,11 @@ def true_air(
     """
     first, second = flows
     mapping = wake.extinction
-    smooth1 = extinction_of(first, mapping, first, second)
     flow = mean_flow((first, second))
     advected = advected or advection_by(wake, platform, scan, volume, flows)
-    if second is None:
-        smooth2 = advected(smooth1)
-    else:
-        smooth2 = extinction_of(second, mapping, first, second)
+    smooth1 = extinction_of(first, mapping, first, second)
     texture = wake.texture
+    factor = xr.DataArray(1.0)
     if texture.rms > 0:
         x = first["x"].values if first.sizes["x"] > 1 else None
         factor = corrsin_obukhov(
@@ -120,14 +139,19 @@ def true_air(
         if x is None:
             factor = factor.expand_dims(x=first["x"].values)
         factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
+    textured1 = smooth1 * factor if texture.rms > 0 else smooth1
+
+    @functools.cache
+    def smooth2() -> xr.DataArray:
         if second is None:
-            textured1 = smooth1 * factor
-            textured2 = advected(textured1)
-        else:
-            textured1 = smooth1 * factor
-            textured2 = smooth2 * advected(factor)
-    else:
-        textured1, textured2 = smooth1, smooth2
+            return advected(smooth1)
+        return extinction_of(second, mapping, first, second)
+
+    def textured2() -> xr.DataArray:
+        if texture.rms == 0:
+            return smooth2()
+        return advected(textured1) if second is None else smooth2() * advected(factor)
+
     # winds are retrieved from the first gate
     depth = scan.thickness / scan.gate_count
     gates = (scan.range, scan.range + depth)
@@ -138,9 +162,11 @@ def true_air(
     def with_molecules(field: xr.DataArray) -> xr.DataArray:
         return field.copy(data=field.values + mapping.molecules)
 
-    textured = with_molecules(textured1), with_molecules(textured2)
-    smooth = with_molecules(smooth1), with_molecules(smooth2)
-    return Truth(textured, smooth, wind)
+    return Truth(
+        Later(with_molecules(textured1), lambda: with_molecules(textured2())),
+        Later(with_molecules(smooth1), lambda: with_molecules(smooth2())),
+        wind,
+    )
 
 
 def extinction_of(

@@ -9,9 +9,10 @@ import xarray as xr
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.scans import LineScan
 from lidar_mi.instrument.coherent.velocity_noise import cramer_rao
-from lidar_mi.instrument.coherent.weighting import CoherentLidar, WindField, radial_velocities
+from lidar_mi.instrument.coherent.weighting import CoherentLidar, Signal, WindField, gate_moments
 
-_START = np.datetime64("2000-01-01T00:00:00", "ns")
+START = np.datetime64("2000-01-01T00:00:00", "ns")
+"""Time 0 of simulated lines."""
 
 
 def measured_lines(
@@ -24,6 +25,7 @@ def measured_lines(
     bandwidth: float = 38.8,
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     resolution: float = 1.0,
+    signal: Signal | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
     """Radial velocities with noise, in the layout of `read_lines_of_sight`.
@@ -34,10 +36,10 @@ def measured_lines(
 
     Parameters
     ----------
-    wind, scan, lidar, origin, resolution
-        As of `radial_velocities`.
+    wind, scan, lidar, origin, resolution, signal
+        As of `gate_moments`.
     snr : float, (gates,) array or callable of the range (m)
-        Signal-to-noise ratio of the powers, above 0.
+        Signal-to-noise ratio of the powers where the signal is 1, above 0.
     samples : float
         Of a gate times pulses of a line.
     bandwidth : float
@@ -60,9 +62,11 @@ def measured_lines(
     ratio = np.asarray(snr(ranges) if callable(snr) else snr, float)
     if ratio.shape not in ((), ranges.shape):
         raise InputError(f"snr: shape {ratio.shape} is not allowed; expected ({ranges.size},)")
-    true, spread = radial_velocities(wind, scan, lidar, origin=origin, resolution=resolution)
+    true, spread, power = gate_moments(
+        wind, scan, lidar, origin=origin, resolution=resolution, signal=signal
+    )
     width = np.hypot(lidar.pulse_width, spread)
-    ratio = np.broadcast_to(ratio, true.shape)
+    ratio = ratio * power
     stderr = cramer_rao(ratio, width, bandwidth, samples)
     random = np.random.default_rng(seed)
     shared = np.maximum(1 - np.abs(ranges - ranges[0]) / lidar.gate_length, 0.0)
@@ -73,7 +77,7 @@ def measured_lines(
     def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
         return both, values, {"units": units, "long_name": long_name}
 
-    time = _START + np.round(scan.time * 1e9).astype("timedelta64[ns]")
+    time = START + np.round(scan.time * 1e9).astype("timedelta64[ns]")
     degree = {"units": "degree"}
     return xr.Dataset(
         {
@@ -81,7 +85,7 @@ def measured_lines(
             "radial_velocity_stderr": field(stderr, "standard error of the radial velocity"),
             "radial_velocity_true": field(true, "radial velocity without noise"),
             "spectral_width": field(width, "width of the Doppler spectrum"),
-            "snr": field(ratio.copy(), "signal-to-noise ratio of the powers", "1"),
+            "snr": field(ratio, "signal-to-noise ratio of the powers", "1"),
             "flag": (both, np.zeros(true.shape, np.uint16), {"flag_meanings": ""}),
         },
         {

@@ -86,6 +86,26 @@ def range_weight(offset: np.ndarray, lidar: CoherentLidar) -> np.ndarray:
     return (scipy.special.erf(upper) - scipy.special.erf(lower)) / (2 * lidar.gate_length)
 
 
+def echo_shift(ranges: np.ndarray, ratio: np.ndarray, lidar: CoherentLidar) -> np.ndarray:
+    """Distance (m) of the middle of a gate's echo from the middle of the gate.
+
+    Where the signal falls with range, the near end of a gate says more: by the variance of
+    `range_weight` times the slope of the logarithm of the signal, to first order in it.
+
+    Parameters
+    ----------
+    ranges, ratio : (gates,) arrays
+        Middles of the gates, m, and signal-to-noise ratio there, above 0.
+    lidar : CoherentLidar
+    """
+    variance = lidar.pulse_length**2 / (8 * math.log(2)) + lidar.gate_length**2 / 12
+    return variance * np.gradient(np.log(ratio), ranges)
+
+
+Signal = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Relative power of the echo at x, y, z (lines, points), in the order of range, and time."""
+
+
 def radial_velocities(
     wind: WindField,
     scan: LineScan,
@@ -93,9 +113,28 @@ def radial_velocities(
     *,
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     resolution: float = 1.0,
-    signal: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
+    signal: Signal | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Radial velocity of a wind field, positive away, and its spread within every gate.
+
+    Parameters and the first two results as of `gate_moments`.
+    """
+    mean, spread, _ = gate_moments(
+        wind, scan, lidar, origin=origin, resolution=resolution, signal=signal
+    )
+    return mean, spread
+
+
+def gate_moments(
+    wind: WindField,
+    scan: LineScan,
+    lidar: CoherentLidar,
+    *,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    resolution: float = 1.0,
+    signal: Signal | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Moments of the echo of every gate: radial velocity, its spread, relative power.
 
     Parameters
     ----------
@@ -109,13 +148,15 @@ def radial_velocities(
     resolution : float
         Distance of the points of the quadrature along a line, m: half of a vortex core or less.
     signal : callable, optional
-        Relative power of the echo at places and times, such as backscatter times transmittance over
-        the range squared. Default: the same everywhere within a gate.
+        `Signal`, such as backscatter times transmittance over the range squared. Default: 1
+        everywhere.
 
     Returns
     -------
     mean, spread : (lines, gates) arrays
-        m/s; the spread is the standard deviation, which widens the Doppler spectrum.
+        m/s, positive away; the spread is the standard deviation, which widens the Doppler spectrum.
+    power : (lines, gates) array
+        Mean of the signal over every gate.
     """
     reach = lidar.gate_length / 2 + _REACH * lidar.pulse_length / math.sqrt(8 * math.log(2))
     near, far = max(lidar.ranges[0] - reach, 0.0), lidar.ranges[-1] + reach
@@ -139,4 +180,4 @@ def radial_velocities(
         power = np.ones(x.shape) if signal is None else signal(x, y, z, time)
         total += part * np.stack([(power * along**n) @ weight.T for n in range(3)])
     mean = total[1] / total[0]
-    return mean, np.sqrt(np.maximum(total[2] / total[0] - mean**2, 0.0))
+    return mean, np.sqrt(np.maximum(total[2] / total[0] - mean**2, 0.0)), total[0]

@@ -135,6 +135,8 @@ def _about(root: xr.Dataset, path: Path) -> dict[str, str | float]:
             about.setdefault(ours, texts[theirs])
     for ours, theirs in (
         ("gate_length", "range_gate_length"),
+        ("gate_length", "gate_length"),
+        ("pulse_length", "pulse_length"),
         ("samples_per_gate", "samples_per_gate"),
         ("pulses_per_line", "shots_per_profile"),
         ("velocity_resolution", "radial_velocity_resolution"),

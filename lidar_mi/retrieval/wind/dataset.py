@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import xarray as xr
 
+import lidar_mi.plots  # noqa: F401 - data.lidar.plot()
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows

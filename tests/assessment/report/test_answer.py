@@ -23,10 +23,11 @@ TABLES = read_requirements()
 
 def an_experiment(speed=70.0, **parts):
     return SimpleNamespace(
-        wake=True,
+        imaged_wake=True,
         volume=None,
         detector=None,
-        doppler=None,
+        fringes=None,
+        coherent=None,
         platform=SimpleNamespace(speed=speed),
         scan=SimpleNamespace(range=148.75, thickness=2.5),
         retrieval=SimpleNamespace(methods=["variational", "cc"]),
@@ -147,8 +148,8 @@ def test_the_vortices_with_their_errors():
 def test_a_statistic_has_its_error_bar():
     """Of few images a standard deviation may be below its bound: 0.119 +- 0.021 against 0.136."""
     experiment = an_experiment()
-    experiment.wake = None
-    experiment.doppler = SimpleNamespace(
+    experiment.imaged_wake = None
+    experiment.fringes = SimpleNamespace(
         lidar=SimpleNamespace(range=56.0),
         retrieval=SimpleNamespace(methods=["annular"], centre=["free"], averaged=[20]),
     )
@@ -280,3 +281,56 @@ def test_of_volumes_the_noise_is_compared():
     assert "it has 1.5 times the variance of the detector noise" in first
     enough = NOISY | {"backscatter_noisy.monte_carlo_fraction": 0.09}
     assert answer(experiment, enough)[0].startswith("Backscatter lidar, ")
+
+
+LINES = {"coherent.lines": 800.0, "coherent.noise": 0.019}
+SLICES = LINES | {
+    "coherent.vortices.scans": 16.0,
+    "coherent.vortices.valid_fraction": 0.75,
+    "coherent.vortices.circulation_error": 0.021,
+    "coherent.vortices.place_error": 0.0041,
+    "coherent.vortices.coverage_95_circulation": 0.9,
+    "coherent.vortices.coverage_95_y": 1.0,
+    "coherent.vortices.coverage_95_z": 0.5,
+}
+
+
+@pytest.mark.parametrize(
+    ("metrics", "lines"),
+    [
+        (
+            SLICES,
+            [
+                "Coherent lidar, 16 vertical slices: median errors of the vortices' circulation "
+                "2.1 %, of their place 0.41 % of the separation (published: 4 % and 6 %); 75 % of "
+                "the slices are valid.",
+                "95 % intervals of circulation, distance and height hold 90 %, 100 %, 50 % of the "
+                "errors.",
+            ],
+        ),
+        (
+            LINES | {"coherent.vortices.scans": 3.0, "coherent.vortices.valid_fraction": 0.0},
+            ["Coherent lidar, 3 vertical slices: no valid vortex."],
+        ),
+        (
+            LINES
+            | {f"coherent.winds.rmse_{name}": 0.25 for name in "uvw"}
+            | {"coherent.winds.valid_fraction": 1.0},
+            [
+                "Coherent lidar: rms errors of the wind to the east, to the north and up 0.250, "
+                "0.250, 0.250 m/s; 100 % of the winds are valid."
+            ],
+        ),
+        (
+            LINES,
+            [
+                "Coherent lidar: 800 lines of sight, whose velocities have a noise of 0.019 m/s "
+                "(median)."
+            ],
+        ),
+    ],
+)
+def test_what_the_lines_of_a_coherent_lidar_tell(metrics, lines):
+    experiment = an_experiment()
+    experiment.imaged_wake, experiment.coherent = None, True
+    assert answer(experiment, metrics) == lines

@@ -6,9 +6,11 @@ from importlib.resources import files
 from typing import get_args
 
 import pytest
+import yaml
 from pydantic import BaseModel
 
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema.coherent import CoherentDoppler
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import check, dump, load
 from lidar_mi.units import Unit, Within
@@ -292,7 +294,45 @@ FAULTS = [
         "render.samples_per_beam=many",
         "render.samples_per_beam: 'many' is not allowed; expected 'auto' or a valid",
     ),
+    # of two kinds of a section
+    (
+        "doppler={kind: heterodyne}",
+        "doppler.kind: 'heterodyne' is not allowed; expected 'fringes' or",
+    ),
+    ("doppler={kind: coherent, etalon: {}}", "doppler.etalon: unknown key (allowed: kind, laser, "),
+    (
+        "doppler={kind: coherent, scan: {azimut: 90 deg}}",
+        "doppler.scan.azimut: unknown key; did you mean azimuth? (allowed: kind, ",
+    ),
+    (
+        "doppler={kind: coherent, scan: {rate: 5}}",
+        "doppler.scan.rate: 5 has no unit; expected a quantity in rad/s such as '500 deg/s'",
+    ),
+    (
+        "doppler={kind: coherent, scan: {elevations: [0 deg, 200 deg]}}",
+        "doppler.scan.elevations.1: 200 deg is not allowed; expected 0 to 180 deg (from",
+    ),
+    (
+        "doppler={kind: coherent, scan: 3}",
+        "doppler.scan: 3 is not allowed; expected a section with keys out of kind, azimuth, ",
+    ),
     # values that exclude each other
+    (
+        "doppler={kind: coherent, scan: {repeat: 1 s}}",
+        "doppler.scan: repeat: 1 s is not allowed with scans of 4 s; expected at least",
+    ),
+    (
+        "doppler={kind: coherent, scan: {elevations: [1 deg, 1.1 deg]}}",
+        "doppler.scan: elevations: less than the 0.5 deg of one line is not allowed; expected more",
+    ),
+    (
+        "doppler={kind: coherent, laser: {first_gate: 15 m}}",
+        "doppler.laser: first_gate: 15 m is not allowed with gates of 30 m; expected more",
+    ),
+    (
+        "doppler={kind: coherent, passage: {decay_time: 9 s, dissipation_rate: 1e-3}}",
+        "doppler.passage: expected one of decay_time and dissipation_rate",
+    ),
     ("wake.vortex_pair={}", "wake: expected one of file, vortex_pair and turbine"),
     ("wake.file=null", "wake: expected one of file, vortex_pair and turbine"),
     ("wake={vortex_pair: {}, second: 41 s}", "wake: second: 41.0 is not allowed with vortex_pair"),
@@ -302,6 +342,49 @@ FAULTS = [
     ("retrieval.search=9", "retrieval: search: 9 is not allowed; expected at least template + 2"),
     ("scan.range=15 m", "scan.range: 15 m is not allowed; expected more than the 15 m flown"),
 ]
+
+
+COHERENT, PAIR = "doppler: {kind: coherent}\n", "wake: {vortex_pair: {}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            PAIR + "scan: {range: 100 m}",
+            "scan: not allowed with doppler.kind coherent; expected it under",
+        ),
+        (
+            PAIR + "sensor: {}",
+            "sensor: not allowed with doppler.kind coherent, a lidar on the ground",
+        ),
+        (
+            PAIR + "encounter: {}",
+            "encounter: not allowed with doppler.kind coherent, a lidar on the",
+        ),
+        ("wake: {turbine: {}}", "wake.turbine: not allowed with doppler.kind coherent; expected"),
+        (
+            "wake: {file: a.nc, depth: volume}",
+            "wake.depth: volume is not allowed with doppler.kind",
+        ),
+        ("", "wake: missing; doppler.scan.kind rhi expects one (ppi and dbs measure the wind)"),
+    ],
+)
+def test_a_coherent_lidar_is_alone_with_its_wake(write, text, message):
+    with pytest.raises(InputError) as error:
+        load(write(f"name: a\n{COHERENT}{text}\n"))
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_the_kind_of_a_doppler_lidar(write):
+    """Fringes without a word, as ever; settings and what is written again have the kind's keys."""
+    fringes = load(write("name: a\ndoppler: {etalon: {gap: 13 mm}}\n"))
+    assert fringes.fringes is fringes.doppler and fringes.coherent is None
+    coherent = load(write("name: a\n" + PAIR + COHERENT))
+    assert coherent.coherent is coherent.doppler and coherent.fringes is None
+    assert coherent.imaged_wake is None and coherent.doppler.scan.kind == "rhi"
+    again = check(yaml.safe_load(dump(coherent)), "again")
+    assert again == coherent and "etalon" not in dump(coherent) and "lidar:" not in dump(coherent)
 
 
 @pytest.mark.parametrize(("override", "message"), FAULTS, ids=[f for f, _ in FAULTS])
@@ -318,10 +401,12 @@ def numbers(model=Experiment, path=()):
     """Every key that takes numbers: dotted name, annotation and all that is nested in it."""
     for name, field in model.model_fields.items():
         parts = list(nested(field.annotation)) + [p for m in field.metadata for p in nested(m)]
-        section = next((p for p in parts if isinstance(p, type) and issubclass(p, BaseModel)), None)
-        if section:
+        kinds = dict.fromkeys(p for p in parts if isinstance(p, type) and issubclass(p, BaseModel))
+        for section in kinds:
             yield from numbers(section, (*path, name))
-        elif {int, float} & {p for p in parts if isinstance(p, type)}:
+        if kinds:
+            continue
+        if {int, float} & {p for p in parts if isinstance(p, type)}:
             yield ".".join((*path, name)), parts
 
 
@@ -350,7 +435,12 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
         for section in sections:
             innermost = innermost.setdefault(section, {})
         pairs = ("scan.azimuth_half", "scan.elevation_half", "wake.centre", "doppler.camera.centre")
-        innermost[key] = [value] * 2 if name in pairs or key in ("cycles", "tilt") else value
+        several = ("cycles", "tilt", "elevations", "azimuths", "wind")
+        innermost[key] = [value] * 2 if name in pairs or key in several else value
+        if name.split(".")[0] == "doppler" and name.split(".")[1] in CoherentDoppler.model_fields:
+            data["doppler"]["kind"] = "coherent"
+        if key == "position":
+            innermost[key] = [value] * 3
         if key in ("v_los", "averaged"):
             innermost[key] = [value]
         if name.startswith("scattering.parts"):

@@ -175,6 +175,7 @@ def test_texture_moves_with_the_wind_in_the_plane(tmp_path):
     assert float(wind["w"].mean()) == pytest.approx(1.25**2 / 3 + STEP**2 / 6, abs=0.002)
 
 
+@pytest.mark.slow
 def test_the_state_that_the_simulation_stored_is_nearer(tmp_path):
     """Wind along x is a quarter of what in-plane advection lacks; the rest is not of the wind."""
     wake = {"time": "40 s", "x": "20.5 m", "extinction": {}, "texture": {"rms": 0}}

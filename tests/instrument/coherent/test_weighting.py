@@ -13,7 +13,13 @@ import scipy
 from lidar_mi.atmosphere.vortex import angular_velocity
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.scans import dbs_scan, directions, ppi_scan, rhi_scan, stare_scan
-from lidar_mi.instrument.coherent.weighting import CoherentLidar, radial_velocities, range_weight
+from lidar_mi.instrument.coherent.weighting import (
+    CoherentLidar,
+    echo_shift,
+    gate_moments,
+    radial_velocities,
+    range_weight,
+)
 
 LIDAR = CoherentLidar(gate_length=30.0, first_gate=105.0, gate_step=10.0, gates=80)
 
@@ -148,3 +154,22 @@ def test_times_and_directions_of_scans():
         ppi_scan(0.0, (0.0, 0.001), 1.0, 1.0)
     with pytest.raises(InputError, match=r"lidar.first_gate: 10 m"):
         CoherentLidar(first_gate=10.0)
+
+
+def test_where_the_echo_of_a_gate_is():
+    """Of a signal exp(k r) the weighted wind r is that at r + variance k, to first order in k."""
+    lidar = CoherentLidar(first_gate=300.0, gate_step=10.0, gates=30)
+    slope = -0.004
+
+    def wind(x, y, z, time):
+        return np.zeros_like(y), y, np.zeros_like(y)
+
+    def signal(x, y, z, time):
+        return np.exp(slope * (y - 300))
+
+    found, _, power = gate_moments(wind, stare_scan(0.0, 0.0, 1.0, 1), lidar, signal=signal)
+    shift = echo_shift(lidar.ranges, power[0], lidar)
+    assert shift[10] == pytest.approx(slope * (30**2 / 12 + (lidar.pulse_length / 2.354820) ** 2))
+    np.testing.assert_allclose(found[0], lidar.ranges + shift, atol=0.02)
+    # without a signal, power is 1 everywhere
+    assert gate_moments(wind, stare_scan(0.0, 0.0, 1.0, 1), lidar)[2] == pytest.approx(1.0)

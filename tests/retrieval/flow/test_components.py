@@ -79,7 +79,9 @@ def retrieved(images, level, monkeypatch, stride=4):
     return found, models[-1], residuals[-1]
 
 
-@pytest.mark.parametrize(("level", "unbiased"), [(0.05, 0.025), (0.01, 0.05)])
+@pytest.mark.parametrize(
+    ("level", "unbiased"), [(0.05, 0.025), pytest.param(0.01, 0.05, marks=pytest.mark.slow)]
+)
 def test_noise_that_the_flow_absorbs_is_counted(level, unbiased, monkeypatch):
     """Six flows of two spectra, noise not told: the mean of estimates over the sample variances.
 
@@ -125,7 +127,7 @@ def test_noise_told_by_a_map_stays_where_it_is(monkeypatch):
 
 
 @pytest.mark.parametrize("level", [0.002, pytest.param(0.01, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("told", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_replaced_texture_is_found(level, told, monkeypatch):
     """Texture of a spectrum k^-4 at rest; means of four seeds, of which one is right to 20 %."""
     for fraction in (0.0, 0.1, 0.3):
@@ -161,7 +163,7 @@ def slices(through, seed, level):
     return [image / pair[0].std() + level * random.standard_normal(image.shape) for image in pair]
 
 
-@pytest.mark.parametrize("through", [0.1, 0.3])
+@pytest.mark.parametrize("through", [pytest.param(0.1, marks=pytest.mark.slow), 0.3])
 def test_motion_through_the_plane_is_found(through, monkeypatch):
     """The mean of two pairs to 15 % of the displacement, without replaced texture."""
     amplitudes = [

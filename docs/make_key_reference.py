@@ -1,0 +1,145 @@
+"""Write docs/reference/keys*.md from the descriptions of the experiment file.
+
+Usage: ``python docs/make_key_reference.py``.
+
+The pages say what ``lidar-mi explain`` says, a page for each section of a file.
+"""
+
+import re
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from lidar_mi.experiment.schema import keys
+
+FOLDER = Path(__file__).with_name("reference")
+
+NOTE = (
+    "<!-- Written by docs/make_key_reference.py from the descriptions of the keys; edit those. -->"
+)
+HEAD = f"""\
+# Keys
+
+{NOTE}
+
+Every key of an experiment file, section by section: unit, default, what is allowed, what it does.
+[Experiment files](../guide/keys.md) describes their syntax. A plain number is in the unit of the
+table, except that angles always need a unit. Limits have their reason in parentheses.
+`lidar-mi explain KEY` says the same on the command line.
+"""
+# where a section is described in use
+GUIDES = {
+    "wake": "[your own wake](../guide/wake.md), [wakes from flow solvers](../cfd.md)",
+    "platform": "[times and poses of beams](../guide/beams.md)",
+    "lidar": "[your own sensor](../guide/sensor.md), [lidar equation](../theory/lidar_equation.md)",
+    "detector": "[detectors](../guide/keys.md#detectors), [theory](../theory/detector.md)",
+    "scan": "[times and poses of beams](../guide/beams.md), [theory](../theory/scan.md)",
+    "scattering": "[mixtures](../guide/keys.md#mixtures), [theory](../theory/scatterers.md)",
+    "render": "[runs](../guide/running.md), "
+    "[simulation or lidar](../guide/methods.md#simulation-or-lidar)",
+    "retrieval": "[methods](../guide/methods.md), [limits](../guide/keys_retrieval.md#retrieval)",
+    "doppler": "[Doppler lidar](../guide/keys_retrieval.md#doppler), [rings](../guide/rings.md)",
+    "sensor": "[both lidars](../guide/keys_sensor.md#sensor), [theory](../theory/combination.md)",
+    "volume": "[volumes](../guide/keys_sensor.md#volume), [theory](../theory/volumes.md)",
+    "encounter": "[flights](../guide/flights.md), [air](../guide/air.md), "
+    "[theory](../theory/encounter.md)",
+}
+TABLE = "| key | unit | default | allowed | meaning |\n| --- | --- | --- | --- | --- |"
+
+
+def pages() -> dict[str, str]:
+    """Texts of all pages by the names of their files."""
+    found = [keys.explain(name) for name in keys.sections()]
+    top = [keys.explain(name) for name in keys.OF_A_FILE]
+    sections = [key for key in found if key.keys]
+    of_a_file = [_line(key) for key in (*found, *top) if not key.keys]
+    listed = [f"| [`{key.name}`](keys_{key.name}.md) | {_text(key.meaning)} |" for key in sections]
+    contents = "\n".join(
+        [
+            HEAD,
+            "\n".join([TABLE, *of_a_file]),
+            "",
+            "\n".join(["| section | |", "| --- | --- |", *listed]),
+            "",
+            "```{toctree}\n:hidden:\n",
+            *(f"keys_{key.name}" for key in sections),
+            "```\n",
+        ]
+    )
+    return {"keys.md": contents} | {f"keys_{key.name}.md": section(key) for key in sections}
+
+
+def section(key: keys.Key) -> str:
+    """The page of a section at the top of a file."""
+    # a section of another package may have no page of its own in the guide
+    see = f"In use: {GUIDES[key.name]}." if key.name in GUIDES else ""
+    parts = [f"# {key.name}", NOTE, *(part for part in _about(key) if part), see]
+    parts += [_table(key), *_below(key)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _below(key: keys.Key) -> list[str]:
+    """The sections in a section, each with what it is and its keys."""
+    found = []
+    for inner in map(keys.explain, key.keys):
+        if inner.keys:
+            each = "A list of sections, each with these keys." if _is_list(inner) else ""
+            found += [f"## {inner.name}", *_about(inner), each, _table(inner), *_below(inner)]
+    return found
+
+
+def _table(key: keys.Key) -> str:
+    rows = [_line(inner) for inner in map(keys.explain, key.keys) if not _always(inner)]
+    return "\n".join([TABLE, *rows]) if rows else ""
+
+
+def _always(key: keys.Key) -> bool:
+    """Whether it is a section that every experiment has, of which the keys say all."""
+    return bool(key.keys) and isinstance(key.value, BaseModel)
+
+
+def _is_list(key: keys.Key) -> bool:
+    return key.allowed.startswith("a list")
+
+
+def _about(key: keys.Key) -> list[str]:
+    return [_text(part) for part in key.more]
+
+
+def _line(key: keys.Key) -> str:
+    cells = [f"`{key.name}`", _raised(key.unit), _code(key.default), _allowed(key)]
+    return f"| {' | '.join([*cells, _text(key.meaning)])} |"
+
+
+def _allowed(key: keys.Key) -> str:
+    """What is allowed, words as code, units as in their own column."""
+    text = key.allowed
+    for word in (*key.words, "null"):
+        text = re.sub(rf"(^|, |of ){re.escape(word)}(?=, |$)", rf"\1`{word}`", text)
+    return _raised(text)
+
+
+def _code(text: str) -> str:
+    return f"`{text}`" if text and text != "required" else text
+
+
+def _raised(text: str) -> str:
+    """Squares and cubes of units."""
+    return re.sub(r"(?<=[a-z])\^([23])", lambda found: "²³"[int(found[1]) - 2], text)
+
+
+def _text(text: str) -> str:
+    """Prose as Markdown: names of keys as code, but for those that are code already."""
+    parts = re.split(r"(`[^`]*`)", text)
+    named = r"(?<![\w.`/-])([a-z]\w*(?:[._][a-z]\w*)+)(?![\w`-])"
+    parts[::2] = [re.sub(named, r"`\1`", part.replace("<", r"\<")) for part in parts[::2]]
+    return "".join(parts)
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    for old in FOLDER.glob("keys*.md"):
+        old.unlink()
+    for name, text in pages().items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
+    print(f"{FOLDER}: {len(pages())} pages of keys")

@@ -1,0 +1,68 @@
+"""A coherent lidar and the air that passes it, in numbers, before a run."""
+
+import math
+
+import numpy as np
+
+from lidar_mi.experiment.schema.coherent import CoherentDoppler
+from lidar_mi.experiment.stages.coherent_lines import (
+    coherent_lidar,
+    line_scan,
+    plane_place,
+    receiver,
+)
+from lidar_mi.experiment.truth.passing_wake import PassingWake
+from lidar_mi.instrument.coherent.velocity_noise import cramer_rao
+from lidar_mi.units import shown
+
+Rows = list[tuple[str, str]]
+
+
+def coherent_rows(doppler: CoherentDoppler) -> Rows:
+    """Pulses, gates, scans and the noise of a velocity."""
+    laser, scan, signal = doppler.laser, doppler.scan, doppler.signal
+    lines, lidar = line_scan(scan), coherent_lidar(doppler)
+    samples, bandwidth = receiver(doppler)
+    ratio = np.array(10 ** (signal.cnr / 10))
+    noise = float(cramer_rao(ratio, np.array(lidar.pulse_width), bandwidth, samples))
+    step = ""
+    if scan.kind in ("rhi", "ppi"):
+        angle = scan.rate * scan.accumulation
+        step = f", {math.degrees(angle):.3g} deg or {angle * signal.range:.3g} m apart"
+    count = int(np.unique(lines.sweep).size)
+    return [
+        ("laser", f"{shown(laser.wavelength, 'nm')}, pulses of {laser.pulse_length:g} m"),
+        (
+            "gates",
+            f"{laser.gates} of {laser.gate_length:g} m from {laser.first_gate:g} to "
+            f"{lidar.ranges[-1]:g} m, {laser.gate_spacing:g} m apart",
+        ),
+        ("scan", f"{scan.kind}, {count} of {scan.duration:.3g} s"),
+        ("lines", f"{lines.time.size} of {shown(scan.accumulation, 's')}{step}"),
+        ("duration", f"{lines.time[-1] + scan.accumulation / 2:.4g} s"),
+        ("noise of a velocity", f"{noise:.2g} m/s in uniform air at {signal.range:g} m"),
+        ("largest velocity", f"{bandwidth / 2:.3g} m/s"),
+    ]
+
+
+def passage_rows(doppler: CoherentDoppler, air: PassingWake) -> Rows:
+    """The wind, and both vortices at the first and at the last line."""
+    along, left = air.mean.at(np.array(doppler.passage.height))
+    rows = [("mean wind", f"{along:.3g} m/s along the flight, {left:.3g} m/s to its left")]
+    if air.gusts is not None:
+        rms = math.sqrt(float((air.gusts.amplitudes**2).sum()) / 6)
+        rows.append(("turbulence", f"{rms:.2g} m/s rms of a component"))
+    times = line_scan(doppler.scan).time
+    for name, time in (("first", float(times[0])), ("last", float(times[-1]))):
+        for side, one in zip(("port", "starboard"), air.vortices(time) or (), strict=False):
+            where = f"y = {one.y:.4g} m, z = {one.z:.3g} m"
+            if doppler.scan.kind == "rhi":
+                where = f"{plane_place(doppler, one.y):.4g} m from the lidar, {one.z:.3g} m high"
+            age = doppler.passage.age + time
+            rows.append(
+                (
+                    f"{side} vortex at the {name} line",
+                    f"{abs(one.circulation):.4g} m^2/s, {where}, age {age:.3g} s",
+                )
+            )
+    return rows

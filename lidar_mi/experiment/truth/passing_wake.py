@@ -1,0 +1,284 @@
+"""The air that passes a coherent lidar on the ground: a wake, the mean wind and turbulence.
+
+Frame of the passage: x along the flight, forward; y left; z the height above the ground; x = y = 0
+where the wake begins; time 0 at the first line. The lidar's frame: to the east, to the north, up.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from scipy.integrate import cumulative_trapezoid
+
+from lidar_mi.assessment.metrics.cores import find_cores, ring_averages
+from lidar_mi.atmosphere.air.shear import LogarithmicShear
+from lidar_mi.atmosphere.air.standards import CS_25_LENGTH, mil_f_8785c
+from lidar_mi.atmosphere.air.turbulence import Turbulence, turbulence
+from lidar_mi.atmosphere.ground_effect import PairAboveGround
+from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.atmosphere.wake_decay import sarpkaya_decay_time
+from lidar_mi.atmosphere.wake_path import Components
+from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.input_files import find_file
+from lidar_mi.experiment.schema.air import Turbulence as TurbulenceKeys
+from lidar_mi.experiment.schema.coherent import AirAtTheGround, CoherentDoppler, Passage
+from lidar_mi.experiment.schema.wake import ExtinctionMapping, VortexPair, Wake
+from lidar_mi.experiment.truth.extinction import extinction_of
+from lidar_mi.experiment.truth.flows import tracers_of
+from lidar_mi.instrument.coherent.weighting import Signal
+from lidar_mi.io.wake_file import read_wake
+
+_OUTER = (15.0, 12.0, 10.0, 8.0)  # m, of the rings over which circulation is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class MeanWind:
+    """Wind along the flight and to its left by height: the same everywhere, and a surface layer."""
+
+    along: float
+    left: float
+    layer: LogarithmicShear | None
+
+    def at(self, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Both components (m/s) at heights above the ground (m)."""
+        speed = np.zeros_like(height) if self.layer is None else self.layer.wind_at(height)
+        towards = 0.0 if self.layer is None else self.layer.towards
+        return self.along + math.cos(towards) * speed, self.left + math.sin(towards) * speed
+
+    def to_the_left(self, height: np.ndarray) -> np.ndarray:
+        """The second alone."""
+        return self.at(height)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class PassingWake:
+    """All of the air, seen from the lidar.
+
+    Attributes
+    ----------
+    wake : PairAboveGround, VolumeAlongPath or None
+    mean : MeanWind
+    gusts : Turbulence or None
+        Frozen in the mean wind at ``height`` unless it evolves.
+    height : float
+        m.
+    heading : float
+        Of the flight, rad, clockwise from north.
+    position : (float, float, float)
+        Of the lidar, m.
+    """
+
+    wake: PairAboveGround | VolumeAlongPath | None
+    mean: MeanWind
+    gusts: Turbulence | None
+    height: float
+    heading: float
+    position: tuple[float, float, float]
+
+    def places(self, east: np.ndarray, north: np.ndarray, up: np.ndarray) -> Components:
+        """x, y, z (m) of places relative to the lidar."""
+        s, c = math.sin(self.heading), math.cos(self.heading)
+        x0, y0, z0 = self.position
+        return x0 + s * east + c * north, y0 - c * east + s * north, z0 + up
+
+    def wind(
+        self, east: np.ndarray, north: np.ndarray, up: np.ndarray, time: np.ndarray
+    ) -> Components:
+        """Wind (m/s) to the east, to the north and up; a `WindField` about the lidar."""
+        u, v, w = self.in_frame(*self.places(east, north, up), time)
+        s, c = math.sin(self.heading), math.cos(self.heading)
+        return s * u - c * v, c * u + s * v, w
+
+    def in_frame(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, time: np.ndarray) -> Components:
+        """u, v, w (m/s) in the frame of the passage; x is along the flight."""
+        u, v = self.mean.at(z)
+        w = np.zeros_like(z)
+        if isinstance(self.wake, PairAboveGround):
+            found = self.wake.wind(y, z, time)
+            v, w = v + found[0], w + found[1]
+        elif self.wake is not None:
+            of_wake = self.wake.wind(x, y, z, time)
+            u, v, w = u + of_wake[0], v + of_wake[1], w + of_wake[2]
+        if self.gusts is not None:
+            along, left = self.mean.at(np.array(self.height))
+            of_gusts = self.gusts.velocity(x - along * time, y - left * time, z, time)
+            u, v, w = u + of_gusts[0], v + of_gusts[1], w + of_gusts[2]
+        return u, v, w
+
+    def vortices(self, time: float) -> tuple[Vortex, Vortex] | None:
+        """Port and starboard vortex in a plane across the flight; None: no wake."""
+        if self.wake is None:
+            return None
+        if isinstance(self.wake, PairAboveGround):
+            return self.wake.vortices(time)
+        return self.wake.vortices(0.0, time)
+
+
+def passing_wake(
+    doppler: CoherentDoppler, wake: Wake | None, seed: int, search_path: Path, last: float
+) -> PassingWake:
+    """The air of an experiment until a time (s).
+
+    Raises
+    ------
+    InputError
+        A file without two vortices in its plane; keys that it does not allow; turbulence out of
+        range.
+    """
+    passage, air = doppler.passage, doppler.air
+    mean = _mean(air)
+    found: PairAboveGround | VolumeAlongPath | None = None
+    if wake is not None and wake.vortex_pair is not None:
+        found = _pair(wake.vortex_pair, passage, mean, last)
+    elif wake is not None:
+        found = _plane(wake, passage, mean, search_path)
+    gusts = None if air.turbulence is None else _turbulence(air.turbulence, passage.height, seed)
+    return PassingWake(found, mean, gusts, passage.height, passage.heading, doppler.position)
+
+
+def echo(doppler: CoherentDoppler, wake: Wake | None, air: PassingWake) -> Signal | None:
+    """Power of the echo over that at ``signal.range`` in the background alone; None: 1 everywhere.
+
+    Extinction over the square of the range times the transmittance there and back. Between the
+    lidar and the first point of a line there is the background.
+    """
+    if doppler.signal.profile == "constant":
+        return None
+    background = (ExtinctionMapping() if wake is None else wake.extinction).background
+    if not background > 0:
+        raise InputError(
+            "wake.extinction.background: 0 is not allowed with doppler.signal.profile "
+            "lidar_equation; expected above 0, or constant"
+        )
+    reference, inside = doppler.signal.range, air.wake
+
+    def power(east: np.ndarray, north: np.ndarray, up: np.ndarray, time: np.ndarray) -> np.ndarray:
+        distance = np.sqrt(east**2 + north**2 + up**2)
+        alpha = np.full(distance.shape, background)
+        if isinstance(inside, VolumeAlongPath):
+            alpha = inside.extinction(*air.places(east, north, up), time)
+        passed = cumulative_trapezoid(alpha, distance, axis=-1, initial=0.0)
+        depth = background * (distance[..., :1] - reference) + passed
+        return alpha / background * (reference / distance) ** 2 * np.exp(-2 * depth)
+
+    return power
+
+
+def _mean(air: AirAtTheGround) -> MeanWind:
+    layer, given = None, air.logarithmic_shear
+    if given is not None:
+        layer = LogarithmicShear(
+            given.speed, given.reference, given.roughness, given.towards, given.reference
+        )
+    return MeanWind(*air.wind, layer)
+
+
+def _pair(pair: VortexPair, passage: Passage, mean: MeanWind, last: float) -> PairAboveGround:
+    decay = passage.decay_time
+    if passage.dissipation_rate is not None:
+        decay = sarpkaya_decay_time(pair.circulation, pair.separation, passage.dissipation_rate)
+    return PairAboveGround(
+        pair.circulation,
+        pair.separation,
+        pair.core_radius,
+        passage.height,
+        last,
+        passage.age,
+        decay,
+        mean.to_the_left,
+        pair.model,
+        passage.ground,
+    )
+
+
+def _turbulence(given: TurbulenceKeys, height: float, seed: int) -> Turbulence:
+    sigma, length = given.sigma, given.length
+    if given.standard == "cs_25":
+        length = length or CS_25_LENGTH
+    elif sigma is None or length is None:
+        rms, scale = mil_f_8785c(height, given.level)
+        sigma, length = rms if sigma is None else sigma, length or scale
+    assert sigma is not None and length is not None  # the section refuses cs_25 without sigma
+    if given.shortest > length / 10:
+        raise InputError(
+            f"doppler.air.turbulence.shortest: {given.shortest:g} m is not allowed with the "
+            f"length of {length:.3g} m at {height:g} m; expected at most {length / 10:.3g} m"
+        )
+    return turbulence(
+        sigma,
+        length,
+        seed if given.seed is None else given.seed,
+        spectrum=given.spectrum,
+        shortest=given.shortest,
+        evolution=given.evolution,
+    )
+
+
+def _plane(wake: Wake, passage: Passage, mean: MeanWind, search_path: Path) -> VolumeAlongPath:
+    """A simulated plane, extruded, that drifts and sinks as it is: without decay, without ground.
+
+    Beyond the file's edges the wind is that of two vortices at the places and with the circulation
+    of those of the plane.
+    """
+    for key, given in (
+        ("age", passage.age),
+        ("decay_time", passage.decay_time),
+        ("dissipation_rate", passage.dissipation_rate),
+    ):
+        if given:
+            raise InputError(
+                f"doppler.passage.{key}: {given:g} is not allowed with wake.file; expected "
+                "wake.vortex_pair"
+            )
+    assert wake.file is not None  # of the kinds of wake that a coherent lidar observes
+    path = find_file(wake.file, search_path, "wake.file")
+    needed, names = tracers_of(wake)
+    flow = read_wake(path, wake.time, names, wake.x, require=needed)
+    if flow.sizes["x"] > 1:
+        planes = flow["x"].values
+        raise InputError(
+            f"wake.x: missing; {path.name} has {planes.size} planes, expected one of "
+            f"{planes[0]:g} to {planes[-1]:g} m"
+        )
+    field = extinction_of(flow, wake.extinction, flow, None)
+    flow = flow[[n for n in "uvw" if n in flow]].assign(extinction=field)
+    section = flow.isel(x=0)
+    sides, drifts = _vortices(section, path.name)
+    y = float(np.mean([one.y for one in sides]))
+    z = float(np.mean([one.z for one in sides]))
+    own_y, own_z = wake.centre or (y, z)
+    v, w = np.mean(drifts, axis=0)
+    return VolumeAlongPath(
+        flow,
+        (sides[0],),
+        (sides[1],),
+        background=wake.extinction.background,
+        drift=(float(v) + float(mean.to_the_left(np.array(passage.height))), float(w)),
+        origin=(float(flow["x"][0]), own_y, own_z),
+        miss=(0.0, passage.height),
+    )
+
+
+def _vortices(section: xr.Dataset, name: str) -> tuple[list[Vortex], list[tuple[float, float]]]:
+    """Port and starboard vortex of a plane, and the winds that carry them."""
+    cores = find_cores(section)
+    if len(cores) != 2:
+        raise InputError(
+            f"wake.file: {name} has {len(cores)} vortices in its plane; expected two of opposite "
+            "sense"
+        )
+    vortices, drifts = [], []
+    for core, partner in zip(cores, cores[::-1], strict=True):
+        tried = (ring_averages(section, core, [partner], outer=outer) for outer in _OUTER)
+        rings = next((one for one in tried if one is not None), None)
+        if rings is None:
+            raise InputError(
+                f"wake.file: {name} has vortices too close to each other or to the plane's edge; "
+                f"expected {_OUTER[-1]:g} m of their own flow about them"
+            )
+        vortices.append(Vortex(rings.circulation, core.radius, core.y, core.z))
+        drifts.append((rings.v, rings.w))
+    return vortices, drifts

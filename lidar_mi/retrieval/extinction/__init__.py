@@ -1,0 +1,1 @@
+"""Extinction along a beam from its range profile, by single scattering in closed form."""

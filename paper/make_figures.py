@@ -1,0 +1,23 @@
+"""Draw the figures of the paper: three to four minutes on two cores.
+
+Usage: ``python paper/make_figures.py``.
+"""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import lidar_mi as lm
+
+PAPER = Path(__file__).parent
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as folder:
+        lm.run("wake_backscatter", f"{folder}/wake")
+        lm.fly("encounter", f"{folder}/flight")
+        for figure, name in (
+            ("wake/figures/fig00_overview.png", "figure_wake.png"),
+            ("flight/figures/fig30_roll.png", "figure_encounter.png"),
+        ):
+            shutil.copy(Path(folder, figure), PAPER / name)
+            print(PAPER / name)
