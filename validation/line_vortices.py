@@ -21,8 +21,8 @@ INTRODUCTION = (
     "bound. Wakes are drawn anew for every seed. Constants were chosen on other families."
 )
 
-SCANS = 100
-AIR_SCANS = 150
+SCANS = 60
+AIR_SCANS = 60
 FIRST_SEED = 50_000
 
 SIMULATED = Path(__file__).resolve().parents[1] / "scenes" / "wake_volume_40s.nc"
