@@ -16,6 +16,7 @@ from lidar_mi.inversion.scoring import Fit, Known, fit
 from lidar_mi.rendering.backscatter import ScanRenderer
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
+from lidar_mi.retrieval.extinction.profile import numbers
 
 MOST_ROUNDS = 24
 NEAR, CONVERGED = 2.0, 0.1
@@ -144,7 +145,7 @@ def invert_extinction(
         np.linspace(plan.gate_start, plan.gate_stop, plan.gate_count + 1),
         1 / plan.obliquity().ravel(),
     )
-    number = np.asarray(counts, float).reshape(len(counts), -1)
+    number = counts.reshape(len(counts), -1)
     profile = _first(start, air)
     _check_light(layers.signal(profile, 1.0)[0], plan)
     # in the first rounds the profile is far from the last: few samples do
@@ -248,7 +249,7 @@ def _first(start: ArrayLike | None, air: LayeredAir) -> np.ndarray:
     """The start at the nodes: as given, or an optical depth of 1."""
     if start is None:
         return np.full(len(air.nodes()), 1 / (np.ptp(air.x) * len(air.x) / (len(air.x) - 1)))
-    profile = np.asarray(start, float)
+    profile = numbers("start", start)
     if profile.shape != air.x.shape or not (np.isfinite(profile) & (profile > 0)).all():
         raise InputError(
             f"start: shape {profile.shape} or values are not allowed; expected an extinction above "
@@ -286,7 +287,7 @@ def _checked(
     settings: RenderSettings,
     background: float,
 ) -> np.ndarray:
-    counts = np.asarray(counts, float)
+    counts = numbers("counts", counts)
     expected = (plan.gate_count, len(plan.z), len(plan.y))
     if plan.gate_kind != "spherical":
         raise InputError(f"scan.gates: {plan.gate_kind} is not allowed; expected spherical gates")

@@ -37,6 +37,7 @@ from benchmarks import (
     estimators,
     fringes,
     gpu,
+    gradients,
     growth,
     measure,
     methods,
@@ -272,6 +273,16 @@ def test_candidates_lower_the_variance(variant):
     for order in (1, 4):
         case = f"orders up to {order}, 64 samples per beam"
         assert found[case, "relative variance of a pixel"].ratio > 1.5
+
+
+def test_gradients_take_little_more_memory_with_the_orders(variant):
+    times, memory = {}, {}
+    for order in (1, 4):
+        times[order], memory[order] = gradients.measured(order, 1, 400)
+    assert all(set(found) == {"image", "reverse", "forward"} for found in times.values())
+    assert min(seconds[0] for found in times.values() for seconds in found.values()) > 0
+    # the largest memory so far
+    assert memory[1] <= memory[4] < memory[1] + 200e6
 
 
 @pytest.mark.slow

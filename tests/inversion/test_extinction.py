@@ -134,11 +134,26 @@ def test_solution_has_the_full_model_whatever_the_derivative(variant, signal, mo
     assert np.sqrt((((one - other) / stated) ** 2).mean()) < 1
 
 
+def test_oblique_beams_share_the_profile(variant, signal):
+    """Two beams to both sides, each with the counts of the one on axis."""
+    sides = 170 * np.tan(np.deg2rad([-2.0, 2.0]))
+    plan = ScanPlan(sides, np.zeros(1), 100.0, 219.5, "spherical", GATES, 0.0)
+    per_signal = 1e4 / signal[0].max()
+    counts = np.concatenate([per_signal * signal[0]] * 2, axis=2)
+    reference = (true_layers()[-1], 0.1)
+    given = plan, LIDAR, AIR, per_signal, settings(variant, 8_000, fraction=0.5)
+    found = invert_extinction(counts, *given, reference=reference)
+    # gates of 9.96 m and beams oblique by 2 degrees: 0.4 % and 0.06 % of the way
+    assert found["ratio"].shape == (GATES, 1, 2)
+    assert rms(found["extinction"].values) < 0.05
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"counts": np.ones((3, 1, 1))}, r"counts: shape \(3, 1, 1\) or values are not allowed"),
         ({"counts": np.full((GATES, 1, 1), 2.0)}, "counts: 24 in all gates is not above the back"),
+        ({"counts": "many"}, "counts: 'many' is not allowed; expected numbers"),
         ({"counts_per_signal": 0.0}, "counts_per_signal: 0.0 is not allowed"),
         ({"background": -1.0}, "background: -1.0 is not allowed; expected 0 counts or more"),
         ({"calibration_error": 1.0}, "calibration_error: 1.0 is not allowed"),

@@ -2,7 +2,7 @@
 
 Detects: states or axes in another order, an error of 1e-5 between states or cells, a beam that
 meets the air of another time, a pattern displaced by more than the closed form says, gradients that
-reach the states of other times.
+reach the states of other times, air that a flow carries to another place, or past its bounds.
 """
 
 import math
@@ -173,6 +173,77 @@ def test_gradients_belong_to_the_states_around_a_beams_time(world):
     assert np.abs(moving - expected).max() < 1e-4 * np.abs(still).max()
 
 
+def carried(flow, **parameters):
+    """One state, carried by a flow for half a second or less."""
+    tensor = mi.TensorXf(np.asarray(flow, np.float32))
+    times = {"time_start": -0.05, "time_stop": -0.05}
+    return mi.load_dict(volume(STATES[:1], flow=tensor, **(times | parameters)))
+
+
+def test_a_uniform_flow_displaces_the_state():
+    """Frozen air: what is there now was flow x time upwind, also beyond the ends."""
+    random = np.random.default_rng(4)
+    place, time = random.uniform(LOW - 1, HIGH + 1, (2000, 3)), random.uniform(-0.05, 0.5, 2000)
+    wind = np.array([2.0, -9.0, 6.0])
+    found = np.array(carried(np.broadcast_to(wind, (2, 3, 2, 3))).eval_1(interactions(place, time)))
+    upwind = place - wind * (time[:, None] + 0.05)
+    still = mi.load_dict(volume(STATES[:1]))
+    assert np.abs(found - np.array(still.eval_1(interactions(upwind, time)))).max() < 1e-4
+
+
+def test_a_rotation_is_followed_to_second_order():
+    """Solid rotation by an angle a: a step of the midpoint rule ends a^3 / 6 r beside the arc."""
+    cells = np.stack(np.meshgrid(*(np.arange(40) + 0.5,) * 2, indexing="ij"), -1) / 40
+    z, y = np.moveaxis(LOW[[2, 1]] + cells * (HIGH - LOW)[[2, 1]], -1, 0)
+    rate = 0.8
+    wind = np.stack([0 * y, -rate * z, rate * y], -1)[:, :, None]
+    # a field that is linear in y: values are places
+    values = np.broadcast_to(y[None, :, :, None], (1, 40, 40, 1)) + 10
+    random = np.random.default_rng(5)
+    place = np.column_stack([np.full(500, 501.0), *random.uniform(-4, 4, (2, 500))])
+    for age in (0.25, 0.5):
+        loaded = mi.load_dict(
+            volume(values, flow=mi.TensorXf(wind.astype(np.float32)), time_start=0, time_stop=0)
+        )
+        found = np.array(loaded.eval_1(interactions(place, np.full(500, age)))) - 10
+        angle = rate * age
+        origin = place[:, 1] * np.cos(angle) + place[:, 2] * np.sin(angle)
+        radius = np.hypot(place[:, 1], place[:, 2])
+        off = np.abs(found - origin)
+        assert (off < angle**3 / 6 * radius + 1e-4).all()
+
+
+def test_carried_air_before_a_lidar(world):
+    """Signals are those of the displaced state, whose bounds are others."""
+    values = 0.05 * STATES[:1]
+    values[..., 2] *= 8
+    table = np.zeros((1, 7))
+    table[:, 3], table[:, 6] = 1, 0.2
+    wind = np.broadcast_to([8.0, 0.0, 0.0], (1, 1, 1, 3)).astype(np.float32)
+
+    def signal(description, seed):
+        medium = world.homogeneous(0.0) | {"type": "heterogeneous", "sigma_t": description}
+        scene = world.scene(
+            world.lidar((1, 1), (500.0, 503.0), beams=mi.TensorXf(table)),
+            slab=world.box(LOW, HIGH, medium),
+        )
+        image = np.array(mi.render(scene, spp=20_000, seed=seed), float).ravel()
+        return image[0], image[4]
+
+    flowing = volume(values, flow=mi.TensorXf(wind), time_start=-0.05, time_stop=-0.05)
+    # the same as states on a grid four times finer: cells' centres and those between
+    fine = mi.load_dict(flowing)
+    x = LOW[0] + (np.arange(240) + 0.5) / 240 * (HIGH - LOW)[0]
+    axes = [LOW[k] + (np.arange(n) + 0.5) / n * (HIGH - LOW)[k] for k, n in ((2, 4), (1, 6))]
+    places = np.stack(np.meshgrid(*axes, x, indexing="ij"), -1)[..., ::-1].reshape(-1, 3)
+    sampled = np.array(fine.eval_1(interactions(places, np.full(len(places), 0.2))))
+    still = volume(sampled.reshape(1, 4, 6, 240))
+    (one, error), (other, other_error) = signal(flowing, 1), signal(still, 2)
+    assert abs(one - other) < 4 * math.hypot(error, other_error) + 1e-3 * other
+    before, _ = signal(volume(values), 2)
+    assert abs(one - before) > 20 * error
+
+
 def test_new_states_compile_nothing(world):
     """Data, times and the number of states change from scan to scan."""
     states = 0.05 * STATES
@@ -210,6 +281,12 @@ def test_new_states_compile_nothing(world):
             "moving_volume.data: 'absent.npy' is not allowed; expected a readable",
         ),
         ({"to_world": (0, 1, 1)}, "moving_volume.to_world: "),
+        ({"flow": np.ones((2, 3, 3))}, "moving_volume.flow: 'shape (2, 3, 3)' is not allowed"),
+        ({"flow": np.ones((2, 3, 3, 3))}, "moving_volume.flow: 'a wind of 5 states' is not"),
+        (
+            {"data": STATES[:1], "flow": np.full((1, 1, 1, 3), np.nan)},
+            "moving_volume.flow: 'numbers that are none' is not allowed; expected finite ones",
+        ),
     ],
 )
 def test_bad_values_are_named(parameters, message):

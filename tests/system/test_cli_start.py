@@ -196,7 +196,7 @@ def test_explain_a_section_has_its_keys(lidar_mi):
         ("scan.gate", "scan.gates or scan.gate_count"),
         ("scan.gatse", "scan.gates"),
         ("encouter", "encounter"),
-        ("gates", "scan.gates or sensor.directions.gates"),
+        ("gates", "doppler.laser.gates or scan.gates or sensor.directions.gates"),
         ("wake.vortex_pair.circ", "wake.vortex_pair.circulation"),
         ("lidar.wavelenght", "lidar.wavelength"),
         ("varient", "variants"),

@@ -53,9 +53,9 @@ RING_PEAK = 8e-8
 RING_BOUND = 6e-6
 """Seconds of a pixel, for the bound."""
 VORTICES = 2.5
-COHERENT_LINE, COHERENT_TURBULENCE = 1e-5, 10.0
+COHERENT_LINE, COHERENT_TURBULENCE = 6e-6, 10.0
 """Seconds of a gate of a line of a coherent lidar; times so much in turbulence."""
-COHERENT_SLICE = 1.0
+COHERENT_SLICE = 0.5
 """Seconds of a vertical slice of a coherent lidar, to which vortices are fitted."""
 FIGURES = {"images": 8.0, "rings": 2.5, "sensor": 2.5, "coherent": 3.0}
 """Seconds of the figures of a chapter, and its part of the report."""

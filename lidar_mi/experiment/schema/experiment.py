@@ -63,7 +63,10 @@ class Experiment(Tabular, Section):
     wake: Wake | None = Field(
         None, description="observed by the backscatter lidar, or by a coherent Doppler lidar"
     )
-    doppler: AnyDoppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
+    doppler: AnyDoppler | None = Field(
+        None,
+        description="the Doppler lidar; {} for the paper's, kind: coherent for one on the ground",
+    )
     platform: Platform = Platform()
     lidar: BackscatterLidar = BackscatterLidar()
     detector: Detector | None = Field(None, description="adds a noisy image and its winds")

@@ -23,7 +23,7 @@ from pydantic_core import PydanticUndefined
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.faults import A_NAME
-from lidar_mi.experiment.schema.section import section_in, sections_in
+from lidar_mi.experiment.schema.section import section_in, sections_in, tagged_section
 from lidar_mi.io.yaml import to_yaml_line
 from lidar_mi.units import Unit, Within, usual
 
@@ -131,6 +131,15 @@ def explain(name: str) -> Key:
         keys=tuple(dict.fromkeys(f"{name}.{key}" for kind in kinds for key in kind.model_fields)),
         listed_in=listed_in,
     )
+
+
+def keys_of(name: str, data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the keys of a section, of the kind that its data say; none: no section."""
+    if name not in _fields():
+        return ()
+    annotation = _fields()[name][1].annotation
+    section = tagged_section(annotation, data.get("kind")) or section_in(annotation)
+    return tuple(f"{name}.{key}" for key in section.model_fields) if section else ()
 
 
 def sections() -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lidar_mi.experiment.schema.keys import OF_A_FILE, explain, sections
+from lidar_mi.experiment.schema.keys import OF_A_FILE, explain, keys_of, sections
 from lidar_mi.experiment.schema.reading import read_keys
 from lidar_mi.io.yaml import to_yaml_line
 
@@ -81,7 +81,7 @@ def _section(
             yield from _section(value, f"{known.name}.", indent + 2, seen, more=more)
         else:
             yield from _with_comment(f"{start} {to_yaml_line(value)}", about)
-    others = [name for name in explain(above[:-1]).keys if name not in seen] if above else []
+    others = [name for name in keys_of(above[:-1], data) if name not in seen]
     if more and others:
         last = ", ".join(name.rpartition(".")[2] for name in others)
         yield from _comment(f"more: {last}", indent)

@@ -6,6 +6,19 @@ from numpy.typing import ArrayLike
 from lidar_mi.errors import InputError
 
 
+def numbers(name: str, values: ArrayLike) -> np.ndarray:
+    """Values as an array of numbers.
+
+    Raises
+    ------
+    InputError
+    """
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: {values!r} is not allowed; expected numbers") from None
+
+
 def checked_profile(signal: ArrayLike, ranges: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Signal above 0 at ascending ranges, as numbers.
 
@@ -13,7 +26,7 @@ def checked_profile(signal: ArrayLike, ranges: ArrayLike) -> tuple[np.ndarray, n
     ------
     InputError
     """
-    ranges = np.asarray(ranges, float)
+    ranges = numbers("ranges", ranges)
     steps = np.diff(ranges)
     if ranges.ndim != 1 or ranges.size < 2 or not (ranges[0] >= 0 and (steps > 0).all()):
         raise InputError(
@@ -35,7 +48,7 @@ def along(name: str, values: ArrayLike, ranges: np.ndarray) -> np.ndarray:
     ------
     InputError
     """
-    values = np.asarray(values, float)
+    values = numbers(name, values)
     if values.shape not in ((), ranges.shape) or not np.isfinite(values).all():
         raise InputError(
             f"{name}: shape {values.shape} or values are not allowed; expected finite numbers, "
@@ -51,7 +64,8 @@ def positive_number(name: str, value: float, unit: str = "") -> float:
     ------
     InputError
     """
-    if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0):
+    number = numbers(name, value)
+    if not (number.ndim == 0 and np.isfinite(number) and number > 0):
         shown = " ".join([str(value), unit]).strip()
         raise InputError(f"{name}: {shown} is not allowed; expected a number above 0")
-    return float(value)
+    return float(number)

@@ -63,3 +63,14 @@ def refitted(
 def spread(left: np.ndarray) -> float:
     """Standard deviation of residuals of several levels, robust: one may be nothing but noise."""
     return float(_NORMAL * np.median(np.abs(left)))
+
+
+def spread_of_best(left: np.ndarray, count: np.ndarray) -> float:
+    """Standard deviation of the lines by `residuals` of levels of so many lines.
+
+    Three residuals of a level are 0, and the others are the smallest that any three lines leave:
+    they count by 1 + 5 / (n - 3) (Rousseeuw & Leroy 1987, Robust Regression and Outlier Detection,
+    chapter 5).
+    """
+    others = np.abs(left) > 1e-9
+    return spread(left[others] * (1 + 5 / (count[others] - 3))) if others.any() else 0.0

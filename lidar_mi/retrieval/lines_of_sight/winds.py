@@ -9,7 +9,13 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.lines_of_sight.outliers import LIMIT, refitted, residuals, spread
+from lidar_mi.retrieval.lines_of_sight.outliers import (
+    LIMIT,
+    refitted,
+    residuals,
+    spread,
+    spread_of_best,
+)
 from lidar_mi.retrieval.lines_of_sight.posterior import LENGTHS, Level, along, evidence, mean_wind
 from lidar_mi.retrieval.lines_of_sight.profiles import (
     MAX_CONDITION,
@@ -273,8 +279,7 @@ def _kept(
         around[k] = near[count[near] > 0]
     keep, size = np.ones(len(velocity), bool), np.ones(len(velocity))
     for k in tried:
-        scaled = left[around[k]] * np.sqrt(count[around[k]] / (count[around[k]] - 3))
-        limit = LIMIT * max(spread(scaled), _LEAST_SPREAD)
+        limit = LIMIT * max(spread_of_best(left[around[k]], count[around[k]]), _LEAST_SPREAD)
         keep[members[k]] = np.abs(left[members[k]]) <= limit
     # the fit of three lines is poor: by the wind of all that are kept, more may be
     for _ in range(_ROUNDS):

@@ -63,6 +63,15 @@ def test_parts_grow_with_their_work():
 
 
 @pytest.mark.usefixtures("quiet_machine")
+def test_slices_of_a_coherent_lidar():
+    """Of airport, 3 s of lines, 8 s of fits and 3 s of figures were measured."""
+    found = of("airport")
+    assert 11 / 2 < found.lines < 11 * 2 and 17 / 2 < found.total < 17 * 2
+    calm = of("airport", doppler={"air": {"turbulence": None}})
+    assert calm.lines < found.lines and calm.images == calm.rings == calm.rendering == 0
+
+
+@pytest.mark.usefixtures("quiet_machine")
 def test_volumes_and_rings_by_pixels():
     """36 s for 219 x 139 x 24 voxels by both methods, 66 s for 20 frames by pixels, measured."""
     plan = SimpleNamespace(y=np.zeros(219), z=np.zeros(139))

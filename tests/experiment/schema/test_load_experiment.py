@@ -7,8 +7,9 @@ that is no longer found beside the experiment; a message that does not name the 
 import pytest
 
 import lidar_mi as lm
+from lidar_mi.experiment.schema.new_file import new_file
 from lidar_mi.experiment.schema.reading import dump, load, load_variants
-from lidar_mi.experiment.shipped import experiment_file
+from lidar_mi.experiment.shipped import experiment_file, shipped_file
 
 HERE = "name: here\nwake: {file: air.nc, time: 40 s}\nscan: {range: 300 m}\n"
 
@@ -121,3 +122,12 @@ def test_bases_that_are_none(tmp_path, text, message):
     with pytest.raises(lm.InputError) as error:
         lm.load_experiment(write(tmp_path / "a.yaml", text))
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_new_file_names_the_keys_of_its_kind():
+    """Of a coherent lidar none of those of an etalon, and the other way round."""
+    texts = {
+        name: new_file("mine", name, shipped_file(name), "run") for name in ("airport", "fringes")
+    }
+    assert "# more: bias, interval" in texts["airport"] and "speckle" not in texts["airport"]
+    assert "speckle_modes" in texts["fringes"] and "passage" not in texts["fringes"]

@@ -100,6 +100,8 @@ def test_fernald_without_molecules_is_klett():
     [
         ({"signal": np.r_[np.ones(3000), 0]}, "signal: 0 is not allowed; expected values above 0"),
         ({"signal": np.ones(7)}, "signal: shape"),
+        ({"signal": ["a"]}, r"signal: \['a'\] is not allowed; expected numbers"),
+        ({"lidar_ratio": None}, "lidar_ratio: None sr is not allowed"),
         ({"ranges": RANGES[::-1]}, "ranges: not at least two finite, ascending"),
         ({"reference": 3001}, "reference: 3001 is not allowed; expected an index of 3001"),
         ({"molecular_backscatter": -1.0}, "molecular_backscatter: -1 is not allowed"),

@@ -105,6 +105,16 @@ def test_stated_errors_hold_where_the_length_of_the_turbulence_is_known():
     assert (np.abs(z) < 1.96).mean() == pytest.approx(0.95, abs=0.05)
 
 
+def test_five_beams_tell_air_from_outliers():
+    """Of two residuals the smaller one is no spread; errors of 24 scans hold to 3 sigma."""
+    beams = {"azimuth": [0, 90, 180, 270, 0], "elevation": [62.0, 62, 62, 62, 90.0]}
+    beams["seconds"] = 2.0 * np.arange(5)
+    z = np.abs(normalised(beams, lambda seed: made.turbulent(seed, 0.5, 120.0), 24))
+    assert len(z) > 0.75 * 24 * len(RANGES)
+    assert (z < 1).mean() == pytest.approx(0.683, abs=0.2)
+    assert (z < 1.96).mean() == pytest.approx(0.95, abs=0.09)
+
+
 def test_errors_from_stated_noise_alone():
     """Three beams have no residual: the error is that of the noise, exactly."""
     three = {"azimuth": [0, 120, 240], "elevation": 60.0, "seconds": 2.0 * np.arange(3)}
