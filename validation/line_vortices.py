@@ -113,7 +113,7 @@ def measured(name: str, seeds) -> Measured:
 
 def _peer(one: Drawn, family: Family, options: dict) -> np.ndarray:
     """Errors of the method of radial velocities, each vortex when its line passes; NaN: none."""
-    (scan,) = plane_scans(one.lines, None)
+    (scan,), _ = plane_scans(one.lines, None)
     lidar = lidar_of(one.lines, None, None)
     given = Assumptions(ground=options.get("ground"), core_radius=family.core_radii[0])
     guess = detect(scan, lidar, given, single=len(family.circulations) == 1).candidates[0]
@@ -188,7 +188,7 @@ def false_alarms(effort) -> Check:
             chances = []
             for seed in range(FIRST_SEED, FIRST_SEED + number):
                 one = drawn(family, seed, wake=False)
-                (scan,) = plane_scans(one.lines, None)
+                (scan,), _ = plane_scans(one.lines, None)
                 lidar = lidar_of(one.lines, None, None)
                 chances.append(detect(scan, lidar, Assumptions(), single=single).false_alarm)
             rates = [float((np.array(chances) < limit).mean()) for limit in limits]

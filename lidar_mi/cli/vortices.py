@@ -127,6 +127,8 @@ def vortices(
             false_alarm=false_alarm,
             notice=notice,
         )
+    for remark in found.attrs["remarks"].splitlines():
+        output.print(f"remark: {remark}", soft_wrap=True)
     _show(found)
     if out.suffix.lower() == ".nc":
         write_netcdf(found.assign_attrs(software=f"lidar-mi {__version__}"), out)

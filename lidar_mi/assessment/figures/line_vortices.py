@@ -37,8 +37,8 @@ def draw_line_vortices(lines: xr.Dataset, vortices: xr.Dataset, title: str = "")
 
 def _scan(figure: Figure, axes: Axes, lines: xr.Dataset, vortices: xr.Dataset, scan: int) -> None:
     one = vortices.isel(scan=scan)
-    sweep = lines["sweep"].values if "sweep" in lines.coords else np.zeros(lines.sizes["time"])
-    part = lines.isel(time=np.flatnonzero(sweep == one["sweep"].values))
+    within = (lines["time"] >= one["start"].values) & (lines["time"] <= one["end"].values)
+    part = lines.isel(time=np.flatnonzero(within))
     elevation = np.deg2rad(part["elevation"].values)
     beside = np.deg2rad(part["azimuth"].values - float(one["azimuth"]))
     angle = np.arctan2(np.sin(elevation), np.cos(elevation) * np.cos(beside))

@@ -165,7 +165,7 @@ def _by_peer(
 
     given, lidar = Assumptions(profile), coherent_lidar(doppler)
     part = float(ring_fraction(np.array(given.core_radius), profile))
-    scans = list(plane_scans(lines, None))
+    scans, _ = plane_scans(lines, None)
     rows = np.full((len(scans), 2, 4), np.nan)
     for row, scan in zip(rows, scans, strict=True):
         start = (scan.start - START) / np.timedelta64(1, "s")

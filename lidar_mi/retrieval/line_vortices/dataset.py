@@ -175,6 +175,12 @@ def vortex_dataset(found: Sequence[ScanVortices], about: Mapping[str, Any]) -> x
             np.array([one.scan.sweep for one in found]),
             {"long_name": "number of the scan in its data set"},
         ),
+        "start": ("scan", np.array([one.scan.start for one in found]), {"long_name": "first line"}),
+        "end": (
+            "scan",
+            np.array([one.scan.at(float(one.scan.time.max())) for one in found]),
+            {"long_name": "last line"},
+        ),
         "scan": np.arange(count),
         "vortex": np.arange(number),
         "number": names,

@@ -108,17 +108,20 @@ def detect(
     air = _air(windows, lidar)
     z, information = _scores(windows, air, lidar, given, separations, single)
     signs = np.abs(z) if single else z
-    score = float(signs.max())
+    # turbulence that is stronger than in most windows, or of another length, spreads all scores
+    spread = np.maximum(1.0, 1.4826 * np.median(np.abs(z), axis=1, keepdims=True))
+    score = float((signs / spread).max())
     # the ratio of likelihoods of each place, over a half-normal circulation
     strength = TYPICAL**2 * information
     gain = strength / (1 + strength)
-    ratio = 0.5 * gain * z**2 - 0.5 * np.log1p(strength)
+    level = z / spread
+    ratio = 0.5 * gain * level**2 - 0.5 * np.log1p(strength)
     if not single:
-        ratio = ratio + math.log(2) + scipy.special.log_ndtr(z * np.sqrt(gain))
+        ratio = ratio + math.log(2) + scipy.special.log_ndtr(level * np.sqrt(gain))
     total = scipy.special.logsumexp(ratio) - math.log(ratio.size)
     return Detection(
         score,
-        _chance(windows, z, score, 2 if single else 1),
+        _chance(windows, level, score, 2 if single else 1),
         float(scipy.special.expit(total)),
         _candidates(windows, signs, z, information, separations, single, given),
         air,

@@ -3,7 +3,6 @@
 Plane: y horizontal distance from the lidar along the azimuth of the scan, z height above it.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +12,7 @@ import xarray as xr
 from lidar_mi.errors import InputError
 
 _OUT_OF_PLANE = 0.05  # sine of the angle of a line with the plane: 3 degrees
+_PAUSE = 10  # times the time from line to line
 _LEAST_LINES = 8
 _LEAST_GATES = 4
 
@@ -61,31 +61,74 @@ class PlaneScan:
         return self.start + np.timedelta64(round(1e9 * seconds), "ns")
 
 
-def plane_scans(lines: xr.Dataset, noise: float | None) -> Iterator[PlaneScan]:
-    """The slices of a data set of `read_lines_of_sight`, in the order of time.
+def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan], list[str]]:
+    """The slices of a data set of `read_lines_of_sight`, and remarks on lines that are in none.
+
+    A slice is a part of a sweep in which the beam moves one way.
 
     Raises
     ------
     InputError
-        A data set without lines of sight; lines that are not in one vertical plane; a slice of less
-        than 8 lines or 4 gates with usable values.
+        A data set without lines of sight; lines that are not in one vertical plane; no slice of 8
+        lines and 4 gates with usable values.
     """
     for name in ("radial_velocity", "flag", "azimuth", "elevation", "range", "time"):
         if name not in lines.variables:
             raise InputError(
                 f"lines: {name} is missing; expected a data set of read_lines_of_sight"
             )
-    count = lines.sizes["time"]
-    sweep = lines["sweep"].values if "sweep" in lines.coords else np.zeros(count, int)
+    known = np.isfinite(lines["azimuth"].values) & np.isfinite(lines["elevation"].values)
+    lines = lines.isel(time=np.flatnonzero(known & ~np.isnat(lines["time"].values)))
+    lines = lines.isel(time=np.argsort(lines["time"].values, kind="stable"))
+    usable = (lines["flag"].values == 0) & np.isfinite(lines["radial_velocity"].values)
+    common = _azimuth(*(np.deg2rad(lines[name].values) for name in ("azimuth", "elevation")))
+    sweep = lines["sweep"].values if "sweep" in lines.coords else np.zeros(len(usable), int)
+    scans, lost, few = [], int((~known).sum()), "0 lines and 0 gates"
     for number in np.unique(sweep):
-        yield _plane_scan(lines.isel(time=np.flatnonzero(sweep == number)), noise, int(number))
+        whole = np.flatnonzero(sweep == number)
+        for part in _passes(*(lines[name].values[whole] for name in ("elevation", "time"))):
+            index = whole[part]
+            here = usable[index]
+            if here.any(1).sum() < _LEAST_LINES or here.any(0).sum() < _LEAST_GATES:
+                few = f"{here.any(1).sum()} lines and {here.any(0).sum()} gates"
+                lost += len(index)
+                continue
+            scans.append(_plane_scan(lines.isel(time=index), noise, int(number), common))
+    if not scans:
+        raise InputError(
+            f"lines: {few} with usable values in a scan; expected {_LEAST_LINES} and "
+            f"{_LEAST_GATES} or more"
+        )
+    remark = f"{lost} lines are in no scan of {_LEAST_LINES} lines and {_LEAST_GATES} gates"
+    return scans, [remark] if lost else []
 
 
-def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneScan:
+def _passes(elevation: np.ndarray, time: np.ndarray) -> list[slice]:
+    """Parts (in the order of time) in which the elevation rises, or falls, without a pause."""
+    steps, seconds = np.diff(elevation), np.diff(time) / np.timedelta64(1, "s")
+    signs = np.sign(np.where(np.abs(steps) > 0.2 * np.median(np.abs(steps)), steps, 0.0))
+    pause = seconds > _PAUSE * np.median(seconds)
+    starts, way = [0], 0.0
+    for k in np.flatnonzero(pause | (signs != 0)):
+        if pause[k] or (way and signs[k] != way):
+            starts.append(int(k) + 1)
+            way = 0.0
+        else:
+            way = signs[k]
+    ends = [*starts[1:], len(elevation)]
+    # an angle that jitters by more than its steps turns all the time
+    if len(elevation) < _LEAST_LINES * len(starts):
+        return [slice(None)]
+    return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
+
+
+def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: float) -> PlaneScan:
     azimuth, elevation = np.deg2rad(lines["azimuth"].values), np.deg2rad(lines["elevation"].values)
-    along = _azimuth(azimuth, elevation)
+    along = common
+    if not _aside(azimuth, elevation, along) < _OUT_OF_PLANE:
+        along = _azimuth(azimuth, elevation)
     forward = np.cos(elevation) * np.cos(azimuth - along)
-    aside = np.abs(np.cos(elevation) * np.sin(azimuth - along)).max()
+    aside = _aside(azimuth, elevation, along)
     if not aside < _OUT_OF_PLANE:
         raise InputError(
             f"lines: scan {number} leaves the vertical plane of azimuth {np.rad2deg(along):.1f} "
@@ -96,11 +139,6 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneSca
     usable = (lines["flag"].values == 0) & np.isfinite(lines["radial_velocity"].values)
     velocity = np.where(usable, lines["radial_velocity"].values.astype(float), np.nan)[order]
     gates = np.flatnonzero(usable.any(0))
-    if usable.any(1).sum() < _LEAST_LINES or gates.size < _LEAST_GATES:
-        raise InputError(
-            f"lines: scan {number} has {usable.any(1).sum()} lines and {gates.size} gates with "
-            f"usable values; expected {_LEAST_LINES} and {_LEAST_GATES} or more"
-        )
     if not np.ptp(angle) > 0:
         raise InputError(f"lines: scan {number} looks in one direction; expected an RHI")
     part = slice(gates[0], gates[-1] + 1)
@@ -127,6 +165,11 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int) -> PlaneSca
         number,
         stated,
     )
+
+
+def _aside(azimuth: np.ndarray, elevation: np.ndarray, along: float) -> float:
+    """Largest distance of the directions from a vertical plane, of unit vectors."""
+    return float(np.abs(np.cos(elevation) * np.sin(azimuth - along)).max())
 
 
 def _azimuth(azimuth: np.ndarray, elevation: np.ndarray) -> float:

@@ -140,15 +140,22 @@ def fit_vortices_to_lines(
     separations: tuple[float, ...] = SEPARATIONS
     if span is not None:
         separations = tuple(math.pi / 4 * span * factor for factor in (0.85, 1.0, 1.2))
-    found = []
+    found: list[ScanVortices] = []
+    remarks: list[str] = []
     for number, one in enumerate(sets):
         lidar = lidar_of(one, pulse_length, gate_length)
-        scans = list(plane_scans(one, noise))
+        scans, more = plane_scans(one, noise)
+        remarks += more
         for k, scan in enumerate(scans):
             if notice is not None:
                 notice("fitting vortices", (number + k / len(scans)) / len(sets))
             found.append(_scan(scan, lidar, given, kind, separations, false_alarm))
-    about = {"profile": profile, "kind": kind, "false_alarm_limit": false_alarm}
+    about: dict[str, str | float] = {
+        "profile": profile,
+        "kind": kind,
+        "false_alarm_limit": false_alarm,
+    }
+    about["remarks"] = "\n".join(remarks)
     vortices = vortex_dataset(found, about)
     return tracked(vortices, ground) if len(found) > 1 else vortices
 

@@ -130,7 +130,8 @@ def window_of(
         return None
     size = np.sqrt(noise[line, gate])
     covariance = _noise(line, gate, size, scan.ranges[gates], lidar)
-    rate = np.gradient(time, angle) if len(angle) > 1 else np.zeros(1)
+    turn = np.gradient(angle)
+    rate = np.gradient(time) / np.where(np.abs(turn) > 1e-9, turn, np.inf)
     return Window(
         lines_of(time, angle, counts * scan.span, rate, scan.ranges[gates], lidar),
         line,

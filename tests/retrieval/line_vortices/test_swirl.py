@@ -57,7 +57,7 @@ def test_a_pair_descends_and_spreads_over_the_ground():
 
 
 def problem_of(one, ground=None, model="lamb_oseen"):
-    (scan,) = plane_scans(one.lines, None)
+    (scan,), _ = plane_scans(one.lines, None)
     middle = one.at(START + np.timedelta64(3, "s")).mean(0)
     distance, angle = np.hypot(*middle), np.arctan2(middle[1], middle[0])
     aside = 60 / distance

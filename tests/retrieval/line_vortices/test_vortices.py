@@ -83,7 +83,7 @@ def test_turbulence_is_seldom_taken_for_a_wake(single):
     """At most a tenth of the scans have a false alarm of 0.1: three sigma more than that."""
     number, chances = 20, []
     for seed in range(number):
-        (scan,) = plane_scans(of_air(seed), None)
+        (scan,), _ = plane_scans(of_air(seed), None)
         chances.append(detect(scan, LIDAR, Assumptions(), single=single).false_alarm)
     expected = 0.1 * number
     assert np.sum(np.array(chances) < 0.1) <= expected + 3 * np.sqrt(expected * 0.9)
@@ -101,7 +101,7 @@ def test_a_weak_wake_is_uncertain_and_a_strong_one_is_not():
     scores = []
     for strength in (15.0, 60.0, 400.0):
         family = Family(circulations=(-strength, strength))
-        (scan,) = plane_scans(drawn(family, 5).lines, None)
+        (scan,), _ = plane_scans(drawn(family, 5).lines, None)
         scores.append(detect(scan, LIDAR, Assumptions()))
     assert scores[0].score < scores[1].score < scores[2].score
     assert scores[2].false_alarm < 1e-6 < scores[0].false_alarm
@@ -177,13 +177,26 @@ def test_track_goes_on_where_a_scan_shows_nothing():
 def test_method_of_radial_velocities_finds_a_pair():
     """The peer, in still air: places within a gate, circulations within a tenth."""
     one = drawn(Family(sigma=0.0, snr=0.3), 4)
-    (scan,) = plane_scans(one.lines, None)
+    (scan,), _ = plane_scans(one.lines, None)
     given = Assumptions()
     guess = detect(scan, LIDAR, given).candidates[0].vortices
     found = by_radial_velocities(scan, LIDAR, given, guess)
     truth = one.at(scan.at(float(np.interp(guess[0, 1] / guess[0, 0], scan.angle, scan.time))))
     np.testing.assert_allclose(found[:, :2], truth, atol=4)
     np.testing.assert_allclose(found[:, 2], one.circulations, rtol=0.15)
+
+
+def test_passes_up_and_down_in_one_sweep_are_two_scans():
+    one = drawn(replace(PAIR, heights=(70.0, 100.0)), 8, slices(2, 11, count=2))
+    apart = lm.fit_vortices_to_lines(one.lines)
+    lines = one.lines.assign_coords(sweep=one.lines["sweep"] * 0)
+    # and a third pass that has hardly begun
+    more = lines.isel(time=slice(0, 5))
+    more = more.assign_coords(time=more["time"] + np.timedelta64(20, "s"))
+    together = lm.fit_vortices_to_lines(xr.concat([lines, more], "time"))
+    assert together.sizes["scan"] == 2
+    assert together.attrs["remarks"] == "5 lines are in no scan of 8 lines and 4 gates"
+    np.testing.assert_allclose(together["y"], apart["y"], rtol=1e-6)
 
 
 def test_a_list_of_scans_is_in_the_order_of_time():
@@ -202,9 +215,9 @@ def some_lines():
     ("change", "options", "message"),
     [
         (lambda x: x.drop_vars("elevation"), {}, "elevation is missing"),
-        (lambda x: x.assign(flag=x["flag"] + 4), {}, "0 lines and 0 gates with usable values"),
+        (lambda x: x.assign(flag=x["flag"] + 4), {}, "0 lines and 0 gates with usable"),
         (lambda x: x.isel(range=slice(1)), {}, "1 gates; expected two or more"),
-        (lambda x: x.isel(range=slice(3)), {}, "3 gates with usable values"),
+        (lambda x: x.isel(range=slice(3)), {}, "3 gates with usable values in a scan"),
         (
             lambda x: x.assign_coords(azimuth=x["azimuth"] + np.linspace(0, 40, x.sizes["time"])),
             {},
