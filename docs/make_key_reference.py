@@ -44,7 +44,7 @@ GUIDES = {
     "encounter": "[flights](../guide/flights.md), [air](../guide/air.md), "
     "[theory](../theory/encounter.md)",
 }
-TABLE = "| key | unit | default | allowed | meaning |\n| --- | --- | --- | --- | --- |"
+TABLE = "| key | meaning | unit | default | allowed |\n| --- | --- | --- | --- | --- |"
 
 
 def pages() -> dict[str, str]:
@@ -107,8 +107,8 @@ def _about(key: keys.Key) -> list[str]:
 
 
 def _line(key: keys.Key) -> str:
-    cells = [f"`{key.name}`", _raised(key.unit), _code(key.default), _allowed(key)]
-    return f"| {' | '.join([*cells, _text(key.meaning)])} |"
+    cells = [f"`{key.name}`", _text(key.meaning), _raised(key.unit), _code(key.default)]
+    return f"| {' | '.join([*cells, _allowed(key)])} |"
 
 
 def _allowed(key: keys.Key) -> str:

@@ -43,7 +43,8 @@ def row(kind: str, program: str, result: Score) -> str:
     stated = np.isfinite(result.variance)
     within = " / ".join(f"{100 * part:.0f}" for part in result.coverage) + " %" if stated else "-"
     variance = f"{result.variance:.2f}" if stated else "-"
-    cells = [kind, program, f"{result.rms:.2f}", f"{100 * result.valid:.0f} %", within, variance]
+    rms = f"{result.rms:.2f}" if np.isfinite(result.rms) else "-"
+    cells = [kind, program, rms, f"{100 * result.valid:.0f} %", within, variance]
     return f"| {' | '.join(cells)} |"
 
 

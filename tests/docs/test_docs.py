@@ -238,8 +238,8 @@ def documented():
             cells = [cell.strip() for cell in line.strip("|").split("|")]
             if len(cells) == 5 and re.fullmatch(r"`[a-z_.]+`", cells[0]):
                 assert cells[0][1:-1] not in rows, f"{cells[0]} twice"
-                assert len(cells[4]) > 1, f"{cells[0]}: no meaning"
-                rows[cells[0][1:-1]] = cells[1:4]
+                assert len(cells[1]) > 1, f"{cells[0]}: no meaning"
+                rows[cells[0][1:-1]] = cells[2:5]
     return rows
 
 

@@ -231,7 +231,7 @@ def _scores(
     separations: tuple[float, ...],
     single: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normalised amplitudes and informations (templates, windows)."""
+    """Normalised amplitudes and their Fisher information (templates, windows)."""
     number = 1 if single else len(separations)
     z = np.zeros((number, len(windows.angle)))
     information = np.zeros_like(z)
