@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from lidar_mi.atmosphere.vortex import Model
 from lidar_mi.errors import InputError
@@ -172,7 +173,8 @@ def _by_peer(
         middle = np.full((1, 2), start + float(scan.time.mean()))
         guess = _nearer_first(doppler, air, middle)[0]
         cores = np.full((2, 1), np.log(given.core_radius))
-        found = by_radial_velocities(scan, lidar, given, np.hstack([guess, cores]))
+        with threadpool_limits(1, "blas"):
+            found = by_radial_velocities(scan, lidar, given, np.hstack([guess, cores]))
         if found is not None:
             row[:, :3] = found * [1, 1, part]
             # when the lines pass there

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 import scipy
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.vortex import Model
@@ -149,7 +150,9 @@ def fit_vortices_to_lines(
         for k, scan in enumerate(scans):
             if notice is not None:
                 notice("fitting vortices", (number + k / len(scans)) / len(sets))
-            found.append(_scan(scan, lidar, given, kind, separations, false_alarm))
+            # matrices are small: threads would wait for each other longer than they compute
+            with threadpool_limits(1, "blas"):
+                found.append(_scan(scan, lidar, given, kind, separations, false_alarm))
     about: dict[str, str | float] = {
         "profile": profile,
         "kind": kind,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
@@ -102,7 +103,9 @@ def fit_winds_to_lines(
         one = lines.isel(time=index)
         cells = _cells(one, usable[index], step)
         if cells is not None:
-            profiles.append(_profile(one, cells, stated[index], lengths))
+            # small matrices
+            with threadpool_limits(1, "blas"):
+                profiles.append(_profile(one, cells, stated[index], lengths))
     if not profiles:
         raise InputError(
             "lines: no scan has three valid lines that are not in one plane; expected a VAD, "
