@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from lidar_mi.instrument.products import depolarization_stderr, linear_depolarization
+import lidar_mi as lm
+from lidar_mi.instrument.products import (
+    depolarization_image,
+    depolarization_stderr,
+    linear_depolarization,
+)
+from lidar_mi.io.exr import read_scan
+from lidar_mi.rendering.scene import render_file
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -75,3 +82,19 @@ def test_of_one_pass_and_of_many(world):
     one, many = images(*arguments), images(*arguments, samples_per_pass=50)
     for name in ("S1_stderr", "S2_stderr", "S3_stderr", "S0_S1_correlation"):
         np.testing.assert_allclose(many[name], one[name], rtol=2e-4, atol=2e-4 * one[name].max())
+
+
+def test_a_rendered_file_has_them(tmp_path):
+    out = tmp_path / "slab.exr"
+    image = render_file(lm.scene_file("slab"), out, samples=16)
+    found = read_scan(out)
+    for name in ("S1_stderr", "S2_stderr", "S3_stderr", "S0_S1_correlation"):
+        np.testing.assert_array_equal(found[name], image[name])
+        assert "Monte Carlo" in found[name].attrs["long_name"]
+    ratio = depolarization_image(found)["depolarization_stderr"]
+    assert ratio.attrs["stderr_is_bound"] == 0
+    # single scattering of one kind: far below the bound that S0's error alone allows
+    known = found.drop_vars(["S1_stderr", "S0_S1_correlation"])
+    bound = depolarization_image(known)["depolarization_stderr"]
+    assert bound.attrs["stderr_is_bound"] == 1
+    assert (ratio < bound).all()
