@@ -16,7 +16,6 @@ from lidar_mi.experiment.stages.coherent_lines import coherent_lidar, ring_fract
 from lidar_mi.experiment.truth.passing_wake import PassingWake
 from lidar_mi.instrument.coherent.measurement import START
 from lidar_mi.instrument.coherent.scans import directions
-from lidar_mi.instrument.coherent.weighting import echo_shift
 
 _UNEVEN_ECHO = 1 << 8
 _UNEVEN, _PART = 1.5, 0.99
@@ -95,11 +94,10 @@ def line_vortices(
 
     log.bar("fitting vortices to lines of sight", None)
     ground = -doppler.position[2] if doppler.passage.ground and wake.vortex_pair else None
-    lines = _at_the_echo(coherent_lines, doppler)
-    found = fit_vortices_to_lines(lines, ground=ground, notice=log.bar)
-    found = _flagged(found, lines)
+    found = fit_vortices_to_lines(coherent_lines, ground=ground, notice=log.bar)
+    found = _flagged(found, coherent_lines)
     seconds = _seconds(found["time"])
-    peer = _by_peer(lines, doppler, passing_air, found.attrs["profile"])
+    peer = _by_peer(coherent_lines, doppler, passing_air, found.attrs["profile"])
     true = _nearer_first(doppler, passing_air, np.stack([seconds, seconds], -1))
     at_peer = _nearer_first(doppler, passing_air, peer[..., 3])
     both = "scan", "vortex"
@@ -160,13 +158,14 @@ def _by_peer(
     It searches around the true places, at which it has no way to be wrong by a whole vortex. NaN:
     it finds nothing.
     """
+    from lidar_mi.retrieval.line_vortices.echo import at_the_echo
     from lidar_mi.retrieval.line_vortices.fit import Assumptions
     from lidar_mi.retrieval.line_vortices.radial_velocities import by_radial_velocities
     from lidar_mi.retrieval.line_vortices.scan_plane import plane_scans
 
     given, lidar = Assumptions(profile), coherent_lidar(doppler)
     part = float(ring_fraction(np.array(given.core_radius), profile))
-    scans, _ = plane_scans(lines, None)
+    scans, _ = plane_scans(at_the_echo(lines, lidar), None)
     rows = np.full((len(scans), 2, 4), np.nan)
     for row, scan in zip(rows, scans, strict=True):
         start = (scan.start - START) / np.timedelta64(1, "s")
@@ -181,15 +180,6 @@ def _by_peer(
             angle = np.arctan2(found[:, 1], found[:, 0])
             row[:, 3] = start + np.interp(angle, scan.angle, scan.time)
     return rows
-
-
-def _at_the_echo(lines: xr.Dataset, doppler: CoherentDoppler) -> xr.Dataset:
-    """Lines whose ranges are the middles of the echoes, as the signal tells them."""
-    if lines.sizes["range"] < 2:
-        return lines
-    ranges, ratio = lines["range"].values, lines["snr"].median("time").values
-    shift = echo_shift(ranges, ratio, coherent_lidar(doppler))
-    return lines.assign_coords(range=("range", ranges + shift, lines["range"].attrs))
 
 
 def _seconds(time: xr.DataArray) -> np.ndarray:

@@ -16,6 +16,7 @@ from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.progress import Notice
 from lidar_mi.retrieval.line_vortices.dataset import ScanVortices, VortexFlag, vortex_dataset
 from lidar_mi.retrieval.line_vortices.detection import SEPARATIONS, detect
+from lidar_mi.retrieval.line_vortices.echo import at_the_echo
 from lidar_mi.retrieval.line_vortices.fit import Air, Assumptions, Fit, fitted, residuals
 from lidar_mi.retrieval.line_vortices.scan_plane import PlaneScan, plane_scans
 from lidar_mi.retrieval.line_vortices.track import tracked
@@ -54,7 +55,7 @@ def fit_vortices_to_lines(
     lines : xr.Dataset or sequence of xr.Dataset
         As of `read_lines_of_sight`; every sweep is a scan. Gates with a flag are not used. A
         variable ``radial_velocity_stderr`` (m s-1), if there is one, states the noise of every
-        gate.
+        gate; ``snr`` says where in a gate the echo comes from.
     kind : {"pair", "single"}
     profile : {"lamb_oseen", "burnham_hallock"}
     span : float, optional
@@ -145,7 +146,7 @@ def fit_vortices_to_lines(
     remarks: list[str] = []
     for number, one in enumerate(sets):
         lidar = lidar_of(one, pulse_length, gate_length)
-        scans, more = plane_scans(one, noise)
+        scans, more = plane_scans(at_the_echo(one, lidar), noise)
         remarks += more
         for k, scan in enumerate(scans):
             if notice is not None:
