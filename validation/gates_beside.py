@@ -76,7 +76,7 @@ def retrieve_wind_of_gates(
         "device": device,
     }
     alone = retrieve_wind(images[0], images[1], dt, **options)
-    slopes = [_along_x(scan.values, spacing) for scan in scans]
+    slopes = [along_x(scan.values, spacing) for scan in scans]
     through = _through_plane(images, slopes, alone, dt, windows.template / 2)
     corrected = [
         image - sign * 0.5 * dt * through.u * np.mean(slopes, 0)
@@ -129,7 +129,7 @@ def _in_one_brightness(scan: xr.DataArray) -> xr.DataArray:
     return scan * (mean.isel(x=scan.sizes["x"] // 2, drop=True) / mean)
 
 
-def _along_x(gates: np.ndarray, spacing: float) -> np.ndarray:
+def along_x(gates: np.ndarray, spacing: float) -> np.ndarray:
     """Derivative along x in the middle gate (z, y), per m; 0 where a gate has no value."""
     found = np.tensordot(_DIFFERENCES[len(gates)], gates, 1) / spacing
     return np.where(np.isfinite(found), found, 0.0)

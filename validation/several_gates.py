@@ -11,7 +11,7 @@ from lidar_mi.atmosphere.advection import advect
 from lidar_mi.atmosphere.turbine import isotropic_turbulence
 from lidar_mi.experiment.truth.flows import flows_of, mean_flow
 
-from .gates_beside import retrieve_wind_of_gates
+from .gates_beside import along_x, retrieve_wind_of_gates
 from .report import Check, Comparison
 from .scenes import Effort
 
@@ -25,28 +25,20 @@ GATE, GATES, NEAR = 2.5, 5, 494.0
 DT = 0.1
 NOISES = (0.002, 0.01, 0.03)
 """Over the mean signal."""
+_MIDDLE = {3: slice(1, 4), 5: slice(0, 5)}
+"""So many gates about the middle one."""
 
 
 Air: TypeAlias = tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray, np.ndarray]
 """Signals of five gates (5, z, y) at t1 and t2, wind in them, axes z and y (m)."""
 
 
-def derivative(gates: np.ndarray, number: int) -> np.ndarray:
-    """Along x (1/m of the signal) in the middle of five gates (5, z, y), from 3 or 5 of them.
-
-    Central differences of second and fourth order.
-    """
-    near = gates[3] - gates[1]
-    if number == 3:
-        return near / (2 * GATE)
-    return (8 * near - (gates[4] - gates[0])) / (12 * GATE)
-
-
 def corrected(
     first: np.ndarray, second: np.ndarray, u: np.ndarray, number: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Images of the middle gate (z, y) as if u were 0, to first order in u dt."""
-    moved = 0.5 * DT * u * 0.5 * (derivative(first, number) + derivative(second, number))
+    some = _MIDDLE[number]
+    moved = 0.5 * DT * u * np.mean([along_x(gates[some], GATE) for gates in (first, second)], 0)
     return first[2] - moved, second[2] + moved
 
 
@@ -160,11 +152,12 @@ def _lines(
             return lm.retrieve_wind(*images, dt=DT, windows=windows)
 
         lines.append(line(noise, "one gate", of_pair(noisy[0][2], noisy[1][2])))
-        for number in (3, 5):
+        for number in _MIDDLE:
             known = corrected(*noisy, winds["u"][2], number)
             lines.append(line(noise, f"{number} gates, u known", of_pair(*known)))
-            some = slice(1, 4) if number == 3 else slice(None)
-            scans = (xr.DataArray(i, x | axes, ("x", "z", "y")).isel(x=some) for i in noisy)
+            scans = (
+                xr.DataArray(i, x | axes, ("x", "z", "y")).isel(x=_MIDDLE[number]) for i in noisy
+            )
             found = retrieve_wind_of_gates(*scans, dt=DT, windows=windows)
             lines.append(line(noise, f"{number} gates, u estimated", found))
     return lines

@@ -1,6 +1,6 @@
 """Arguments and options common to several commands."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, overload
 
@@ -166,6 +166,30 @@ Electrons = Annotated[
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace a file even if it is no result of lidar-mi.")
 ]
+
+MinCnr = Annotated[
+    float | None,
+    typer.Option(help="Least carrier-to-noise ratio, dB. Default: -21, of WindCube -27."),
+]
+LineNames = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="OURS=THEIRS",
+        help="Name of a variable in the file, as often as needed; a minus sign before "
+        "that of radial_velocity: it is positive toward the lidar.",
+    ),
+]
+
+
+def names_of(pairs: Sequence[str]) -> dict[str, str]:
+    """The names of ``--name OURS=THEIRS``."""
+    found = {}
+    for pair in pairs:
+        ours, sign, theirs = pair.partition("=")
+        if not (ours and sign and theirs):
+            raise InputError(f"--name: {pair!r} is not allowed; expected OURS=THEIRS")
+        found[ours] = theirs
+    return found
 
 
 @overload

@@ -17,6 +17,12 @@ def print_answer(sentences: Sequence[str]) -> None:
         output.print(sentence, soft_wrap=True)
 
 
+def print_remarks(text: str) -> None:
+    """What was found in files, a remark a line."""
+    for remark in text.splitlines():
+        output.print(f"remark: {remark}", soft_wrap=True)
+
+
 def print_rows(title: str, rows: Sequence[Sequence[str]]) -> None:
     """A table without a head: names and values, line by line."""
     print_table(Table(title, rows))

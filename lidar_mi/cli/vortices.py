@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidar_mi.cli.options import Overwrite, quantity
-from lidar_mi.cli.terminal import output, print_table
+from lidar_mi.cli.options import LineNames, MinCnr, Overwrite, names_of, quantity
+from lidar_mi.cli.terminal import output, print_remarks, print_table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -81,24 +81,13 @@ def vortices(
     false_alarm: Annotated[
         float, typer.Option(help="Of scans without a wake, the fraction that may show one.")
     ] = 0.01,
-    min_cnr: Annotated[
-        float | None,
-        typer.Option(help="Least carrier-to-noise ratio, dB. Default: -21, of WindCube -27."),
-    ] = None,
-    name: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="OURS=THEIRS",
-            help="Name of a variable in the file, as often as needed; a minus sign before "
-            "that of radial_velocity: it is positive toward the lidar.",
-        ),
-    ] = None,
+    min_cnr: MinCnr = None,
+    name: LineNames = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Find the vortices of a wake in vertical slices of a Doppler lidar, with their errors."""
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.line_vortices import draw_line_vortices
-    from lidar_mi.cli.winds import names_of
     from lidar_mi.io.csv_file import write_csv
     from lidar_mi.io.lines_of_sight.read import read_lines_of_sight
     from lidar_mi.io.netcdf import write_netcdf
@@ -111,8 +100,7 @@ def vortices(
     check_target(out, files, overwrite=overwrite, suffixes=(".nc", ".csv"))
     check_target(figure, files, overwrite=overwrite, suffixes=(".png",))
     lines = read_lines_of_sight(files, names=names_of(name or ()), min_cnr=min_cnr)
-    for remark in lines.attrs["remarks"].splitlines():
-        output.print(f"remark: {remark}", soft_wrap=True)
+    print_remarks(lines.attrs["remarks"])
     with progress() as notice:
         found = fit_vortices_to_lines(
             lines,
@@ -127,8 +115,7 @@ def vortices(
             false_alarm=false_alarm,
             notice=notice,
         )
-    for remark in found.attrs["remarks"].splitlines():
-        output.print(f"remark: {remark}", soft_wrap=True)
+    print_remarks(found.attrs["remarks"])
     _show(found)
     if out.suffix.lower() == ".nc":
         write_netcdf(found.assign_attrs(software=f"lidar-mi {__version__}"), out)

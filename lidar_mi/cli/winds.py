@@ -1,14 +1,12 @@
 """``lidar-mi winds``: profiles of the wind from scans of a Doppler lidar."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidar_mi.cli.options import Overwrite, quantity
-from lidar_mi.cli.terminal import output, print_table
-from lidar_mi.errors import InputError
+from lidar_mi.cli.options import LineNames, MinCnr, Overwrite, names_of, quantity
+from lidar_mi.cli.terminal import output, print_remarks, print_table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -49,24 +47,14 @@ def winds(
     length_scale: Annotated[
         str | None, typer.Option(help="Of the turbulence. Default: unknown, 50 to 800 m.")
     ] = None,
-    min_cnr: Annotated[
-        float | None,
-        typer.Option(help="Least carrier-to-noise ratio, dB. Default: -21, of WindCube -27."),
-    ] = None,
+    min_cnr: MinCnr = None,
     blind_range: Annotated[
         str | None, typer.Option(help="Gates nearer than this are not used. Default: by the lidar.")
     ] = None,
     range_step: Annotated[
         str | None, typer.Option(help="Distance of the gates, where that of the file is wrong.")
     ] = None,
-    name: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="OURS=THEIRS",
-            help="Name of a variable in the file, as often as needed; a minus sign before "
-            "that of radial_velocity: it is positive toward the lidar.",
-        ),
-    ] = None,
+    name: LineNames = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve profiles of the wind from scans of a Doppler lidar, with their errors."""
@@ -89,8 +77,7 @@ def winds(
         blind_range=quantity("--blind-range", blind_range, "m", "90 m"),
         range_step=quantity("--range-step", range_step, "m", "3 m"),
     )
-    for remark in lines.attrs["remarks"].splitlines():
-        output.print(f"remark: {remark}", soft_wrap=True)
+    print_remarks(lines.attrs["remarks"])
     found = fit_winds_to_lines(
         lines,
         interval=quantity("--interval", interval, "s", "10 min"),
@@ -106,17 +93,6 @@ def winds(
     output.print(f"winds    {out}")
     write_png(draw_wind_profiles(found, files[0].name), figure)
     output.print(f"figure   {figure}")
-
-
-def names_of(pairs: Sequence[str]) -> dict[str, str]:
-    """The names of ``--name OURS=THEIRS``."""
-    found = {}
-    for pair in pairs:
-        ours, sign, theirs = pair.partition("=")
-        if not (ours and sign and theirs):
-            raise InputError(f"--name: {pair!r} is not allowed; expected OURS=THEIRS")
-        found[ours] = theirs
-    return found
 
 
 def _show(found: "xr.Dataset") -> None:

@@ -10,13 +10,7 @@ from lidar_mi.atmosphere.air.along_path import AirAlongPath, LevelFrame, MovingA
 from lidar_mi.atmosphere.air.gust import Gust
 from lidar_mi.atmosphere.air.microburst import Microburst
 from lidar_mi.atmosphere.air.shear import LinearShear, LogarithmicShear
-from lidar_mi.atmosphere.air.standards import (
-    CS_25_LENGTH,
-    design_gust_speed,
-    flight_profile_alleviation,
-    mil_f_8785c,
-)
-from lidar_mi.atmosphere.air.turbulence import Turbulence, turbulence
+from lidar_mi.atmosphere.air.standards import design_gust_speed, flight_profile_alleviation
 from lidar_mi.atmosphere.air.volume import AirVolume
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
@@ -27,6 +21,7 @@ from lidar_mi.experiment.schema import air as schema
 from lidar_mi.experiment.schema import encounter as flight
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.section import Section
+from lidar_mi.experiment.truth.turbulent_air import turbulence_scales, turbulent_air
 from lidar_mi.io.wake_file import read_wake
 from lidar_mi.units import AS_GIVEN
 
@@ -73,7 +68,7 @@ def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir
     """
     parts: list[MovingAir] = []
     if air.turbulence is not None:
-        parts.append(_turbulence(air.turbulence, path.altitude, seed))
+        parts.append(turbulent_air(air.turbulence, path.altitude, seed, "encounter.air"))
     for gust in air.gusts:
         speed = _largest_speed(gust, path.altitude)
         parts.append(Gust(gust.direction, gust.gradient, gust.start, speed))
@@ -99,7 +94,7 @@ def described(air: schema.Air, path: flight.Path) -> list[tuple[str, str]]:
     """What the air is, for people: names of its parts, and a line for each."""
     rows = []
     if air.turbulence is not None:
-        sigma, length = _scales(air.turbulence, path.altitude)
+        sigma, length = turbulence_scales(air.turbulence, path.altitude)
         kind = f"{air.turbulence.spectrum}, {air.turbulence.evolution}".replace("_", " ")
         rows.append(("turbulence", f"{sigma:.3g} m/s rms, length {length:.3g} m, {kind}"))
     if air.volume is not None:
@@ -130,33 +125,6 @@ def _largest_speed(gust: schema.Gust, altitude: float) -> float:
             altitude, gust.maximum_altitude, gust.landing_weight, gust.zero_fuel_weight
         )
     return design_gust_speed(altitude, gust.gradient, factor)
-
-
-def _scales(given: schema.Turbulence, altitude: float) -> tuple[float, float]:
-    """Rms (m/s) and length (m) of turbulence: its own, or those of the standard."""
-    sigma, length = given.sigma, given.length
-    if given.standard == "cs_25":
-        assert sigma is not None  # the section refuses its absence with cs_25
-        return sigma, length or CS_25_LENGTH
-    rms, scale = mil_f_8785c(altitude, given.level)
-    return rms if sigma is None else sigma, length or scale
-
-
-def _turbulence(given: schema.Turbulence, altitude: float, seed: int) -> Turbulence:
-    sigma, length = _scales(given, altitude)
-    if given.shortest > length / 10:
-        raise InputError(
-            f"encounter.air.turbulence.shortest: {given.shortest:g} m is not allowed with the "
-            f"length of {length:.3g} m at {altitude:g} m; expected at most {length / 10:.3g} m"
-        )
-    return turbulence(
-        sigma,
-        length,
-        seed if given.seed is None else given.seed,
-        spectrum=given.spectrum,
-        shortest=given.shortest,
-        evolution=given.evolution,
-    )
 
 
 def _volume(given: schema.AirVolume, experiment: Experiment) -> AirVolume:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from validation import several_gates
+from validation import gates_beside, several_gates
 
 MIDDLES = several_gates.GATE * (np.arange(5) - 2)
 
@@ -16,7 +16,8 @@ MIDDLES = several_gates.GATE * (np.arange(5) - 2)
 @pytest.mark.parametrize(("number", "order"), [(3, 2), (5, 4)])
 def test_derivative_of_polynomials(number, order):
     gates = np.array([MIDDLES**k for k in range(order + 1)]).T[:, :, None]
-    found = several_gates.derivative(gates, number)[:, 0]
+    some = slice(1, 4) if number == 3 else slice(0, 5)
+    found = gates_beside.along_x(gates[some], several_gates.GATE)[:, 0]
     assert found == pytest.approx([0, 1, *[0] * (order - 1)], abs=1e-12)
 
 

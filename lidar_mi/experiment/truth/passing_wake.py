@@ -14,8 +14,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from lidar_mi.assessment.metrics.cores import find_cores, ring_averages
 from lidar_mi.atmosphere.air.shear import LogarithmicShear
-from lidar_mi.atmosphere.air.standards import CS_25_LENGTH, mil_f_8785c
-from lidar_mi.atmosphere.air.turbulence import Turbulence, turbulence
+from lidar_mi.atmosphere.air.turbulence import Turbulence
 from lidar_mi.atmosphere.ground_effect import PairAboveGround
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.atmosphere.wake_decay import sarpkaya_decay_time
@@ -23,11 +22,11 @@ from lidar_mi.atmosphere.wake_path import Components
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema.air import Turbulence as TurbulenceKeys
 from lidar_mi.experiment.schema.coherent import AirAtTheGround, CoherentDoppler, Passage
 from lidar_mi.experiment.schema.wake import ExtinctionMapping, VortexPair, Wake
 from lidar_mi.experiment.truth.extinction import extinction_of
 from lidar_mi.experiment.truth.flows import tracers_of
+from lidar_mi.experiment.truth.turbulent_air import turbulent_air
 from lidar_mi.instrument.coherent.weighting import Signal
 from lidar_mi.io.wake_file import read_wake
 
@@ -135,7 +134,11 @@ def passing_wake(
         found = _pair(wake.vortex_pair, passage, mean, last)
     elif wake is not None:
         found = _plane(wake, passage, mean, search_path)
-    gusts = None if air.turbulence is None else _turbulence(air.turbulence, passage.height, seed)
+    gusts = (
+        None
+        if air.turbulence is None
+        else turbulent_air(air.turbulence, passage.height, seed, "doppler.air")
+    )
     return PassingWake(found, mean, gusts, passage.height, passage.heading, doppler.position)
 
 
@@ -191,29 +194,6 @@ def _pair(pair: VortexPair, passage: Passage, mean: MeanWind, last: float) -> Pa
         mean.to_the_left,
         pair.model,
         passage.ground,
-    )
-
-
-def _turbulence(given: TurbulenceKeys, height: float, seed: int) -> Turbulence:
-    sigma, length = given.sigma, given.length
-    if given.standard == "cs_25":
-        length = length or CS_25_LENGTH
-    elif sigma is None or length is None:
-        rms, scale = mil_f_8785c(height, given.level)
-        sigma, length = rms if sigma is None else sigma, length or scale
-    assert sigma is not None and length is not None  # the section refuses cs_25 without sigma
-    if given.shortest > length / 10:
-        raise InputError(
-            f"doppler.air.turbulence.shortest: {given.shortest:g} m is not allowed with the "
-            f"length of {length:.3g} m at {height:g} m; expected at most {length / 10:.3g} m"
-        )
-    return turbulence(
-        sigma,
-        length,
-        seed if given.seed is None else given.seed,
-        spectrum=given.spectrum,
-        shortest=given.shortest,
-        evolution=given.evolution,
     )
 
 

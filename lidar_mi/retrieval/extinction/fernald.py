@@ -7,7 +7,12 @@ from scipy.integrate import cumulative_trapezoid
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.extinction.klett import over
-from lidar_mi.retrieval.extinction.profile import along, checked_profile, positive_number
+from lidar_mi.retrieval.extinction.profile import (
+    along,
+    check_index,
+    checked_profile,
+    positive_number,
+)
 
 MOLECULAR_LIDAR_RATIO = 8 * scipy.constants.pi / 3
 """Extinction over backscatter of Rayleigh scattering without depolarisation, sr."""
@@ -74,10 +79,7 @@ def fernald(
         )
     ratio = positive_number("lidar_ratio", lidar_ratio, "sr")
     other = positive_number("molecular_lidar_ratio", molecular_lidar_ratio, "sr")
-    if not -len(ranges) <= reference < len(ranges):
-        raise InputError(
-            f"reference: {reference} is not allowed; expected an index of {len(ranges)} ranges"
-        )
+    check_index(reference, ranges)
     known = positive_number(
         "reference_backscatter", reference_backscatter + molecular[reference], "m^-1 sr^-1"
     )

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 
-from lidar_mi.errors import InputError
-from lidar_mi.retrieval.extinction.profile import checked_profile, positive_number
+from lidar_mi.retrieval.extinction.profile import check_index, checked_profile, positive_number
 
 
 def klett(
@@ -56,10 +55,7 @@ def klett(
     signal, ranges = checked_profile(signal, ranges)
     extinction = positive_number("reference_extinction", reference_extinction, "m^-1")
     k = positive_number("exponent", exponent)
-    if not -len(ranges) <= reference < len(ranges):
-        raise InputError(
-            f"reference: {reference} is not allowed; expected an index of {len(ranges)} ranges"
-        )
+    check_index(reference, ranges)
     corrected = (signal * ranges**2 / (signal[reference] * ranges[reference] ** 2)) ** (1 / k)
     before = cumulative_trapezoid(corrected, ranges, initial=0)
     inwards = before[reference] - before

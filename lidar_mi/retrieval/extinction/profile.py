@@ -57,6 +57,19 @@ def along(name: str, values: ArrayLike, ranges: np.ndarray) -> np.ndarray:
     return np.broadcast_to(values, ranges.shape)
 
 
+def check_index(reference: int, ranges: np.ndarray) -> None:
+    """Refuse a reference that is no index of the ranges.
+
+    Raises
+    ------
+    InputError
+    """
+    if not -len(ranges) <= reference < len(ranges):
+        raise InputError(
+            f"reference: {reference} is not allowed; expected an index of {len(ranges)} ranges"
+        )
+
+
 def positive_number(name: str, value: float, unit: str = "") -> float:
     """A finite number above 0.
 

@@ -24,8 +24,8 @@ OTHER_PROFILE = 0.3
 UNEVEN_SWIRL = 0.03
 """Standard deviation of the departure of a real swirl from a round one, relative.
 
-Chosen on planes of one simulated wake: 90 % of the errors are within 95 % intervals, without it 84
-%; 0.06 makes intervals of circulations too wide.
+Chosen on planes of one simulated wake, which therefore does not judge: 90 % of its errors are
+within 95 % intervals, without it 84 %; 0.06 makes intervals of circulations too wide.
 """
 
 _ROUNDS, _FIRST_ROUNDS = 20, 12
