@@ -114,7 +114,8 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
     return (
         f"At {int((parts > _LEAST_PART).sum())} of {parts.size} points, noise of the simulation, "
         f"which a lidar does not have, causes more than {whole_percent(_LEAST_PART)} of the mean "
-        f"square error of v and w: up to {whole_percent(float(parts.max()))}{f' ({where})' if where else ''}; "
+        f"square error of v and w: up to {whole_percent(float(parts.max()))}"
+        f"{f' ({where})' if where else ''}; "
         "render.samples_per_beam: auto or more, or a larger render.max_samples, reduces it. "
     )
 

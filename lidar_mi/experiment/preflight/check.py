@@ -250,7 +250,8 @@ def _displacements(asked: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     rows = [("methods", ", ".join(settings.methods))]
     if {ImageMethod.CC, ImageMethod.WS} & set(settings.methods):
-        rows.append(("search region", f"winds up to {reach:.3g} m/s; largest here {fastest:.3g} m/s"))
+        followed = f"winds up to {reach:.3g} m/s; largest here {fastest:.3g} m/s"
+        rows.append(("search region", followed))
     return rows
 
 
