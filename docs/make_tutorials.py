@@ -72,7 +72,7 @@ def printed(cell: nbformat.NotebookNode) -> str:
         data = output.get("data", {})
         if output.get("name") == "stdout":
             lines += [line for line in output.text.splitlines() if not line.startswith("warning:")]
-        elif "text/html" in data:
+        elif "text/html" in data and not data["text/plain"].startswith("<IPython"):
             lines += data["text/plain"].splitlines()
     return "\n".join(line for line in lines if line.strip())
 

@@ -224,13 +224,22 @@ class Aircraft(Protocol):
     def model(self) -> str: ...
 
 
+class Air(Protocol):
+    """The air of a flight: with a wake, or without."""
+
+    @property
+    def wake(self) -> bool: ...
+
+
 class Encounter(Protocol):
-    """A flight into the wake: slabs per s, look-ahead distance in m."""
+    """A flight into the wake or other air: slabs per s, look-ahead distance in m."""
 
     @property
     def path(self) -> FlightPath: ...
     @property
     def aircraft(self) -> Aircraft: ...
+    @property
+    def air(self) -> Air | None: ...
     @property
     def rate(self) -> float: ...
     @property

@@ -35,18 +35,19 @@ def export(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", help="Folder of the files. Default: one of the format's name in RUN."
+            "-o",
+            "--out",
+            help="Folder of the files. Default: a folder with the name of the format in FOLDER.",
         ),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files that are there.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Write winds, volumes, images, lines of sight and vortices of a run as VTK, CSV or MATLAB.
 
-    Of a flight: the aircraft's way, the track of the vortices, winds and images of the slabs.
+    Of a flight: the path of the aircraft, the track of the vortices, winds and images of the slabs.
     With `--format control`, of a flight or of all flights below a folder: the lidar as a linear
-    filter from the wind ahead to its estimate, with delay and noise, for every range and axis.
+    discrete-time system from the true wind ahead to its estimate, with delay and noise, for every
+    range.
     """
     if format == "control":
         from lidar_mi.encounter.export_control import export_control

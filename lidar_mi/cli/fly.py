@@ -34,14 +34,17 @@ def fly(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", help="Folder. Default: outputs/NAME, with --replay outputs/NAME_replay."
+            "-o",
+            "--out",
+            help="Folder of the results. Default: outputs/NAME, with --replay outputs/NAME_replay.",
         ),
     ] = None,
     mode: Annotated[
         Mode | None,
         typer.Option(
-            help="What steers, encounter.control.mode. It is compared with no help and, for "
-            "feedforward, with perfect preview."
+            help="Flight of interest (encounter.control.mode): off, a pilot levels the wings; "
+            "feedforward, with the lidar; perfect, with the true wind as preview. Those with less "
+            "information are flown as well, with feedforward also perfect."
         ),
     ] = None,
     device: Device = None,
@@ -50,7 +53,7 @@ def fly(
         Path | None,
         typer.Option(
             metavar="FLIGHT",
-            help="Folder of a flight with the lidar, whose estimates are delivered again, to "
+            help="Folder of a finished flight with the lidar. Its estimates are used again, with "
             "another aircraft (encounter.aircraft) or control (encounter.control). Nothing is "
             "rendered.",
         ),
@@ -63,15 +66,17 @@ def fly(
         typer.Option(
             min=1,
             max=2,
-            help="2: wind and vortices are estimated at the same time. Default: 2 where there are "
-            "two cores.",
+            help="Processes that estimate; with 2 wind and vortices are estimated at the same "
+            "time. Default: 2 if there are two cores.",
             show_default=False,
         ),
     ] = min(2, os.cpu_count() or 1),
 ) -> None:
     """Fly into the wake of an experiment, with the lidar in the loop.
 
-    Writes the flights and the track (NetCDF), metrics (JSON), figures, an animation and a report.
+    The same wake is met without control, with the autopilot, with the lidar and with perfect
+    preview. Writes time series and the track of the vortices (NetCDF), metrics (JSON), figures, a
+    video and a report.
     """
     from lidar_mi.experiment.folder.records import RECORD
     from lidar_mi.experiment.schema import reading

@@ -141,8 +141,8 @@ Device = Annotated[
         metavar="DEVICE",
         callback=_checked_device,
         autocompletion=lambda incomplete: starting(incomplete, DEVICES),
-        help="That renders and retrieves: cpu, cuda, or auto for what is there. Default: as the "
-        "experiment says.",
+        help="Device that renders and retrieves: cpu, cuda, or auto for cuda if there is one. "
+        "Default: as the experiment says.",
         show_default=False,
     ),
 ]

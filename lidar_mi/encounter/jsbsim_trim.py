@@ -77,7 +77,7 @@ def check_aeroplane(name: str, path: Path) -> None:
         lacks.append("no engine")
     carried = _buoyancy(raised) / raised["inertia/weight-lbs"]
     if carried > 0:
-        lacks.append(f"gas that carries {carried:.0%} of its weight")
+        lacks.append(f"gas cells with a buoyancy of {carried:.0%} of its weight")
     if lacks:
         raise InputError(
             f"encounter.aircraft.model: {name!r} is not allowed: it has {', '.join(lacks)}; "

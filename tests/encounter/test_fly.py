@@ -84,7 +84,10 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     assert f"slabs per second</td><td {row}" in page
     assert flight.metrics["encounter.normalised_innovation"] < 2
     shown = str(flight)
-    assert "largest roll angle / degrees" in shown and "from the first usable track" in shown
+    assert (
+        "largest roll angle / degrees" in shown
+        and "first usable track before the wake is felt" in shown
+    )
 
 
 @pytest.mark.parametrize(

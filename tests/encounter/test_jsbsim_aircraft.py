@@ -198,8 +198,8 @@ def test_jsbsim_writes_nothing_itself(capfd):
         ("f22", "no ailerons that roll it at 75 m/s"),
         ("F450", "no lift that rises .*, no ailerons .*"),
         ("SGS", "no engine"),
-        ("ZLT-NT", r"no ailerons .*, gas that carries 8\d% of its weight"),
-        ("Submarine_Scout", r"gas that carries 9\d% of its weight"),
+        ("ZLT-NT", r"no ailerons .*, gas cells with a buoyancy of 8\d% of its weight"),
+        ("Submarine_Scout", r"gas cells with a buoyancy of 9\d% of its weight"),
     ],
 )
 def test_no_aeroplane(name, lacks, capfd):

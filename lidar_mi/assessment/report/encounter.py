@@ -22,37 +22,57 @@ GOAL = 0.8
 _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
     ("largest_roll_rate", "largest roll rate", "degrees/s", math.degrees(1)),
-    ("residual_moment", "rolling moment felt over the {met}'s (rms)", "", 1.0),
-    ("roll_control_ratio", "largest moment of the {met} over the controls'", "", 1.0),
+    ("residual_moment", "rolling moment of {met} and ailerons over the {met}'s (rms)", "", 1.0),
+    ("roll_control_ratio", "largest rolling moment of the {met} over the ailerons'", "", 1.0),
     ("largest_lift", "largest vertical force by the {met}'s wind", "kN", 1e-3),
     ("largest_load_increment", "largest change of the load factor", "", 1.0),
     ("largest_bending_increment", "largest change of a wing root's bending", "kN m", 1e-3),
 )
 _OF_THE_LIDAR = (
-    ("lead_time", "from the first usable track to the wake", "s", 1.0),
-    ("look_ahead", "from an estimate to its slab (median)", "s", 1.0),
+    ("lead_time", "first usable track before the wake is felt", "s", 1.0),
+    ("look_ahead", "estimate before the wing is in its slab (median)", "s", 1.0),
     ("slabs", "slabs delivered", "", 1.0),
-    ("accepted_slabs", "of them with an accepted fit", "", 1.0),
-    ("rejected_slabs", "fits that the track rejected", "", 1.0),
-    ("slabs_to_track", "accepted slabs to a usable track", "", 1.0),
+    ("accepted_slabs", "slabs with an accepted fit of both vortices", "", 1.0),
+    ("rejected_slabs", "accepted fits that the track rejected", "", 1.0),
+    ("slabs_to_track", "accepted fits until the track is usable", "", 1.0),
     ("prediction_error", "error of the predicted rolling moment (rms)", "%", 100.0),
     (
         f"after_{AFTER}_slabs.circulation_error",
-        f"error of the circulation after {AFTER} slabs",
+        f"largest error of a circulation, after {AFTER} fits",
         "%",
         100.0,
     ),
-    (f"after_{AFTER}_slabs.core_error", f"error of the cores after {AFTER} slabs", "m", 1.0),
-    (f"after_{AFTER}_slabs.within_2_sigma", "parameters within 2 stated errors then", "%", 100.0),
-    ("tracked.circulation_error", "largest error of a circulation from then on", "%", 100.0),
-    ("tracked.core_error", "largest error of a core from then on", "m", 1.0),
-    ("tracked.within_2_sigma", "parameters within 2 stated errors from then on", "%", 100.0),
-    ("normalised_innovation", "normalised innovation (1 = as stated)", "", 1.0),
+    (
+        f"after_{AFTER}_slabs.core_error",
+        f"largest error of a core's position, after {AFTER} fits",
+        "m",
+        1.0,
+    ),
+    (
+        f"after_{AFTER}_slabs.within_2_sigma",
+        f"circulations and positions within 2 standard errors, after {AFTER} fits",
+        "%",
+        100.0,
+    ),
+    (
+        "tracked.circulation_error",
+        f"largest error of a circulation, from {AFTER} fits on",
+        "%",
+        100.0,
+    ),
+    ("tracked.core_error", f"largest error of a core's position, from {AFTER} fits on", "m", 1.0),
+    (
+        "tracked.within_2_sigma",
+        f"circulations and positions within 2 standard errors, from {AFTER} fits on",
+        "%",
+        100.0,
+    ),
+    ("normalised_innovation", "normalised innovation of the track (1: errors as stated)", "", 1.0),
     ("wind_ahead.w_error", "error of w expected on the wing (rms)", "m/s", 1.0),
     ("wind_ahead.w_rms", "w on the wing (rms)", "m/s", 1.0),
     ("wind_ahead.v_error", "error of v expected on the wing (rms)", "m/s", 1.0),
-    ("wind_ahead.within_1_sigma", "winds within 1 stated error", "%", 100.0),
-    ("wind_ahead.within_2_sigma", "winds within 2 stated errors", "%", 100.0),
+    ("wind_ahead.within_1_sigma", "winds on the wing within 1 standard error", "%", 100.0),
+    ("wind_ahead.within_2_sigma", "winds on the wing within 2 standard errors", "%", 100.0),
 )
 
 _FLIGHT = {
@@ -137,8 +157,9 @@ def encounter_chapter(
         heading="Numbers of the flight",
         legend=f"All flights meet the same {met}. Without control, a pilot levels the wings; "
         f"{_FLIGHTS_OWN.format(controller) if controller else _AUTOPILOT}, without "
-        f"information on the {met}. Flight lost: {_UPSET}. Rolling moment felt: that of {met} and "
-        "ailerons together. Errors are those of the track against the truth, in the newest slab.",
+        f"information on the {met}. Flight lost: {_UPSET}. The {met} is felt from a tenth of its "
+        "largest rolling moment on. Errors of circulations and positions are those of the track "
+        "against the truth, in the newest slab; the larger one of both vortices.",
         tables=tables,
     )
     return Chapter(
@@ -179,10 +200,13 @@ def encounter_answer(
     removed = metrics.get("encounter.removed_of_perfect.largest_roll")
     if removed is not None:
         verdict = "meets" if removed >= GOAL else "misses"
-        removes = f"{percent(removed)} of the roll angle that perfect preview removes"
+        reduces = f"{percent(removed)} of the reduction by perfect preview"
         if removed >= 1:
-            removes = "as much of the roll angle as perfect preview, or more"
-        answer += f" The lidar removes {removes}, and so {verdict} the goal of {percent(GOAL)}."
+            reduces = "at least the reduction by perfect preview"
+        answer += (
+            f" Compared with no control, the lidar achieves {reduces}: it {verdict} the goal of "
+            f"{percent(GOAL)}."
+        )
         answer += _beyond_autopilot(metrics, controller)
     best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"
     bank, ratio = (metrics[f"encounter.{best}.{k}"] for k in ("largest_roll", "roll_control_ratio"))
@@ -193,15 +217,16 @@ def encounter_answer(
         f"{three(ratio)} times the largest of the controls"
     )
     # the rating is of wakes
-    rated = f"; pilots rate encounters of up to {ACCEPTED_RATIO:g} times as uncritical"
+    rated = f"; pilots rated wakes of up to {ACCEPTED_RATIO:g} times as uncritical"
     answer += rated + "." if met == "wake" else "."
     lead = [answer, *loads_answer(metrics)]
     if "encounter.lead_time" in metrics:
+        margin = metrics["encounter.lead_time"]
         lead.append(
             f"The track is usable after "
-            f"{metrics['encounter.slabs_to_track']:.0f} slabs with both vortices, "
-            f"{three(metrics['encounter.lead_time'])} s before the wake is felt. The rolling "
-            f"moment predicted from it is wrong by "
+            f"{metrics['encounter.slabs_to_track']:.0f} accepted fits, {three(abs(margin))} s "
+            f"{'after' if margin < 0 else 'before'} the wake is first felt (a tenth of its largest "
+            "rolling moment). The error of the rolling moment predicted from it is "
             f"{percent(metrics['encounter.prediction_error'])} (rms)."
         )
         lead += _limits(metrics)
@@ -216,11 +241,9 @@ def _beyond_autopilot(metrics: Mapping[str, float], controller: str) -> str:
         return ""
     steers = f"{controller} without a preview" if controller else "the autopilot"
     if blind <= metrics["encounter.perfect.largest_roll"]:
-        return f" Perfect preview rolls no less than {steers}."
+        return f" With perfect preview the aircraft rolls no less than with {steers}."
     found = "all" if share >= 1 else percent(share) if share > 0 else "nothing"
-    return (
-        f" Of the roll angle that {steers} leaves and perfect preview removes, it removes {found}."
-    )
+    return f" Compared with {steers}, it achieves {found} of the reduction by perfect preview."
 
 
 def _of_a_flight(metrics: Mapping[str, float], met: str) -> list[tuple[str, str, str, float]]:
@@ -239,10 +262,10 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
     if perfect is None or ours is None:
         return []
     return [
-        f"The rolling moment felt is {three(ours)} times the wake's with the lidar and "
-        f"{three(perfect)} times with perfect preview (rms). The latter is beyond the rate "
-        "and the deflection of the ailerons, or planned: the plan is for small roll angles, and "
-        "may bank against the wake before the encounter. The difference is the lidar's."
+        f"Wake and ailerons together have {three(ours)} times the rolling moment of the wake "
+        f"with the lidar, and {three(perfect)} times with perfect preview (rms). With perfect "
+        "preview the cause is the limits of the ailerons and the plan, which minimises the roll "
+        "angle and not the moment. Only what exceeds this is due to errors of the lidar."
     ]
 
 
@@ -258,7 +281,7 @@ def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> "T
     return Tables(
         heading="Requirements, as measured in flight",
         legend="Range: distance of the aircraft to the slab when its estimate is delivered. "
-        " Errors of v and w are those of valid vectors against the truth; a lidar "
+        "Errors of v and w are those of valid vectors against the truth; a lidar "
         "without Doppler measurements has no u.",
         tables=tables,
     )

@@ -20,6 +20,12 @@ from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.units import shown
 
+# Models of an aircraft that are not JSBSim's, as the report calls them.
+_MODELS = {
+    "roll": "an aircraft that only rolls",
+    "heave": "an aircraft that rolls, pitches and moves vertically",
+}
+
 NumberTable = tuple[str, Sequence[str], Sequence[tuple[str, str, Sequence[str]]]]
 """(title, heads, rows), a row being (name, unit, values as text)."""
 
@@ -262,13 +268,12 @@ def _platform(platform: Platform) -> tuple[str, str]:
 
 
 def _flight(encounter: Encounter) -> tuple[str, str]:
-    path, aircraft = encounter.path, encounter.aircraft
-    kind = (
-        "a rigid aircraft that rolls" if aircraft.model == "roll" else f"JSBSim's {aircraft.model}"
-    )
+    path, model = encounter.path, encounter.aircraft.model
+    kind = _MODELS.get(model, f"JSBSim's {model}")
+    wake = encounter.air is None or encounter.air.wake
+    crossing = f"crossing the wake at {math.degrees(path.crossing_angle):.3g} degrees "
     return "flight", (
-        f"{kind} at {shown(path.speed, 'm/s')}, crossing the wake at "
-        f"{math.degrees(path.crossing_angle):.3g} degrees on a path of "
+        f"{kind}, at {shown(path.speed, 'm/s')}, {crossing if wake else ''}on a path of "
         f"{math.degrees(path.climb_angle):+.3g} degrees; {encounter.rate:g} slabs a second"
     )
 

@@ -11,15 +11,17 @@ _Place = Annotated[Length, Within(-1e5, 1e5, "an encounter")]
 
 
 class Turbulence(Section):
-    """Isotropic turbulence; rms and length of a standard, or one's own."""
+    """Isotropic turbulence, with the rms and length of a standard or given ones."""
 
     spectrum: Literal["von_karman", "kolmogorov"] = Field(
         "von_karman", description="energy spectrum; both have the same rms and inertial range"
     )
     standard: Literal["mil_f_8785c", "cs_25"] = Field(
-        "mil_f_8785c", description="of rms and length; cs_25 has a length alone"
+        "mil_f_8785c", description="source of rms and length; cs_25 has a length, and needs sigma"
     )
-    level: Literal["light", "moderate", "severe"] = Field("moderate", description="of mil_f_8785c")
+    level: Literal["light", "moderate", "severe"] = Field(
+        "moderate", description="level of mil_f_8785c"
+    )
     sigma: Annotated[Speed, Within(0, 30, "severe storms have 9 m/s")] | None = Field(
         None, description="rms of one component; default: that of the standard at this level"
     )
@@ -27,15 +29,15 @@ class Turbulence(Section):
         None, description="length scale; default: that of the standard"
     )
     shortest: Annotated[Length, Within(0.1, 1000, "a tenth of the length at most")] = Field(
-        2.0, description="shortest wavelength"
+        2.0, description="shortest wavelength that is simulated"
     )
     evolution: Literal["frozen", "turnover", "sweeping"] = Field(
         "frozen",
-        description="in the frame of the mean wind: at rest, changing as eddies turn over, or as "
-        "large ones sweep small ones along",
+        description="change in the frame of the mean wind: frozen: none; turnover: eddies turn "
+        "over; sweeping: large eddies sweep small ones",
     )
     seed: Annotated[int, Within(0, 2**31 - 1, "as of the experiment's seed")] | None = Field(
-        None, description="of the turbulence; default: that of the experiment"
+        None, description="seed of the turbulence; default: that of the experiment"
     )
 
     @model_validator(mode="after")
@@ -56,13 +58,17 @@ class Turbulence(Section):
 class Gust(Section):
     """A discrete 1-cosine gust of CS 25.341."""
 
-    direction: Literal["up", "down", "left", "right"] = Field("up", description="in which it blows")
-    gradient: Annotated[Length, Within(1, 1000, "CS 25.341 has 9 to 107 m")] = Field(
-        50.0, description="half of its length"
+    direction: Literal["up", "down", "left", "right"] = Field(
+        "up", description="direction in which the gust blows"
     )
-    start: _Place = Field(200.0, description="where it begins, from the start of the path")
+    gradient: Annotated[Length, Within(1, 1000, "CS 25.341 has 9 to 107 m")] = Field(
+        50.0, description="gradient distance, half of the length of the gust"
+    )
+    start: _Place = Field(200.0, description="start of the gust, from that of the path")
     speed: Annotated[Speed, Within(0.01, 50, "CS 25.341 has 17 m/s at most")] | None = Field(
-        None, description="largest; default: the design speed of CS 25.341 at the start's altitude"
+        None,
+        description="largest true speed of the gust; default: the design speed of CS 25.341 at "
+        "the altitude of the path's start",
     )
     alleviation: Annotated[Number, Within(0, 1, "a fraction", "(]")] | None = Field(
         None,
@@ -70,13 +76,15 @@ class Gust(Section):
         "maximum_altitude, else 1",
     )
     maximum_altitude: Annotated[Length, Within(1, 20000, "of operation")] | None = Field(
-        None, description="Z_mo, from which F_g follows; one of speed, alleviation and this"
+        None,
+        description="maximum operating altitude Z_mo, from which F_g follows; excludes speed and "
+        "alleviation",
     )
     landing_weight: Annotated[Number, Within(0, 1, "of that at take-off", "(]")] = Field(
-        1.0, description="largest, over that at take-off: R_1"
+        1.0, description="maximum landing weight over maximum take-off weight, R_1"
     )
     zero_fuel_weight: Annotated[Number, Within(0, 1, "of that at take-off", "(]")] = Field(
-        1.0, description="largest, over that at take-off: R_2"
+        1.0, description="maximum zero fuel weight over maximum take-off weight, R_2"
     )
 
     @model_validator(mode="after")
@@ -101,27 +109,28 @@ class LinearShear(Section):
     """A horizontal wind that grows linearly with the height."""
 
     du_dz: Annotated[Shear, Within(-1, 1, "a jet at the ground has 0.1 / s")] = Field(
-        0.0, description="of the wind along the path"
+        0.0, description="vertical gradient of the wind along the path"
     )
     dv_dz: Annotated[Shear, Within(-1, 1, "a jet at the ground has 0.1 / s")] = Field(
-        0.0, description="of the wind to the left"
+        0.0, description="vertical gradient of the wind to the left"
     )
 
 
 class LogarithmicShear(Section):
-    """The neutral surface layer."""
+    """The logarithmic wind profile of the neutral surface layer."""
 
     speed: Annotated[Speed, Within(0, 100, "a hurricane")] = Field(
-        quantity("10 m/s"), description="of the wind at the reference"
+        quantity("10 m/s"), description="wind speed at the height reference"
     )
     reference: Annotated[Length, Within(0.1, 1000, "a mast")] = Field(
-        quantity("20 ft"), description="height above the ground"
+        quantity("20 ft"), description="height of speed above the ground"
     )
     roughness: Annotated[Length, Within(1e-6, 10, "from ice to a town")] = Field(
-        quantity("0.15 ft"), description="length of the ground"
+        quantity("0.15 ft"), description="roughness length of the ground"
     )
     towards: Annotated[Angle, Within(-6.3, 6.3, "a turn")] = Field(
-        quantity("180 deg"), description="0: tail wind, 90 deg: to the left"
+        quantity("180 deg"),
+        description="direction to which the wind blows; 0: tail wind, 90 deg: to the left",
     )
 
     @model_validator(mode="after")
@@ -138,41 +147,43 @@ class Microburst(Section):
     """The downdraft of Oseguera and Bowles (1988)."""
 
     outflow: Annotated[Speed, Within(0.1, 100, "the largest was 67 m/s")] = Field(
-        15.0, description="the largest"
+        15.0, description="largest speed of the outflow"
     )
     radius: Annotated[Length, Within(10, 10000, "a microburst")] = Field(
-        600.0, description="of the downdraft; the outflow is largest at 1.12 radii"
+        600.0, description="radius of the downdraft; the outflow is largest at 1.12 radii"
     )
     outflow_height: Annotated[Length, Within(1, 1000, "near the ground")] = Field(
-        60.0, description="of the largest outflow"
+        60.0, description="height of the largest outflow"
     )
-    x: _Place = Field(400.0, description="of its axis, from the start of the path")
-    y: _Place = Field(0.0, description="of its axis, to the left of the path")
+    x: _Place = Field(400.0, description="distance of its axis from the start of the path")
+    y: _Place = Field(0.0, description="distance of its axis to the left of the path")
 
 
 class AirVolume(Section):
-    """Air of a simulation: one instant, at rest in the mean wind."""
+    """Air of a simulation: one instant, frozen in its mean wind."""
 
     file: str = Field(description="NetCDF file with u, v, w on (x, y, z), z above the ground")
     time: Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")] | None = Field(
-        None, description="needed when the file holds several"
+        None, description="time in the file; required if it has several"
     )
-    names: dict[str, str] = Field({}, description="our dimension or variable names: the file's")
+    names: dict[str, str] = Field(
+        {}, description="names in the file, of variables or dimensions with other names there"
+    )
     start: Annotated[Length, Within(-1e6, 1e6, "models of a region")] | None = Field(
-        None, description="x in the file where the path starts; default: its first plane"
+        None, description="x of the file at which the path starts; default: its first plane"
     )
     centre: Annotated[Length, Within(-1e6, 1e6, "models of a region")] | None = Field(
-        None, description="y in the file of the path; default: its middle"
+        None, description="y of the file at which the path lies; default: the middle"
     )
 
 
 class Air(Section):
-    """The air about the wake, or in its place."""
+    """The air about the wake, or instead of it."""
 
     wake: bool = Field(
         True,
-        description="false: this air replaces the wake, whose section still gives size, texture "
-        "and extinction of the images",
+        description="false: there is no wake; its section still gives the size, texture and "
+        "extinction of the images",
     )
     turbulence: Turbulence | None = None
     volume: AirVolume | None = None

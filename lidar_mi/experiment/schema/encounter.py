@@ -30,12 +30,10 @@ class Miss(Section):
     """Where the middle between the vortices is, from the path, when the aircraft arrives."""
 
     y: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
-        0.0,
-        description="place of the middle between the vortices to the left of the path, when the "
-        "aircraft arrives",
+        0.0, description="distance of the middle between the vortices to the left of the path"
     )
     z: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
-        0.0, description="above the path"
+        0.0, description="distance of the middle between the vortices above the path"
     )
 
 
@@ -46,19 +44,22 @@ class Path(Section):
         75.0, description="true airspeed"
     )
     crossing_angle: Annotated[Angle, Within(0, 1.5708, "0 to 90 degrees")] = Field(
-        quantity("10 deg"), description="of the path and the wake's axis, horizontal"
+        quantity("10 deg"), description="horizontal angle between the path and the axis of the wake"
     )
-    climb_angle: _Slope = Field(quantity("-3 deg"), description="of the path; the wake is level")
+    climb_angle: _Slope = Field(
+        quantity("-3 deg"), description="angle of the path to the horizontal; the wake is level"
+    )
     miss: Miss = Miss()
     altitude: Annotated[Length, Within(1, 15000, "the lower atmosphere")] = Field(
         300.0,
-        description="above the ground (sea level) at the start; a path into the ground is refused",
+        description="height above the ground (sea level) at the start; a path into the ground is "
+        "refused",
     )
     start: Annotated[Length, Within(1, 20000, "an encounter")] = Field(
-        600.0, description="distance from the wake's centre at the start"
+        600.0, description="distance from the centre of the wake at the start"
     )
     beyond: Annotated[Length, Within(0, 20000, "an encounter")] = Field(
-        300.0, description="distance flown behind the wake's centre"
+        300.0, description="distance flown beyond the centre of the wake"
     )
 
     @model_validator(mode="after")
@@ -78,18 +79,17 @@ class Crow(Section):
 
     model: Literal["tangents", "filaments"] = Field(
         "tangents",
-        description="tangents: the flow of straight lines that touch the bent ones, which do not "
-        "grow; filaments: Biot-Savart's law, growth with the wake's age, rings once linked",
+        description="tangents: the flow of straight vortices tangent to the bent ones, constant in "
+        "time; filaments: law of Biot and Savart, waves that grow with the age and link to rings",
     )
     amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = Field(
-        0.0,
-        description="of the sinusoidal deformation of both vortices; of filaments that at age 0",
+        0.0, description="amplitude of the deformation; with filaments that at age 0"
     )
     wavelength: Annotated[Length, Within(1, 100000, "8.6 separations")] | None = Field(
-        None, description="default: 8.6 separations"
+        None, description="wavelength of the deformation; default: 8.6 separations"
     )
     phase: Annotated[Angle, Within(-6.2832, 6.2832, "one wave")] = Field(
-        0.0, description="of the sine at the wake's centre, along its axis"
+        0.0, description="phase of the deformation at the centre of the wake"
     )
 
 
@@ -97,26 +97,26 @@ class WakeInTime(Section):
     """How the wake changes in time and along its axis, in addition to its drift."""
 
     age: Annotated[Time, Within(0, 1e5, "a wake's life")] = Field(
-        0.0, description="of the wake at the start of the flight"
+        0.0, description="age of the wake at the start of the flight"
     )
     decay_time: Annotated[Time, Within(1, 1e9, "a wake's life")] | None = Field(
-        None, description="in which circulation falls to 1/e; default: it stays"
+        None, description="time in which the circulation falls to 1/e; default: no decay"
     )
     dissipation_rate: (
         Annotated[DissipationRate, Within(0, 1, "from calm air to a thunderstorm")] | None
     ) = Field(
         None,
-        description="of turbulence, in which circulation decays (Sarpkaya 2000); in place of "
-        "decay_time",
+        description="dissipation rate of the turbulence by which the circulation decays "
+        "(Sarpkaya 2000); instead of decay_time",
     )
     crow: Crow = Crow()
     ends: Literal["mirror", "blend", "refuse"] = Field(
         "mirror",
-        description="of a simulated volume that is not periodic: mirrored at its ends, its ends "
-        "blended into each other, or refused",
+        description="what follows a simulated volume that is not periodic: mirror: its mirror "
+        "image; blend: the volume again, its ends blended into each other; refuse: it is refused",
     )
     ends_length: Annotated[Length, Within(0.1, 10000, "part of a volume")] = Field(
-        5.0, description="over which ends are blended, or u falls to 0 at a mirror"
+        5.0, description="length over which ends are blended, or u falls to 0 at a mirror"
     )
 
     @model_validator(mode="after")
@@ -129,35 +129,35 @@ class WakeInTime(Section):
 class Aircraft(Section):
     """The aircraft that flies into the wake.
 
-    Defaults are the Boeing 737 of JSBSim: its metrics, inertia with fuel, control power and, with
-    the finite-span slope of an elliptic wing, its lift slope of 4.35 per rad. The aileron's rate
-    is usual for transport aircraft. The numbers are those of the roll model; an aircraft of JSBSim
-    has its own, but for the lift slope of the sections and the rate of the controls.
+    Defaults are the Boeing 737 of JSBSim: its dimensions, inertia with fuel, control power and,
+    with the finite-span slope of an elliptic wing, its lift slope of 4.35 per rad. The rate of the
+    ailerons is usual for transport aircraft. The numbers are for the models roll and heave. An
+    aircraft of JSBSim has its own, except for the lift slope and the rate of the controls.
     """
 
     model: str = Field(
         "roll",
-        description="roll: rolls only; heave: rises and pitches, too; else of JSBSim, such as 737 "
-        "(pip install 'lidar-mi[flight]')",
+        description="roll: rolls only; heave: also pitches and moves vertically; otherwise an "
+        "aircraft of JSBSim, such as 737 (pip install 'lidar-mi[flight]')",
     )
-    span: Annotated[Length, Within(1, 200, "aircraft")] = Field(28.9, description="of the wing")
+    span: Annotated[Length, Within(1, 200, "aircraft")] = Field(28.9, description="wing span")
     wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = Field(
-        108.8, description="of the aircraft"
+        108.8, description="reference area of the wing"
     )
     roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = Field(
         8.0e5, description="moment of inertia about the roll axis"
     )
     lift_slope: Annotated[Number, Within(1, 6.2832, "thin wings, per rad")] = Field(
-        5.3, description="of the wing's sections"
+        5.3, description="lift slope of the wing's sections, per rad"
     )
     largest_aileron: Annotated[Angle, Within(0.001, 1, "aircraft")] = Field(
-        quantity("20 deg"), description="largest deflection"
+        quantity("20 deg"), description="largest deflection of the ailerons"
     )
     aileron_rate: Annotated[AngularRate, Within(0.001, 100, "actuators")] = Field(
-        quantity("50 deg/s"), description="largest rate of all controls"
+        quantity("50 deg/s"), description="largest rate of deflection of every control"
     )
     aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
-        0.1, description="rolling moment coefficient per rad of deflection"
+        0.1, description="rolling moment coefficient per rad of aileron"
     )
     heave: HeaveKeys = HeaveKeys()
 
@@ -169,19 +169,25 @@ class Aircraft(Section):
 
 
 class Control(Section):
-    """What steers against the wake."""
+    """The controller and what it knows of the wake."""
 
     mode: Literal["off", "feedforward", "perfect"] = Field(
-        "feedforward", description="off: the wings are levelled; perfect: knows the truth"
+        "feedforward",
+        description="off: a pilot levels the wings; feedforward: the lidar gives the preview; "
+        "perfect: the true wind gives it",
     )
     preview: Literal["pair", "wind"] = Field(
-        "pair", description="pair: the tracked vortices alone; wind: with the vectors' wind ahead"
+        "pair",
+        description="pair: the loads of the tracked vortices; wind: those of the vortices and of "
+        "the air about them, from the wind vectors",
     )
     latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
-        0.12, description="from the second scan of a slab to its estimate"
+        0.12, description="time from the second scan of a slab to the delivery of its estimate"
     )
     levelling_time: Annotated[Time, Within(0.1, 1000, "a pilot")] | None = Field(
-        3.0, description="in which the wings are levelled without control; null: they are not"
+        3.0,
+        description="time constant with which a pilot levels the wings in the mode off; null: no "
+        "pilot",
     )
 
     @field_validator("mode", mode="before")
@@ -192,13 +198,13 @@ class Control(Section):
 
 
 class Window(Section):
-    """Where the scan of the backscatter lidar looks."""
+    """Direction of the backscatter lidar's scan."""
 
     follow: bool = Field(
-        False, description="whether its middle follows the pair; else it is straight ahead"
+        False, description="true: the scan follows the vortex pair; false: it is straight ahead"
     )
     reach: Annotated[Angle, Within(0, 0.8, "a scanner")] = Field(
-        quantity("20 deg"), description="of its middle from straight ahead"
+        quantity("20 deg"), description="largest angle of its middle from straight ahead"
     )
 
 
@@ -208,12 +214,14 @@ class Encounter(Section):
     aircraft: Aircraft = Aircraft()
     path: Path = Path()
     wake: WakeInTime = WakeInTime()
-    air: Air | None = Field(None, description="beside the wake, or in its place; default: at rest")
+    air: Air | None = Field(
+        None, description="air in addition to the wake, or instead of it; default: air at rest"
+    )
     rate: Annotated[Frequency, Within(0.1, 1000, "slabs a second")] = Field(
-        10.0, description="scans per second"
+        10.0, description="scans per second; each completes one slab"
     )
     look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
-        150.0, description="range of the farther gate's start"
+        150.0, description="range at which the farther slab of a scan begins"
     )
     window: Window = Window()
     control: Control = Control()

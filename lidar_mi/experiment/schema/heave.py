@@ -1,4 +1,4 @@
-"""The keys of an aircraft that rises and pitches."""
+"""The keys of an aircraft that pitches and moves vertically."""
 
 from typing import Annotated
 
@@ -9,47 +9,48 @@ from lidar_mi.units import Angle, Area, Inertia, Length, Mass, Number, Within, q
 
 
 class HeaveKeys(Section):
-    """Mass, tail and elevator of the model heave, and how the ailerons lift and the wing bends.
+    """Mass, tail, elevator and symmetric ailerons of the model heave, and the mass of its wing.
 
     Defaults are the Boeing 737 of JSBSim: its mass with fuel, pitch inertia, tail, elevator power,
-    and the ratio of its slopes of pitching moment, about the centre of gravity, and lift. Of an
-    aircraft of JSBSim only the wing's part of the mass counts.
+    and the static margin from its slopes of pitching moment and lift. For an aircraft of JSBSim
+    only wing_mass is used.
     """
 
-    mass: Annotated[Mass, Within(1, 1e6, "aircraft")] = Field(48500.0, description="in flight")
+    mass: Annotated[Mass, Within(1, 1e6, "aircraft")] = Field(48500.0, description="mass in flight")
     pitch_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = Field(
         2.1e6, description="moment of inertia about the pitch axis"
     )
     static_margin: Annotated[Number, Within(0.01, 1, "stable aircraft")] = Field(
         0.23,
-        description="from the centre of gravity to the neutral point, in chords (wing area / span)",
+        description="distance from the centre of gravity back to the neutral point, in mean chords "
+        "(wing area / span)",
     )
     tail_area: Annotated[Area, Within(0.01, 1000, "aircraft")] = Field(
-        32.3, description="of the horizontal tail"
+        32.3, description="area of the horizontal tail"
     )
     tail_arm: Annotated[Length, Within(0.1, 100, "aircraft")] = Field(
-        14.64, description="from the centre of gravity to the horizontal tail"
+        14.64, description="distance from the centre of gravity back to the horizontal tail"
     )
     elevator_power: Annotated[Number, Within(1e-3, 5, "aircraft")] = Field(
-        1.2, description="pitching moment coefficient, with the chord wing area / span, per rad"
+        1.2, description="pitching moment coefficient per rad of elevator, with the mean chord"
     )
     largest_elevator: Annotated[Angle, Within(0, 1, "aircraft")] = Field(
-        quantity("20 deg"), description="largest deflection from trim; 0: it is fixed"
+        quantity("20 deg"), description="largest deflection of the elevator from trim; 0: fixed"
     )
     largest_symmetric_aileron: Annotated[Angle, Within(0, 1, "aircraft")] = Field(
         quantity("10 deg"),
-        description="largest deflection of both ailerons to one side; 0: they only roll",
+        description="largest symmetric deflection of both ailerons; 0: they only roll",
     )
     aileron_inner: Annotated[Number, Within(0, 1, "of half the span")] = Field(
-        0.7, description="inner end of the ailerons, over half the span"
+        0.7, description="inner end of the ailerons, fraction of the half span"
     )
     aileron_outer: Annotated[Number, Within(0, 1, "of half the span")] = Field(
-        0.95, description="outer end of the ailerons, over half the span"
+        0.95, description="outer end of the ailerons, fraction of the half span"
     )
     wing_mass: Annotated[Number, Within(0, 0.9, "of the aircraft's mass")] = Field(
         0.17,
-        description="fraction of the mass that is wing, with engines and fuel; of JSBSim's "
-        "aircraft, too",
+        description="mass of the wing with engines and fuel, fraction of the mass; also used for "
+        "aircraft of JSBSim",
     )
 
     @model_validator(mode="after")

@@ -72,7 +72,8 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
         raise InputError(f"variant: {variant!r} is not allowed; expected {wanted}")
     found = variants[str(variant)] if variants else load(path)
     if changes:
-        data = settings(found)
+        # keys that the file does not have stay defaults: checks tell them from chosen ones
+        data = settings(found) if variants else read_keys(path)
         for key, value in changes.items():
             # a.b: x is {a: {b: x}}, built from the inside
             for part in reversed(key.split(".")):

@@ -37,9 +37,9 @@ def test_answer_comes_first():
     for words in (
         "Without control, the wake rolls the aircraft by 25 degrees; with the same autopilot, but "
         "no preview, by 7 degrees; with the lidar by 9 degrees; with perfect preview by 2 degrees.",
-        "removes 70 % of the roll angle that perfect preview removes, and so misses the goal of "
-        "80 %. Of the roll angle that the autopilot leaves and perfect preview removes, it removes "
-        "nothing.",
+        "Compared with no control, the lidar achieves 70 % of the reduction by perfect preview: it "
+        "misses the goal of 80 %. Compared with the autopilot, it achieves nothing of the "
+        "reduction by perfect preview.",
         "The flight with the lidar exceeds the 7 degrees of bank",
     ):
         assert words in answer
@@ -48,8 +48,8 @@ def test_answer_comes_first():
 @pytest.mark.parametrize(
     ("autopilot", "share", "words"),
     [
-        (7, 0.6, "Of the roll angle that the autopilot leaves and perfect preview removes, it "),
-        (2, 1.5, "Perfect preview rolls no less than the autopilot."),
+        (7, 0.6, "Compared with the autopilot, it achieves "),
+        (2, 1.5, "With perfect preview the aircraft rolls no less than with the autopilot."),
     ],
 )
 def test_share_beyond_the_autopilot(autopilot, share, words):
@@ -60,6 +60,19 @@ def test_share_beyond_the_autopilot(autopilot, share, words):
     assert words in answer and ("60 %" in answer) == (share == 0.6)
 
 
+@pytest.mark.parametrize(
+    ("lead", "words"), [(1.2, "1.2 s before the wake"), (-0.42, "0.42 s after the wake")]
+)
+def test_a_late_track_is_told_as_late(lead, words):
+    metrics = numbers(off=25, autopilot=7, feedforward=4, perfect=2)
+    metrics |= {
+        "encounter.slabs_to_track": 3,
+        "encounter.lead_time": lead,
+        "encounter.prediction_error": 0.04,
+    }
+    assert f"usable after 3 accepted fits, {words} is first felt" in encounter_answer(metrics)[1]
+
+
 def test_flights_through_air_are_called_so():
     metrics = numbers(off=25, perfect=2)
     answer, *_ = encounter_answer(metrics, met="air")
@@ -68,7 +81,7 @@ def test_flights_through_air_are_called_so():
     chapter = encounter_chapter(metrics, [], [], met="air")
     assert chapter.title == "Into the air"
     table, *_ = encounter_summary(metrics, met="air")
-    assert ("largest moment of the air over the controls'", "1.50", "1.50") in table.rows
+    assert ("largest rolling moment of the air over the ailerons'", "1.50", "1.50") in table.rows
 
 
 def test_an_upset_is_told():
@@ -102,6 +115,21 @@ def test_page_has_the_video_and_the_animation_for_browsers_without():
     html = page(check(encounter_keys(), "test"), "name: x", {"lidar-mi": "0"}, {}, [chapter])
     assert "<video controls" in html and 'src="data:video/mp4;base64,ZmlsbQ=="' in html
     assert 'src="approach.gif"' in html and "for (const film of" not in html
+
+
+@pytest.mark.parametrize(
+    ("model", "air", "words"),
+    [
+        ("roll", None, "only rolls, at 75 m/s, crossing the wake"),
+        ("heave", {"wake": False}, "moves vertically, at 75 m/s, on a path of"),
+        ("737", None, "JSBSim&#39;s 737, at 75 m/s, crossing the wake"),
+    ],
+)
+def test_page_names_the_aircraft_and_what_it_meets(model, air, words):
+    keys = encounter_keys()
+    keys["encounter"] = keys["encounter"] | {"aircraft": {"model": model}, "air": air}
+    html = page(check(keys, "test"), "name: x", {"lidar-mi": "0"}, {}, [])
+    assert words in html
 
 
 @pytest.mark.parametrize("mode", ["off", "perfect"])

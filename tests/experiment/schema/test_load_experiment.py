@@ -131,3 +131,10 @@ def test_a_new_file_names_the_keys_of_its_kind():
     }
     assert "# more: bias, interval" in texts["airport"] and "speckle" not in texts["airport"]
     assert "speckle_modes" in texts["fringes"] and "passage" not in texts["fringes"]
+
+
+def test_keys_that_nobody_gave_stay_defaults():
+    """Checks warn of chosen keys without effect, not of defaults."""
+    changed = lm.load_experiment("encounter", scan={"rows": 99}, platform={"dt": "0.2 s"})
+    assert changed.scan.model_fields_set == {"thickness", "rows"}
+    assert changed.platform.model_fields_set == {"dt"}
