@@ -1,8 +1,8 @@
 """``lidar-mi retrieve``: the time step that headers state, the numbers printed, completion.
 
 Detects: a step or an order of images taken on trust where the files contradict it; statistics that
-are not those of the file written; pixels that are not those of the wind in metres; a picture that is
-missing or replaces an input; names that a shell does not complete. System tier.
+are not those of the file written; pixels that are not those of the wind in metres; a picture that
+is missing or replaces an input; names that a shell does not complete. System tier.
 """
 
 import re
