@@ -78,10 +78,13 @@ def pages() -> dict[str, str]:
 def _of_section(key: keys.Key) -> dict[str, tuple[str, str, str]]:
     """Titles, meanings and texts of the pages of a section, one for each kind of it."""
     found = {}
+    listed: tuple[str, ...] = ()
     for number, kind in enumerate(keys.kinds(key.name)):
         name = f"{key.name}_{kind.word}" if number else key.name
         title = f"{key.name}, kind: {kind.word}"
-        text = section(replace(key, keys=kind.keys, more=kind.more), title, name)
+        own = tuple(one for one in kind.keys if one not in listed)
+        listed += own
+        text = section(replace(key, keys=own, more=kind.more), title, name)
         found[f"keys_{name}"] = title, _text(kind.more[0].removesuffix(".")), text
     alone = key.name, _text(key.meaning), section(key, key.name, key.name)
     return found or {f"keys_{key.name}": alone}
