@@ -2,10 +2,12 @@
 
 Usage: ``python docs/make_key_reference.py``.
 
-The pages say what ``lidar-mi explain`` says, a page for each section of a file.
+The pages say what ``lidar-mi explain`` says, a page for each section of a file, or for each kind of
+it.
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -39,6 +41,7 @@ GUIDES = {
     "[simulation or lidar](../guide/methods.md#simulation-or-lidar)",
     "retrieval": "[methods](../guide/methods.md), [limits](../guide/keys_retrieval.md#retrieval)",
     "doppler": "[Doppler lidar](../guide/keys_retrieval.md#doppler), [rings](../guide/rings.md)",
+    "doppler_coherent": "[coherent lidar](../guide/keys_coherent.md)",
     "sensor": "[both lidars](../guide/keys_sensor.md#sensor), [theory](../theory/combination.md)",
     "volume": "[volumes](../guide/keys_sensor.md#volume), [theory](../theory/volumes.md)",
     "encounter": "[flights](../guide/flights.md), [air](../guide/air.md), "
@@ -53,7 +56,10 @@ def pages() -> dict[str, str]:
     top = [keys.explain(name) for name in keys.OF_A_FILE]
     sections = [key for key in found if key.keys]
     of_a_file = [_line(key) for key in (*found, *top) if not key.keys]
-    listed = [f"| [`{key.name}`](keys_{key.name}.md) | {_text(key.meaning)} |" for key in sections]
+    below = {name: page for key in sections for name, page in _of_section(key).items()}
+    listed = [
+        f"| [`{title}`]({name}.md) | {meaning} |" for name, (title, meaning, _) in below.items()
+    ]
     contents = "\n".join(
         [
             HEAD,
@@ -62,18 +68,33 @@ def pages() -> dict[str, str]:
             "\n".join(["| section | |", "| --- | --- |", *listed]),
             "",
             "```{toctree}\n:hidden:\n",
-            *(f"keys_{key.name}" for key in sections),
+            *below,
             "```\n",
         ]
     )
-    return {"keys.md": contents} | {f"keys_{key.name}.md": section(key) for key in sections}
+    return {"keys.md": contents} | {f"{name}.md": text for name, (*_, text) in below.items()}
 
 
-def section(key: keys.Key) -> str:
-    """The page of a section at the top of a file."""
+def _of_section(key: keys.Key) -> dict[str, tuple[str, str, str]]:
+    """Titles, meanings and texts of the pages of a section, one for each kind of it."""
+    found = {}
+    listed: tuple[str, ...] = ()
+    for number, kind in enumerate(keys.kinds(key.name)):
+        name = f"{key.name}_{kind.word}" if number else key.name
+        title = f"{key.name}, kind: {kind.word}"
+        own = tuple(one for one in kind.keys if one not in listed)
+        listed += own
+        text = section(replace(key, keys=own, more=kind.more), title, name)
+        found[f"keys_{name}"] = title, _text(kind.more[0].removesuffix(".")), text
+    alone = key.name, _text(key.meaning), section(key, key.name, key.name)
+    return found or {f"keys_{key.name}": alone}
+
+
+def section(key: keys.Key, title: str, name: str) -> str:
+    """The page of a section at the top of a file, or of a kind of it."""
     # a section of another package may have no page of its own in the guide
-    see = f"In use: {GUIDES[key.name]}." if key.name in GUIDES else ""
-    parts = [f"# {key.name}", NOTE, *(part for part in _about(key) if part), see]
+    see = f"In use: {GUIDES[name]}." if name in GUIDES else ""
+    parts = [f"# {title}", NOTE, *(part for part in _about(key) if part), see]
     parts += [_table(key), *_below(key)]
     return "\n\n".join(part for part in parts if part) + "\n"
 

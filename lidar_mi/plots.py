@@ -4,6 +4,7 @@ All show the pilot's view: port (+y) on the left, up (+z) at the top. matplotlib
 first plot.
 """
 
+import re
 from collections.abc import Hashable
 from typing import TYPE_CHECKING, Any
 
@@ -94,7 +95,9 @@ def plot_wind(wind: xr.Dataset, ax: "Axes | None" = None) -> "Axes":
     y, z = v["y"].values, v["z"].values
     shown = np.where(valid, speed, np.nan)
     mesh = ax.pcolormesh(y, z, shown, shading="nearest", vmin=0, vmax=limit or 1.0, cmap="viridis")
-    ax.figure.colorbar(mesh, ax=ax, label="cross-flow wind / m s$^{-1}$", extend=extend, pad=0.02)
+    unit = re.sub(r"-(\d)", r"$^{-\1}$", str(v.attrs.get("units", "m s-1")))
+    what = "cross-flow wind" if unit.startswith("m") else "motion"
+    ax.figure.colorbar(mesh, ax=ax, label=f"{what} / {unit}", extend=extend, pad=0.02)
     every = max(1, round(max(v.shape) / _ARROWS))
     some = np.s_[::every, ::every]
     step = every * float(np.ptp(y)) / max(1, len(y) - 1)
@@ -115,7 +118,7 @@ def plot_wind(wind: xr.Dataset, ax: "Axes | None" = None) -> "Axes":
         )
         if colour == "white":
             length = float(f"{limit:.1g}") or 1.0
-            label = f"{length:g} m s$^{{-1}}$"
+            label = f"{length:g} {unit}"
             ax.quiverkey(arrows, 0.9, 1.04, length, label, labelpos="W", color="black")
     ax.set_title(ax.get_title() or " ")  # room for the key
     return ax
@@ -183,7 +186,8 @@ def _axes(ax: "Axes | None", field: xr.DataArray) -> "Axes":
 
         ax = plt.subplots(figsize=(7.5, 4.6), layout="compressed")[1]
     y, z = field["y"].values, field["z"].values
-    ax.set(xlabel="y / m (port is left)", ylabel="z / m", aspect="equal")
+    unit = field["y"].attrs.get("units", "m")
+    ax.set(xlabel=f"y / {unit} (port is left)", ylabel=f"z / {unit}", aspect="equal")
     ax.set_xlim(float(y.max()), float(y.min()))
     ax.set_ylim(float(z.min()), float(z.max()))
     return ax

@@ -148,11 +148,16 @@ def _gate(made, start, end, rng):
     for _ in range(20):
         near = rng.uniform(0.5 * start, end)
         gate = near, near + rng.uniform(0.02, 0.3) * (end - start)
-        x = np.linspace(*gate, 4001)
-        values = made.extinction(np.stack([x, 0 * x, 0 * x], -1))
-        if values.mean() > 0.02 * values.max() > 0:
+        if _filled(made, gate):
             return gate
     return None
+
+
+def _filled(made, gate):
+    """Whether there is air in a gate and more than a corner of it."""
+    x = np.linspace(*gate, 4001)
+    values = made.extinction(np.stack([x, 0 * x, 0 * x], -1))
+    return values.mean() > 0.02 * values.max() > 0
 
 
 def _state(kind, shape, rng):
@@ -208,10 +213,16 @@ def single_scattering(made: Field, offset: float = 0.0) -> float:
 
 def widened(seed: int) -> Field:
     """A field for multiple scattering: as wide as it is long, of few cells, with a long gate."""
-    made = next(f for f in map(field, range(seed * 1000, seed * 1000 + 1000)) if _coarse(f))
+    fields = map(field, range(seed * 1000, seed * 1000 + 1000))
+    wide = (_widened(made) for made in fields if _coarse(made))
+    return next(made for made in wide if _filled(made, made.gate))
+
+
+def _widened(made):
     length, *width = np.abs(made.place[:3, :3]).sum(1)
     stretch = np.diag([1.0, *(np.maximum(1.0, 0.5 * length / np.array(width))), 1.0])
-    end = float((made.place @ np.ones(4))[0])
+    # the farthest corner of a box in any pose
+    end = float(made.place[0, 3] + np.maximum(made.place[0, :3], 0).sum())
     return replace(made, place=stretch @ made.place, gate=(0.6 * end, end))
 
 
@@ -224,14 +235,17 @@ def double_scattering(made: Field, fov_half: float, paths: int, seed: int) -> tu
 
     Brute force: first vertices uniform along the beam; second ones from two densities, by flights
     in all directions and uniform in the field of view, weighted by their mean (balance heuristic).
+    All within the distances at which there is air.
     """
     rng, far = np.random.default_rng(seed), made.gate[1]
-    first = far * rng.random(paths)
+    near, longest = _reach(made)
+    first = near + (far - near) * rng.random(paths)
     turn, cosine = 2 * np.pi * rng.random(paths), 2 * rng.random(paths) - 1
     in_view = rng.random(paths) < 0.5
     view = 2 * np.pi * (1 - np.cos(fov_half))
     cosine = np.where(in_view, 1 - (1 - cosine) / 2 * (1 - np.cos(fov_half)), cosine)
-    length = np.where(in_view, far, 2 * far) * rng.random(paths)
+    part = rng.random(paths)
+    length = np.where(in_view, near + (far - near) * part, longest * part)
     sine = np.sqrt(1 - cosine**2)
     ways = np.stack([cosine, sine * np.cos(turn), sine * np.sin(turn)], -1) * length[:, None]
     start = np.stack([first, 0 * first, 0 * first], -1)
@@ -241,9 +255,10 @@ def double_scattering(made: Field, fov_half: float, paths: int, seed: int) -> tu
     counted = (whole > 2 * made.gate[0]) & (whole < 2 * made.gate[1])
     counted &= second[:, 0] > back * np.cos(fov_half)
     first, start, second, leg, back = (a[counted] for a in (first, start, second, leg, back))
-    density = 0.5 * ((back < far) / (view * back**2 * far))
-    density += 0.5 * ((leg < 2 * far) / (4 * np.pi * leg**2 * 2 * far))
-    value = made.extinction(start) * made.extinction(second) * PHASE**2 * AREA * far
+    density = 0.5 * ((near < back) & (back < far)) / (view * back**2 * (far - near))
+    density += 0.5 * (leg < longest) / (4 * np.pi * leg**2 * longest)
+    density = np.where(density > 0, density, np.inf)
+    value = made.extinction(start) * made.extinction(second) * PHASE**2 * AREA * (far - near)
     value *= second[:, 0] / back / (back**2 * leg**2 * density)
     lit = value > 0
     depth = _depths(made, 0 * start[lit], start[lit], rng)
@@ -252,6 +267,16 @@ def double_scattering(made: Field, fov_half: float, paths: int, seed: int) -> tu
     value[lit] *= np.exp(-depth)
     mean = value.sum() / paths
     return mean, float(np.sqrt(((value**2).sum() / paths - mean**2) / paths))
+
+
+def _reach(made):
+    """Distance at which the air begins, and that between the two scatterings at most."""
+    if made.environment:
+        return 0.0, 2 * made.gate[1]
+    local = np.array(list(np.ndindex(2, 2, 2))) * (1 + 2 * made.margin) - made.margin
+    corners = local @ made.place[:3, :3].T + made.place[:3, 3]
+    apart = np.linalg.norm(corners[:, None] - corners, axis=-1)
+    return max(corners[:, 0].min(), 0.0), apart.max()
 
 
 def _depths(made, start, end, rng, steps=200):

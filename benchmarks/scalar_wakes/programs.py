@@ -1,4 +1,4 @@
-"""Programs that retrieve vectors from a pair: ours, OpenPIV, OpenCV's DIS.
+"""Programs that retrieve vectors from a pair: ours, OpenPIV, FF-PIV, OpenCV's DIS.
 
 Of programs that state no errors, `lidar_mi.standard_errors` does.
 """
@@ -15,6 +15,7 @@ import lidar_mi as lm
 
 Program = Callable[[xr.DataArray, xr.DataArray, float], xr.Dataset]
 OPENPIV_WINDOWS = (32, 16, 16)
+FFPIV_WINDOW = 16
 STRIDE = 4
 
 
@@ -27,7 +28,16 @@ def ours(method: str) -> Program:
     return find
 
 
-def openpiv(first: xr.DataArray, second: xr.DataArray, dt: float) -> xr.Dataset:
+def openpiv(backend: str) -> Program:
+    """OpenPIV with correlations by SciPy, or by the package openpiv-rust."""
+
+    def find(first: xr.DataArray, second: xr.DataArray, dt: float) -> xr.Dataset:
+        return _openpiv(first, second, dt, backend)
+
+    return find
+
+
+def _openpiv(first: xr.DataArray, second: xr.DataArray, dt: float, backend: str) -> xr.Dataset:
     """Window deformation with windows of 32, 16, 16 px, validation as it comes."""
     from openpiv.settings import PIVSettings
     from openpiv.windef import simple_multipass
@@ -41,12 +51,25 @@ def openpiv(first: xr.DataArray, second: xr.DataArray, dt: float) -> xr.Dataset:
         deformation_method="symmetric",
         sig2noise_method=None,
         sig2noise_validate=False,
+        backend=backend,
     )
     with contextlib.redirect_stdout(io.StringIO()):
         _, _, right, up, _ = simple_multipass(first.values, second.values, options)
     # rows are z, ascending; OpenPIV assumes descending ones, and inverts the sign
     start = (OPENPIV_WINDOWS[-1] - 1) / 2
     return _with_errors(first, second, right, -up, dt, start, 4, OPENPIV_WINDOWS[-1])
+
+
+def ffpiv(first: xr.DataArray, second: xr.DataArray, dt: float) -> xr.Dataset:
+    """One pass of windows of 16 px, each with its mean and its standard deviation removed."""
+    import ffpiv as package
+
+    shape, overlap = (FFPIV_WINDOW,) * 2, (FFPIV_WINDOW - STRIDE,) * 2
+    right, up = package.piv(
+        first.values, second.values, window_size=shape, overlap=overlap, normalize=True
+    )
+    start = (FFPIV_WINDOW - 1) / 2
+    return _with_errors(first, second, right, up, dt, start, STRIDE, FFPIV_WINDOW)
 
 
 def dis(first: xr.DataArray, second: xr.DataArray, dt: float) -> xr.Dataset:
@@ -93,6 +116,10 @@ PROGRAMS: dict[str, Program] = {
     "lidar-mi cc": ours("cc"),
 }
 if find_spec("openpiv"):
-    PROGRAMS["OpenPIV, 16 px"] = openpiv
+    PROGRAMS["OpenPIV, 16 px"] = openpiv("scipy")
+    if find_spec("openpiv_rust"):
+        PROGRAMS["OpenPIV in Rust, 16 px"] = openpiv("rust")
+if find_spec("ffpiv"):
+    PROGRAMS["FF-PIV, 16 px"] = ffpiv
 if find_spec("cv2"):
     PROGRAMS["OpenCV DIS"] = dis

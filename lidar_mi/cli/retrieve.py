@@ -1,5 +1,6 @@
 """``lidar-mi retrieve``: the cross-flow wind in images of the same air."""
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +21,7 @@ EXAMPLES = (
     "lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc",
     "lidar-mi retrieve frame_*.tif --dt 0.1 --spacing 0.5 --pairs all",
     "lidar-mi retrieve stack.tif --frame 3,4 --dt 0.1 --spacing 0.5 -o wind.csv",
+    "lidar-mi retrieve a.png b.png --pixels -o motion.nc",
 )
 
 _SAME = 1e-3
@@ -84,6 +86,21 @@ def retrieve(
     spacing: Annotated[
         float | None, typer.Option(help="Pixel spacing in m, for files without axes.")
     ] = None,
+    pixels: Annotated[
+        bool,
+        typer.Option(
+            "--pixels",
+            help="Places and motion in pixels instead of metres, y and v to the left, z and w up; "
+            "without --dt motion from frame to frame.",
+        ),
+    ] = False,
+    picture: Annotated[
+        bool,
+        typer.Option(
+            help="Draw the vectors of a wind into a PNG of the same name as the file (not with "
+            "--pairs)."
+        ),
+    ] = True,
     noise: Annotated[
         float | None,
         typer.Option(
@@ -121,6 +138,12 @@ def retrieve(
     from lidar_mi.retrieval.wind.synchronised import synchronised
 
     check_target(out, files, overwrite=overwrite, suffixes=SUFFIXES if pairs is None else SERIES)
+    drawn = out.with_suffix(".png") if picture and pairs is None else None
+    if drawn is not None:
+        check_target(drawn, files, overwrite=overwrite)
+    if pixels and spacing is not None:
+        raise InputError("--pixels, --spacing: both; expected one of them")
+    spacing = 1.0 if pixels else spacing
     numbers = None if frame is None else _numbers(frame)
     layer = layer or _layer(files)
     asked = _frames(files, layer, numbers, pairs)
@@ -133,7 +156,8 @@ def retrieve(
             "all (a wind from each pair), or --method variational (one wind from all)"
         )
     images = [one for path, frames in asked for one in read_images(path, frames, layer, spacing)]
-    steps = _time_steps(paths, dt, equal=chosen is None)
+    per_frame = pixels and dt is None
+    steps = [1.0] * (len(paths) - 1) if per_frame else _time_steps(paths, dt, equal=chosen is None)
     noisy = paths if chosen is not None else paths[:1]
     levels: list[Any] = [
         read_noise(path, layer, spacing) if noise is None else noise for path in noisy
@@ -185,14 +209,18 @@ def retrieve(
         if isinstance(level, xr.DataArray) and pair[0] is not images[0]:
             # noise cannot be interpolated: its median is used
             level = float(level.median())
-        wind = retrieve_wind(
-            *pair,
-            dt=steps[0],
-            noise=level,
-            more=images[2:],
-            times=on_one_grid(*seen[:2]) if timed else None,
-            **options,
-        )
+        with progress() as notice:
+            notice(f"{method}: {grid.sizes['y']} x {grid.sizes['z']} pixels", None)
+            wind = retrieve_wind(
+                *pair,
+                dt=steps[0],
+                noise=level,
+                more=images[2:],
+                times=on_one_grid(*seen[:2]) if timed else None,
+                **options,
+            )
+    if pixels:
+        wind = _in_pixels(wind, per_frame=per_frame)
     z, y = (float(np.diff(grid[axis].values).mean()) for axis in "zy")
     wind = wind.assign_attrs(software=f"lidar-mi {__version__}")
     lost = write_wind(out, wind, (z, y))
@@ -202,8 +230,34 @@ def retrieve(
         _print_wind(wind)
     output.print(f"method   {method}")
     output.print(f"winds    {out}")
+    if drawn is not None:
+        _draw(wind, drawn)
+        output.print(f"picture  {drawn}")
     if lost:
         output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
+
+
+def _in_pixels(wind: "xr.Dataset", *, per_frame: bool) -> "xr.Dataset":
+    """The same numbers, of pixels of 1 m, with their units; ``per_frame``: and of frames of 1 s."""
+    wind = wind.copy()
+    for variable in wind.variables.values():
+        if "units" in variable.attrs:
+            unit = re.sub(r"\bm(?=-?\d|\b)", "px", str(variable.attrs["units"]))
+            if per_frame:
+                unit = re.sub(r"\bs(?=-?\d|\b)", "frame", unit)
+            variable.attrs["units"] = unit
+    return wind.assign_attrs(dt_units="frame") if per_frame else wind
+
+
+def _draw(wind: "xr.Dataset", path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    from lidar_mi.io.png import write_png
+    from lidar_mi.plots import plot_wind
+
+    figure = Figure(figsize=(7.5, 4.6), layout="compressed")
+    plot_wind(wind, figure.subplots())
+    write_png(figure, path)
 
 
 def _numbers(text: str) -> list[int]:
@@ -373,7 +427,13 @@ def _print_statistics(wind: "xr.Dataset") -> None:
     valid, columns = _statistics(wind)
     rows = list(zip(("mean", "rms", "mean stated error"), *columns, strict=True))
     title = f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid"
-    print_table(Table(title, rows, ("valid vectors", "v, m/s", "w, m/s")))
+    unit = _speed(wind)
+    print_table(Table(title, rows, ("valid vectors", f"v, {unit}", f"w, {unit}")))
+
+
+def _speed(wind: "xr.Dataset") -> str:
+    """The unit of v as one writes it: m/s, px/s or px/frame."""
+    return re.sub(r" (\w+)-1", r"/\1", str(wind["v"].attrs["units"]))
 
 
 def _print_series(winds: "xr.Dataset") -> None:
@@ -387,9 +447,19 @@ def _print_series(winds: "xr.Dataset") -> None:
         valid, columns = _statistics(wind, ".3f")
         numbers = (part for column in columns for part in column)
         rows.append((name, f"{float(wind['time']):.5g}", f"{valid:.0%}", *numbers))
-    heads = ("images", "time, s", "valid", "v: mean", "rms", "error", "w: mean", "rms", "error")
+    heads = (
+        "images",
+        f"time, {winds['time'].attrs['units']}",
+        "valid",
+        "v: mean",
+        "rms",
+        "error",
+        "w: mean",
+        "rms",
+        "error",
+    )
     title = f"{winds.sizes['y']} x {winds.sizes['z']} vectors a pair"
-    note = "mean, rms and mean stated error of the valid vectors, m/s"
+    note = f"mean, rms and mean stated error of the valid vectors, {_speed(winds)}"
     print_table(Table(title, rows, heads, note))
 
 

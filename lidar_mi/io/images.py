@@ -253,7 +253,7 @@ def _on_axes(
     else:
         raise InputError(
             f"{path}: no axes y and z for {columns} x {rows} pixels; expected them in the header "
-            "of an EXR file, or --spacing in m"
+            "of an EXR file, --spacing in m, or --pixels"
         )
     metres = {"units": "m"}
     axes = {"z": ("z", z, metres), "y": ("y", y, metres)}

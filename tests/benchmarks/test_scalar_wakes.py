@@ -7,8 +7,9 @@ truth's, and scores that are not those of errors that were put in.
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.ndimage import gaussian_filter
 
-from benchmarks.scalar_wakes import cases, score
+from benchmarks.scalar_wakes import cases, programs, score
 from lidar_mi.io.flo_file import write_flo
 
 
@@ -63,3 +64,24 @@ def test_vectors_near_the_rim_and_flagged_ones_do_not_count(truth):
     found["flag"][20, 30] = 4
     result = score.score([score.errors_of(found, truth)])
     assert result.rms == 0 and result.valid < 1
+
+
+def test_programs_find_a_known_motion():
+    """Each that is installed, of air that moves by 2 px to port and 1 px up; FF-PIV errs to 0."""
+    random = np.random.default_rng(3)
+    air = 1000 * (1 + 0.3 * gaussian_filter(random.standard_normal((90, 110)), 2.0) / 0.14)
+    z, y = np.arange(80.0), np.arange(100.0)
+    first, second = (
+        xr.DataArray(
+            air[up : up + 80, port : port + 100],
+            {"z": ("z", z, {"units": "m"}), "y": ("y", y, {"units": "m"})},
+            ("z", "y"),
+        )
+        for up, port in ((4, 6), (3, 4))
+    )
+    for name, program in programs.PROGRAMS.items():
+        found = program(first, second, 0.1)
+        inner = found.sel(z=slice(10, 70), y=slice(10, 90))
+        low = 0.6 if name.startswith("FF-PIV") else 0.9
+        for component, true in (("v", 20.0), ("w", 10.0)):
+            assert low * true < float(inner[component].median()) < 1.05 * true, name

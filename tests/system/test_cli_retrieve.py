@@ -1,7 +1,8 @@
 """``lidar-mi retrieve``: the time step that headers state, the numbers printed, completion.
 
 Detects: a step or an order of images taken on trust where the files contradict it; statistics that
-are not those of the file written; names that a shell does not complete. System tier.
+are not those of the file written; pixels that are not those of the wind in metres; a picture that
+is missing or replaces an input; names that a shell does not complete. System tier.
 """
 
 import re
@@ -9,6 +10,7 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from lidar_mi.cli import options
@@ -182,3 +184,49 @@ def test_shells_complete_commands_and_experiments(here, monkeypatch):
     assert options.complete_contents("so") == ["soot"] and "0.exr" in options.complete_contents("")
     assert options.complete_method("v") == ["variational", "vortex_fit"]
     assert complete_format("") == ["vtk", "csv", "mat", "control"]
+
+
+@pytest.fixture
+def photographs(tmp_path, monkeypatch):
+    """Two PNG files without axes, the second moved by two pixels to the right."""
+    monkeypatch.chdir(tmp_path)
+    air = gaussian_filter(np.random.default_rng(2).normal(size=(40, 60)), 1.5)
+    grey = np.interp(air, (air.min(), air.max()), (20, 230)).astype(np.uint8)
+    for name, start in (("a.png", 6), ("b.png", 4)):
+        Image.fromarray(grey[:, start : start + 48]).save(name)
+
+
+def test_pixels_are_those_of_the_wind_in_metres(photographs, lidar_mi):
+    assert lidar_mi("retrieve", "a.png", "b.png", *OPTIONS)[0] == 2
+    files = "retrieve", "a.png", "b.png", "--stride", "4"
+    code, out, err = lidar_mi(*files, "--pixels", "-o", "px.nc")
+    assert code == 0 and "v, px/frame" in out and "variational: 48 x 40 pixels" in err
+    assert lidar_mi(*files, "--spacing", 0.5, "--dt", 0.1, "-o", "m.nc")[0] == 0
+    assert lidar_mi(*files, "--pixels", "--dt", 0.1, "-o", "px_s.nc")[0] == 0
+    pixels, metres, timed = (xr.load_dataset(name) for name in ("px.nc", "m.nc", "px_s.nc"))
+    # y is to the left
+    assert float(pixels["v"].median()) == pytest.approx(-2, abs=0.05)
+    for name in ("v", "w", "v_stderr", "w_stderr"):
+        one = pixels[name].values
+        np.testing.assert_allclose(one, metres[name] * 0.1 / 0.5, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(one, timed[name] * 0.1, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(pixels["y"], metres["y"] / 0.5)
+    units = [data["v"].attrs["units"] for data in (pixels, metres, timed)]
+    assert units == ["px frame-1", "m s-1", "px s-1"] and pixels["y"].attrs["units"] == "px"
+    code, _, err = lidar_mi(*files, "--pixels", "--spacing", 1)
+    assert code == 2 and "--pixels, --spacing" in err
+
+
+def test_a_picture_of_the_vectors(photographs, lidar_mi, tmp_path):
+    files = "retrieve", "a.png", "b.png", "--pixels", "--stride", "4"
+    code, out, _ = lidar_mi(*files, "-o", "w.nc")
+    assert code == 0 and "picture w.png" in words_of(out)
+    with Image.open("w.png") as picture:
+        # arrows and colours: a picture of one colour has nothing in it
+        assert min(picture.size) > 100 and len(set(picture.convert("L").tobytes())) > 20
+    before = (tmp_path / "a.png").read_bytes()
+    code, _, err = lidar_mi(*files, "-o", "a.nc")
+    assert code == 2 and "a.png: is an input" in err
+    assert (tmp_path / "a.png").read_bytes() == before and not (tmp_path / "a.nc").exists()
+    assert lidar_mi(*files, "-o", "plain.nc", "--no-picture")[0] == 0
+    assert not (tmp_path / "plain.png").exists()

@@ -4,7 +4,9 @@ Detects a version, a dependency or a bound that one of them states otherwise tha
 file that the container image or its recipe would lack, and a paper that cites nothing it has.
 """
 
+import json
 import re
+import shlex
 import tomllib
 from pathlib import Path
 
@@ -62,6 +64,30 @@ def test_image_has_what_a_wheel_is_made_of():
         assert re.search(rf"^COPY .*\b{re.escape(name)}\b", text, re.MULTILINE)
         assert f"!{name}" in allowed
     assert text.startswith("#") and "FROM debian:bookworm-slim" in text
+
+
+def test_commands_of_the_image_can_run(lidar_mi):
+    """What is copied is there, what pip installs are requirements, what starts is a command."""
+    text = (ROOT / "Dockerfile").read_text().replace("\\\n", " ")
+    lines = [line.split(maxsplit=1) for line in text.splitlines() if line[:1].isalpha()]
+    for word, rest in lines:
+        if word == "COPY":
+            *sources, _ = rest.split()
+            assert all((ROOT / source).exists() for source in sources)
+    (pip,) = (part for _, rest in lines for part in rest.split("&&") if "pip install" in part)
+    words = shlex.split(pip.split("pip install")[1])
+    *given, source = [word for word in words if not word.startswith(("-", "https:"))]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    allowed = {one.name: one.specifier for one in map(Requirement, project["dependencies"])}
+    # a version that the package does not allow would be replaced
+    for one in map(Requirement, given):
+        assert set(one.specifier) <= set(allowed[one.name])
+    assert source == "/source"
+    (command,) = (json.loads(rest) for word, rest in lines if word == "ENTRYPOINT")
+    environment = re.search(r"python3 -m venv (\S+)", text)[1]
+    assert [name for name in project["scripts"] if f"{environment}/bin/{name}" == command[0]]
+    (arguments,) = (json.loads(rest) for word, rest in lines if word == "CMD")
+    assert lidar_mi(*arguments)[0] == 0
 
 
 @pytest.mark.parametrize("name", sorted(p.name for p in (ROOT / ".github/workflows").glob("*.yml")))

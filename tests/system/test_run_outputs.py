@@ -23,6 +23,7 @@ from lidar_mi.io.exr import read_scan
 from tests.support.experiments import FIGURES, SOURCES
 
 SCENES = Path(str(files("lidar_mi.scenes")))
+METHODS = "variational", "cc"
 
 STATISTICS = [
     f"{statistic}_{name}"
@@ -108,7 +109,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
     assert all(isinstance(value, float) and np.isfinite(value) for value in metrics.values())
     expected = {
         f"{source}.{method}.{key}"
-        for source, method in product(SOURCES, ("cc", "ws"))
+        for source, method in product(SOURCES, METHODS)
         for key in (
             "valid_fraction",
             "retrieved_fraction",
@@ -116,15 +117,23 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
         )
     }
     expected |= {
-        f"{source}.cc.{key}"
-        for source, key in product(SOURCES, ("stderr_v", "stderr_w", "no_skill_fraction"))
+        f"{source}.{method}.{key}"
+        for source, method, key in product(
+            SOURCES, METHODS, ("stderr_v", "stderr_w", "no_skill_fraction")
+        )
     }
     # the noise of an image that was rendered is known, and so how well a wind can be found in it
-    expected |= {f"backscatter.cc.{q}_{name}" for q in ("bound", "efficiency") for name in "vw"}
+    expected |= {
+        f"backscatter.{method}.{q}_{name}"
+        for method, q, name in product(METHODS, ("bound", "efficiency"), "vw")
+    }
     expected |= {
         "backscatter.mc_relative_error",
         "backscatter.samples_per_beam",
-        *(f"backscatter.cc.{p}monte_carlo_{n}" for p in ("", "outside_cores.") for n in "vw"),
+        *(
+            f"backscatter.{method}.{part}monte_carlo_{name}"
+            for method, part, name in product(METHODS, ("", "outside_cores."), "vw")
+        ),
         "backscatter.multiple_scattering_fraction",
         "backscatter.depolarization",
         "backscatter.depolarization_stderr",
@@ -141,8 +150,8 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
     }
     expected |= {f"true_wind.{part}rms_{q}" for part in ("", "outside_cores.") for q in "vw"}
     expected |= {f"timing.{step}_s" for step in ("truth", "render", "retrieve", "figures")}
-    # no vector of smooth smoke is valid, nor any of weight shift: their statistics are left out
-    for none in ("extinction_without_texture.cc.", *(f"{source}.ws." for source in SOURCES)):
+    # no vector of smooth smoke is valid: its statistics are left out
+    for none in (f"extinction_without_texture.{method}." for method in METHODS):
         assert metrics[f"{none}valid_fraction"] == 0
         expected -= {f"{none}{part}{s}" for part in ("", "outside_cores.") for s in STATISTICS}
         expected -= {f"{none}{q}" for q in ("stderr_v", "stderr_w", "no_skill_fraction")}
@@ -154,7 +163,7 @@ def test_wind_file_is_cf(demo):
         assert wind.attrs["Conventions"].startswith("CF-")
         assert wind["v"].dims == ("source", "algorithm", "z", "y")
         assert wind["source"].values.tolist() == list(SOURCES)
-        assert wind["algorithm"].values.tolist() == ["cc", "ws"]
+        assert wind["algorithm"].values.tolist() == list(METHODS)
         for name, variable in wind.variables.items():
             if variable.dtype.kind == "f":
                 assert variable.attrs["units"] in ("m", "m s-1", "s", "1"), name

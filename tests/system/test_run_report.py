@@ -126,4 +126,4 @@ def test_report_contains_the_numbers(demo):
         f"simulation {percent(demo.metrics['backscatter.mc_relative_error'])} (64 samples per beam)"
     )
     assert noise in words and "no detector" in words
-    assert "cross-correlation" in words and "weight shift" in words
+    assert "cross-correlation" in words and "variational" in words

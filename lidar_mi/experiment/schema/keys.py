@@ -142,6 +142,28 @@ def keys_of(name: str, data: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(f"{name}.{key}" for key in section.model_fields) if section else ()
 
 
+@dataclass(frozen=True)
+class Kind:
+    """One kind of a section that ``kind`` chooses: its paragraphs and its keys."""
+
+    word: str
+    more: tuple[str, ...]
+    keys: tuple[str, ...]
+
+
+def kinds(name: str) -> tuple[Kind, ...]:
+    """Those of a section; none: it has no key ``kind`` that chooses its keys."""
+    annotation = _fields()[name][1].annotation
+    if f"{name}.kind" not in _fields():
+        return ()
+    tagged = {word: tagged_section(annotation, word) for word in explain(f"{name}.kind").words}
+    return tuple(
+        Kind(word, _paragraphs(model), tuple(f"{name}.{key}" for key in model.model_fields))
+        for word, model in tagged.items()
+        if model is not None
+    )
+
+
 def sections() -> tuple[str, ...]:
     """Names of the keys at the top of a file."""
     return tuple(Experiment.model_fields)

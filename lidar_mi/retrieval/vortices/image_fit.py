@@ -212,7 +212,7 @@ def detected_fit(
     taken = _checked_acquisition(stack, dt, noise, profile, frozen, times, telescope, device)
     first, second = (on_device(image, device) for image in stack)
     with threads_for(image1.size):
-        return _detected(first, second, taken)
+        return within_memory(lambda: _detected(first, second, taken))
 
 
 def _detected(first: torch.Tensor, second: torch.Tensor, taken: Acquisition) -> VortexPairFit:

@@ -315,9 +315,6 @@ def test_blurred_images_with_less_noise_have_no_larger_errors():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="errors in the cores 0.86 of those of blurred images, not 0.85"
-)
 def test_known_blur_is_corrected_in_the_cores():
     """It commutes with shifts, not with what turns and shears; beyond the cores it amplifies noise,
     which costs less than half of what is gained within."""

@@ -43,7 +43,7 @@ def reduced_errors(seed, amount, **changes):
         experiment.platform.dt,
         "variational",
         noise=noise,
-        **window_settings(experiment.retrieval),
+        **window_settings(experiment.retrieval, None),
     )
     good = wind["flag"].values == 0
     assert good.mean() > 0.9

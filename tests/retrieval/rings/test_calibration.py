@@ -196,7 +196,7 @@ def test_lamp_with_two_lines():
     """A second line half an order away: no instrument of one line has such rings."""
     second = replace(SMALL, order=SMALL.order + 0.45)
     frames = laser_frames(3, 10, Defects()) + laser_frames(3, 11, Defects(), instrument=second)
-    refused(frames, "frames")
+    refused(frames, "frames: the calibration does not converge|frames: chi-square")
 
 
 def test_one_ring():
