@@ -48,7 +48,12 @@ EXPERIMENTS = {
         "retrieval": {"methods": ["ws", "cc", "variational"], "stride": 2},
         "doppler": {"lidar": {"range": "150 m"}} | QUICK_DOPPLER,
         "sensor": {
-            "directions": {"columns": 5, "rows": 3},
+            "directions": {
+                "columns": 5,
+                "rows": 3,
+                "azimuth_half": "8 deg",
+                "elevation_half": "4 deg",
+            },
             "method": "variational",
             "crossflow_std": "0.8 m/s",
         },
@@ -61,7 +66,10 @@ EXPERIMENTS = {
     "slices": {
         "wake": PAIR,
         "doppler": COHERENT
-        | {"kind": "coherent", "scan": {"count": 3, "elevations": ["0 deg", "30 deg"]}},
+        | {
+            "kind": "coherent",
+            "scan": {"count": 3, "elevations": ["0 deg", "30 deg"], "rate": "10 deg/s"},
+        },
     },
 }
 
@@ -147,7 +155,7 @@ def sample():
         coords[name] = ("sample", values, {"scale": "linear", "long_name": name})
     data = campaign(coords, ("sample",), 10 ** (1 - 2 * unit))
     for mode, factor in (("off", 1.0), ("autopilot", 0.5), ("feedforward", 0.2)):
-        roll = factor * (0.02 + unit)
+        roll = (0.02 + unit) ** (2 - factor)
         data[f"encounter.{mode}.largest_roll"] = "sample", roll, {"units": "rad"}
     return data
 

@@ -413,9 +413,10 @@ def _cells(
         )
         if failed[i, j]:
             axes.plot(across[j], up[i], "x", color=FAILED, ms=9, mew=2)
-    _scale(axes, x, y)
+    # how many numbers an axis has follows from its limits
     axes.set_xlim(edges[0].min(), edges[0].max())
     axes.set_ylim(edges[1].min(), edges[1].max())
+    _scale(axes, x, y)
     return marks
 
 

@@ -55,11 +55,12 @@ def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     """The axes' figure as an SVG element with marks below its lines; all text is escaped."""
     figure = axes.figure
     assert isinstance(figure, Figure)  # that of `panel`
+    spoken = ". ".join(part for part in (label.strip(" ,"), seen(figure)) if part)
     # cells and dots are behind the frame
     figure.patch.set_visible(False)
     axes.patch.set_visible(False)
     text = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": f"{label}{marks}"}):
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": f"{spoken}{marks}"}):
         FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None})
     svg = text.getvalue()
     height = float(figure.get_figheight() * 72)
@@ -67,7 +68,6 @@ def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     body = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     size = re.search(r'viewBox="([^"]*)"', body)
-    spoken = ". ".join(part for part in (label.strip(" ,"), seen(figure)) if part)
     # what holds links is no image
     role = "group" if marks else "img"
     start = f'<svg viewBox="{size[1] if size else ""}" role="{role}" aria-label="{escape(spoken)}">'
