@@ -2,6 +2,7 @@
 
 import re
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from matplotlib.lines import AxLine
 from matplotlib.quiver import Quiver, QuiverKey
 
 from lidar_mi.assessment.figures import campaign, linked, plates
+from lidar_mi.io import png
 
 
 def faults(figure, marks=0):
@@ -103,7 +105,7 @@ def judged_figures():
     svg = linked.as_svg
 
     def write(figure, path, **_):
-        found[path.stem] = faults(figure)
+        found[Path(path).stem] = faults(figure)
         figure.set_layout_engine("none")
         figure.savefig(path, dpi=40)
 
@@ -113,6 +115,8 @@ def judged_figures():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plates, "write_png", write)
+        # that of the commands, which import it when they draw
+        patch.setattr(png, "write_png", write)
         for module in (linked, campaign):
             patch.setattr(module, "as_svg", as_svg)
         yield found
