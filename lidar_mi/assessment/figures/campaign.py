@@ -337,8 +337,8 @@ def draw_against(
     return as_svg(axes, [], f"{label} against {name}")
 
 
-def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> str:
-    """First-order and total indices of every knob with their intervals."""
+def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str], of: str) -> str:
+    """First-order and total indices of every knob for a metric, with their intervals."""
     _, axes = panel(title)
     rows = np.arange(len(found.knobs), dtype=float)[::-1]
     for shift, name, values, interval, colour in (
@@ -350,7 +350,7 @@ def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> 
     axes.set_yticks(rows, [labels[name] for name in found.knobs])
     axes.set(xlim=(0, 1), xlabel="fraction of the variance")
     axes.legend(fontsize=8)
-    return as_svg(axes, [], title)
+    return as_svg(axes, [], f"{title} of {of}")
 
 
 def _finer(places: np.ndarray, logarithmic: bool) -> np.ndarray:
