@@ -61,12 +61,13 @@ def sheet(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
 
 
 def panels_of(number: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels for slabs, in rows of two, and none that is empty."""
-    columns = min(number, 2)
-    figure, grid = sheet(-(-number // columns), columns)
-    if number == 1:
-        # alone it has the space of two
-        figure.set_size_inches(8.8, 5.6)
+    """A figure with so many panels for slabs, in rows of two or three, and none that is empty."""
+    columns = 3 if number % 2 and number > 1 else min(number, 2)
+    rows = -(-number // columns)
+    figure, grid = sheet(rows, columns)
+    if columns != 2:
+        # one alone has the space of two, three are smaller
+        figure.set_size_inches((8.8, 5.6) if columns == 1 else (18, 4.2 * rows))
     for spare in grid.ravel()[number:]:
         spare.remove()
     return figure, list(grid.ravel()[:number])
