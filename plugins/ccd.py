@@ -19,7 +19,7 @@ Parameter                   Type       Meaning                                  
                                        larger x, of larger y lie farther from the lens
 ``distortion``              float      k of r = r_ideal (1 + k (r_ideal / R)^2), R half the 0
                                        CCD's diagonal; up to 0.05 each way
-``defocus``                 float      diameter of the disc that a point of light is, m     0
+``defocus``                 float      diameter of the image of a point of light, m         0
 ``stop_radius``             float      m                                                    5e-3
 ``lens``                    string,    ``ideal``: light at an angle goes to r = f tan       ideal
                             tensor     (angle), from everywhere on the stop; or N x 4
@@ -31,14 +31,15 @@ Parameter                   Type       Meaning                                  
 
 The image is upright: its top is z up, its left is y. A lens has a row for each surface along the
 light path, the stop first: radius of curvature (m; positive: the centre is on the side of the CCD;
-0: plane), conic constant, distance to the next surface or the CCD (m), refractive index behind.
-The lens is assumed to be coated: without loss and without effect on the polarisation. For a real
-lens ``focal_length`` is only information for other parts of the program.
+0: plane), conic constant, distance to the next surface or the CCD (m), refractive index behind. The
+lens is assumed to be coated: without loss and without effect on the polarisation. For a real lens
+``focal_length`` does not affect the image; other parts of the program use it.
 
-Tilt and distortion are about ``centre``, and come on top of those of a real lens. Light that passes
-the middle of the stop is not moved by a defocus, light at its rim by half the disc; the disc is the
-same everywhere on the CCD. (Rays from the CCD through a real lens take their place in its last
-surface for that in the stop, which differs by 1 to 2 % of the disc.)
+Tilt and distortion are about the point (``centre_x``, ``centre_y``), and add to those of a real
+lens. A defocus spreads a point of light over a disc that is the same everywhere on the CCD: light
+through the middle of the stop is not displaced, light through its rim by the radius of the disc.
+(Rays traced from the CCD through a real lens use their position on its last surface in place of
+that in the stop, which causes an error of 1 to 2 % of the disc.)
 
 The weight of a sampled ray is the étendue (m^2 sr) of its pixel, so that the mean of weight times
 radiance is the power on the pixel.

@@ -14,8 +14,8 @@ orders within 1 degree of the axis, 0.004 m/s at 355 nm).
 Parameter                    Type    Meaning                                                Default
 ============================ ======= ====================================================== ========
 ``gap``                      float   mean distance of the mirrors, m                        13.7e-3
-``order_fraction``           float   fractional order on the axis, mirrors included, to     as the
-                                     which the gap is tuned by at most half an order        gap is
+``order_fraction``           float   fractional order on the axis, mirrors included, to     that of
+                                     which the gap is tuned by at most half an order        ``gap``
 ``index``                    float   refractive index in the gap                            1
 ``reflectivity``             float   of a mirror, for any angle and polarisation            0.7
 ``coating``                  string  instead of ``reflectivity``: layers of a mirror from   none
@@ -41,17 +41,17 @@ Transmitted (component 1, ``Null``) and reflected light (component 0) have Muell
 and p components and their phases. The outer faces of the plates are assumed to be coated and
 wedged, so that their reflections are not received. A coating applies to both mirrors and is
 computed for the laser line at the angle of the ray (transfer matrices); its dispersion is included
-as the delay of a reflection on the axis. The walk-off of 2 d tan(angle) per round trip, 0.4 mm at
-15 mrad, is neglected; it is small compared with an aperture of a few cm. With a gap of index n
-light is refracted by Snell's law from air of index 1.
+as the delay of a reflection on the axis. The walk-off of 2 ``gap`` tan(angle) per round trip, 0.4
+mm at 15 mrad, is neglected; it is small compared with an aperture of a few cm. With a gap of index
+n light is refracted by Snell's law from air of index 1.
 
 With ``sampled`` the ``time`` of a ray contains its frequency offset from the laser line in Hz,
 which the :ref:`fringes <integrator-fringes>` integrator sets; use it for several etalons in a row.
 ``folded`` uses the width of the line on the axis: widths are then wrong by 1 - cos(angle), 1e-4 at
 15 mrad. ``gap`` and ``order_fraction`` (in double precision), ``surface_rms``, ``bow`` and, without
 a coating, ``reflectivity`` and ``absorption`` can be changed through ``mi.traverse``; a new
-``order_fraction`` tunes the gap again. They and the line can also differ between scenes of one
-kind. Neither recompiles anything.
+``order_fraction`` tunes the gap again. These parameters and the line can also differ between scenes
+of the same structure. Neither causes a recompilation.
 
 .. code-block:: xml
 

@@ -24,9 +24,9 @@ Parameter                    Type    Meaning                                    
 
 All estimators have the same expectation. A path is a straight line from the source to the stop.
 Surfaces multiply its weight (component ``Null`` of their BSDF) and do not displace it. Surfaces
-without that component block the light; reflected light is lost. A scene is refused if a surface
-lies so close behind another one that a ray would miss it. The frequency of each path is drawn from
-the line of the source and stored with the ray, as an offset in Hz in place of its ``time``.
+without that component block the light; reflected light is lost. A scene is refused if two surfaces
+are so close to each other that a ray would miss the second one. The frequency of each path is drawn
+from the line of the source. The ray stores it as an offset in Hz in place of its ``time``.
 
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``S0`` ...
 ``S3``, ``S0_stderr``; row 0 is the top. The Stokes vector refers to the horizontal axis.

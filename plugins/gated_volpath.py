@@ -16,29 +16,29 @@ Parameter                    Type    Meaning                                    
                                      ``analog``: free flights from their physical
                                      distribution, most samples miss the gate (for
                                      validation)
-``candidates``               int     light paths, of which the single scattering of a sample   1
-                                     takes one by its contribution: with 16 a long pulse at a
+``candidates``               int     single-scattering paths, of which each sample selects    1
+                                     one by its contribution: with 16, a long pulse at a
                                      bright slab needs 25 to 50 times fewer samples, each of
                                      which takes twice as long
 ``orders``                   bool    also give S0 of every scattering order                  false
 ``covariance``               bool    also give the standard errors of S1, S2 and S3 and the  false
                                      correlation of the errors of S0 and S1 (for the error of
                                      the depolarisation ratio)
-``shares``                   bool    also give the largest share of one sample in the        false
-                                     variance of S0
+``shares``                   bool    also give the largest fraction of the variance of S0     false
+                                     that is due to one sample
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
                                      memory, does not change the result
 ============================ ======= ======================================================= =======
 
-Both estimators connect every collision to a sampled point of the telescope, test the field of
-view and multiply by the transmittance of all media on the way. They have the same expectation. In
-the gated estimator every sample belongs to a gate and has a range R in it. The last vertex of each
-scattering order is placed so that the whole path is 2 R long: on the ellipsoid whose foci are the
-last but one vertex and the telescope point. Its direction is drawn preferably into the field of
-view; of two candidates one is selected in proportion to its contribution (Talbot, Cline & Egbert
-2005). With several ``candidates`` so is the path of single scattering: each has a ray of the
-laser and a point of the telescope of its own, and its place in another of as many equally probable
-parts of the gate and the pulse. Gradients, and scenes with open surfaces between media, have one.
+Both estimators connect every collision to a sampled point of the telescope, test the field of view
+and multiply by the transmittance of all media on the way. They have the same expectation. In the
+gated estimator every sample belongs to a gate and has a range R in it. The last vertex of each
+scattering order is placed such that the whole path is 2 R long: on the ellipsoid whose foci are the
+vertex before it and the telescope point. Its direction is drawn preferably into the field of view;
+of two candidates one is selected in proportion to its contribution (Talbot, Cline & Egbert 2005).
+With several ``candidates`` the path of single scattering is selected in the same way. Each
+candidate has its own ray of the laser and point of the telescope, and its place is stratified over
+the gate and the pulse. Gradients, and scenes with open surfaces between media, use one candidate.
 
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
 ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
@@ -46,10 +46,11 @@ each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... after these, wit
 ``gateNNN.S1_stderr``, ``gateNNN.S0_S1_correlation``, ``gateNNN.S2_stderr`` and
 ``gateNNN.S3_stderr`` after these, with ``shares`` ``gateNNN.S0_largest_share`` after all.
 
-A standard error to which one sample contributes half of the variance or more is known to a factor
-of two at best, and most of the light may not have been sampled. Without ``shares``, a warning says
-so where this holds for more than 1 % of the pixels that receive light; the integrator's ``lit`` and
-``untrusted`` are the numbers of these pixels. Light that no sample has met is not noticed.
+If one sample contributes half of the variance or more, the standard error is uncertain by a factor
+of two at least, and most of the light may not have been sampled. Without ``shares``, a warning is
+given if this holds for more than 1 % of the pixels that receive light. The integrator's attributes
+``untrusted`` and ``lit`` are the numbers of such pixels and of all pixels that receive light. Light
+that no sample has reached cannot be detected in this way.
 
 The Stokes vector of the received light, like that of the emitted light, refers to the horizontal
 axis e_h of the beam, projected perpendicular to the returning light, as for an analyser fixed to
@@ -66,30 +67,31 @@ S0 to S3 of all orders are differentiable, in reverse and forward mode (``dr.bac
 ``dr.forward_to`` of what ``mi.render(scene, params)`` returns), with the gated estimator: with
 respect to extinction coefficients and albedos, to weights of a ``blendphase``, g of ``hg``, tables
 of :ref:`mueller <phase-mueller>`, and the flow of a :ref:`moving_volume <volume-moving_volume>`.
-The samples are others than those of the image. Memory does not grow with the orders. Gradients
-with respect to anything else are refused in one line. What a loss takes from other channels,
-standard errors among them, has no gradient.
+Gradients use other random samples than the image. Memory does not grow with the number of orders.
+Gradients with respect to anything else raise an error of one line. Other channels, such as standard
+errors, are constants in a loss: they have no gradient.
 
 A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
 extinction coefficient, an albedo or a weight of a blend outside 0 to 1, if ``hg`` has a g beyond
 0.99 in magnitude, or if a shape or volume has a transform that is not finite. Values are checked
 before the first rendering and whenever they are replaced.
 
-What else Mitsuba's scenes offer is honoured or refused in one line, before anything is rendered:
+Other features of Mitsuba scenes are either supported or refused with an error of one line before
+anything is rendered:
 
 ===================================== =============================================================
-Of a scene                            What becomes of it
+Feature of a scene                    Treatment
 ===================================== =============================================================
 film: ``width``, ``height``           honoured: the beams
 film: crop, ``sample_border``         refused
-film: ``rfilter``                     ``box``, or none stated: a beam is a pixel of its own; others
-                                      are refused
+film: ``rfilter``                     ``box``, or none stated: each beam is one pixel; others are
+                                      refused
 film: formats of pixel and file       no effect: the tensor is single precision and its channels
                                       have names
 other films than ``hdrfilm``          refused
 sampler                               ``independent``; others are refused, and its ``seed``: it is
                                       given to ``mi.render``
-sensor: shutter                       refused; ``beams`` have times of their own
+sensor: shutter                       refused; each beam has its own time, see ``beams``
 sensor: clipping, fields of cameras   unknown parameters: refused by Mitsuba
 sensor: medium                        honoured; refused if it is not that of the shape in which the
                                       telescope is. If none is stated, the shape's
@@ -109,20 +111,20 @@ cube, sphere, closed mesh             honoured: the interior is what it encloses
 rectangle, disk, cylinder, open mesh  honoured: the exterior is on the side of the normal. Refused
                                       where a beam first meets the side of another medium
 other shapes around media             refused; instances always
-shapes that touch, nest, overlap      honoured, without a least distance. Where closed shapes
+shapes that touch, nest, overlap      honoured, without a minimum distance. Where closed shapes
                                       overlap, the smallest one's medium holds
 exterior medium                       if none is stated, what surrounds the shape; beside open
                                       surfaces a vacuum. Refused if it is neither the sensor's nor
                                       that of another shape
-``merge``, shapes that Mitsuba merges honoured: taken apart again
+``merge``, shapes that Mitsuba merges honoured: they are separated again
 medium: ``scale``, chromatic values   honoured, at the laser's wavelength
 medium: ``sample_emitters``           no effect: there is no emitter to sample
 volume: all parameters                honoured, of extinction and albedo
 grid of three channels                as Mitsuba reads colours: the laser's channel in RGB
                                       variants, the luminance in ``mono`` ones
 phase function ``tabphase``           honoured within rounding of 0 and 180 degrees as well
-``mi.traverse``                       all that it lists is honoured, shapes that move included. It
-                                      cannot exchange media
+``mi.traverse``                       all parameters that it lists can be changed, poses of shapes
+                                      included. Media cannot be exchanged
 ===================================== =============================================================
 
 .. code-block:: xml

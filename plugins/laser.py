@@ -35,13 +35,13 @@ Parameter                 Type       Meaning                                    
 
     {"type": "laser", "beam_radius": 0.1, "beam_cut": 0.1, "divergence_full_mrad": 2.0}
 
-It also lights the surfaces and media of any scene, under ``path``, ``volpath``, ``ptracer`` and
-other integrators of Mitsuba. What they return is then of a pulse: fluence in J/m^2 in place of
-irradiance. Rays do not hit the laser; it is sampled, by its directions where the beam is about as
-wide as the aperture and by places of the aperture where the divergence has made it wider. Both are
-unbiased. Spectral variants draw wavelengths at random, of which none is the laser's: there,
-``gated_volpath`` alone renders it. Energy, radius, cut, divergence and pose can be changed through
-``mi.traverse``.
+The laser can also illuminate the surfaces and media of any scene, with ``path``, ``volpath``,
+``ptracer`` and other integrators of Mitsuba. Their results are then those of a pulse: fluence in
+J/m^2 in place of irradiance. Rays cannot hit the laser; it is always sampled. Near the laser, where
+the beam is about as wide as the aperture, directions are sampled; further away, where the
+divergence has widened it, points of the aperture. Both are unbiased. Spectral variants draw random
+wavelengths, none of which is that of the laser: in these variants only ``gated_volpath`` renders
+it. Energy, radius, cut, divergence and pose can be changed through ``mi.traverse``.
 """
 
 import math

@@ -20,19 +20,19 @@ Parameter                  Type           Meaning
 ``flow``                   tensor, string optional: Z x Y x X x 3 numbers, or a ``.npy`` file of
                                           them: the wind in m/s along the world's axes at the
                                           centres of cells of a grid that fills the same cube,
-                                          of any size. It carries the one state of ``data``
+                                          of any size. It advects the single state of ``data``
 ========================== ============== ==================================================
 
-Values are linear between states and between cells, and those of the nearest state or cell beyond
-the ends. A pattern of wavelength L that moves by d from one state to the next is displaced by at
-most 0.63 d^3 / L^2 in between, and its amplitude is smaller by at most 5 (d / L)^2, for d well
-below L. With a ``flow`` u there is one state, at ``time_start``; s seconds later the value at p is
-that at p - s u(p - s u(p) / 2): frozen air, followed back in one step of the midpoint rule. Air
-that comes from beyond the ends has the value of the nearest cell, and bounds of the extinction are
-those of the whole grid.
+Values are interpolated linearly between states and between cells. Beyond the ends they are those of
+the nearest state or cell. A pattern of wavelength L that moves by d from one state to the next is
+displaced by at most 0.63 d^3 / L^2 in between, and its amplitude is smaller by at most 5 (d / L)^2,
+for d well below L. With a ``flow`` u there is one state, at ``time_start``; s seconds later the
+value at p is that of the state at p - s u(p - s u(p) / 2): frozen air, traced back by one step of
+the midpoint rule. Air from outside the grid has the value of the nearest cell. The bounds of the
+extinction are those of the whole grid.
 
 ``data`` (with a last axis of one channel) and ``flow``, both differentiable, ``time_start`` and
-``time_stop`` can be changed through ``mi.traverse`` without recompilation. Other integrators than
+``time_stop`` can be changed through ``mi.traverse`` without recompilation. Integrators other than
 :ref:`gated_volpath <integrator-gated_volpath>` use the time of their rays.
 
 .. code-block:: xml

@@ -45,13 +45,14 @@ is at x reaches these planes at ranges that are shorter by x over that cosine. `
 are ranges from each beam's own origin, shorter by x: the gates follow the air, not the lidar.
 
 Files of tables are ``.npy``, or text with numbers separated by blanks or commas and ``#`` comments.
-Integrators other than :ref:`gated_volpath <integrator-gated_volpath>` take it for a camera along
-the beams, without its laser and its gates, and a warning says so.
+Integrators other than :ref:`gated_volpath <integrator-gated_volpath>` use this sensor as a camera
+along the beams, without laser and gates, and a warning says so.
 
-The time of a beam is that of its light everywhere, in a :ref:`volume that changes with time
-<volume-moving_volume>` for instance; the pulse itself takes none. Directions, ``origins`` (x, y, z
-of every beam) and ``times``, gates, aperture, field of view, pose and the laser (as
-``laser.divergence_full_mrad``) can be changed through ``mi.traverse`` without recompilation.
+All light of a beam has the time of the beam, in a
+:ref:`volume that changes with time <volume-moving_volume>` for instance; the pulse itself takes
+none. Directions, ``origins`` (x, y, z of every beam) and ``times``, gates, aperture, field of view,
+pose and the laser (as ``laser.divergence_full_mrad``) can be changed through ``mi.traverse``
+without recompilation.
 
 .. code-block:: xml
 

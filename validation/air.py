@@ -109,7 +109,8 @@ def divergence(effort):
         Row("divergence over the gradient, rms", "continuity", 0.0, float(found), tolerance=2e-3),
         Row("amplitudes along their waves", "continuity", 0.0, float(along), tolerance=1e-12),
     )
-    text = "Of the differences 2e-4 remain; the amplitudes are across their waves exactly."
+    text = "Finite differences leave 2e-4 of the gradient; the amplitude of each wave is exactly "
+    "perpendicular to its wave vector."
     return Check("Divergence of turbulence", text, rows)
 
 
@@ -201,7 +202,11 @@ def regulations(effort):
         Row("its radius over that of the downdraft", nasa, 1.1212, r[where] / 600, 0, 2e-3),
         Row("its height", nasa, 60.0, z[where], 0, 1.0, "m"),
     )
-    return Check("Gusts, standards, microburst", "Units and formulas.", rows)
+    return Check(
+        "Gusts, standards, microburst",
+        "The functions of the gusts and of the microburst against numbers in their sources.",
+        rows,
+    )
 
 
 CHECKS = (statistics, divergence, aircraft, regulations)

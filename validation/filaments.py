@@ -60,7 +60,9 @@ def rings(effort):
         error = np.abs(found[:, 1:].T - straight).max() / tangential_speed(CORE, 1.0, CORE, model)
         name = f"straight lines, {model}: largest difference over the largest swirl"
         rows.append(Row(name, "profile of the model", 0.0, float(error), tolerance=2e-5))
-    return Check("Rings and lines", "Kernels of both cores.", tuple(rows))
+    return Check(
+        "Rings and lines", "The kernels of Biot and Savart with both core models.", tuple(rows)
+    )
 
 
 def instability(effort):
@@ -72,7 +74,8 @@ def instability(effort):
             Row(f"growth rate, {model}, of Gamma / 2 pi b^2", "Crow 1970", 0.83, rate, 0, 0.01),
             Row(f"plane, {model}", "Crow 1970", 48.0, plane, 0, 0.5, "degrees"),
         ]
-    text = "Waves of 8.6 separations, from the velocity of lines that are displaced a little."
+    text = "Waves with a length of 8.6 separations: growth rate and plane follow from the "
+    "velocity of slightly displaced lines."
     return Check("Crow's instability", text, tuple(rows))
 
 
@@ -106,7 +109,9 @@ def conservation(effort):
         what = f"{name}: table over the largest swirl, rms near the lines"
         rms = float(np.sqrt((error**2).mean()))
         rows.append(Row(what, "sum over the nodes", 0.0, rms, tolerance=2e-3))
-    return Check("Waves and rings", "In cores of 3 m.", tuple(rows))
+    return Check(
+        "Waves and rings", "Interpolated tables of the velocity, for cores of 3 m.", tuple(rows)
+    )
 
 
 def wakes(effort):
@@ -127,7 +132,8 @@ def wakes(effort):
         Row("A343, lift over g", "Kutta and Joukowski", 190e3, lift, 0, 1.0, "kg"),
     )
     text = (
-        "The simulation is that of the shipped wakes, in stratified air; Sarpkaya's law has none."
+        "The simulation is that of the shipped wakes, in stratified air; Sarpkaya's law is for "
+        "air without stratification."
     )
     return Check("Decay and aircraft", text, rows)
 

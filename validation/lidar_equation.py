@@ -203,8 +203,8 @@ def valley_of_extinction(effort):
     return Check(
         "Valley of extinction on a grid",
         "Extinction decreases from 0.007 to 0.001 / m at 465 m and increases again. Four gates "
-        "are behind this minimum. The majorant of the null collisions is raised by one voxel "
-        "that no beam crosses.",
+        "are behind this minimum. One voxel that no beam crosses raises the majorant, the upper "
+        "bound of the extinction from which free paths are drawn.",
         tuple(rows),
     )
 

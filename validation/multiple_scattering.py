@@ -223,8 +223,8 @@ def majorants(effort):
         rows.append(spread(f"{name}: gate by gate", REFERENCE, scores(i, other[..., 0].sum(2)), 32))
     return Check(
         "Any majorant",
-        "The dense slab of molecules as a grid; one distant voxel raises the majorant of the "
-        "whole grid.",
+        "The dense slab of molecules as a grid. One distant voxel raises the majorant of the "
+        "whole grid, which must not change the result.",
         tuple(rows),
     )
 
@@ -273,7 +273,8 @@ def sharpness(effort):
     )
     return Check(
         "The reference itself",
-        f"The sensitivity of the comparisons above, which pass within {SIGMAS} sigma.",
+        "Whether the comparisons above, which pass within "
+        f"{SIGMAS} sigma, would detect a wrong reference.",
         tuple(rows),
     )
 

@@ -374,18 +374,20 @@ def cost(effort):
         "Cost of 0.5 m/s",
         "Cramér-Rao bounds at 56 / 76 / 150 m for the default lidar (70 mJ, 8500 m) and CCD (5 "
         "electrons rms per pixel or element), v_LOS = 50 m/s. N = 2.4e7 / 1.3e7 / 3.3e6 photons "
-        "reach every receiver; *aerosol* is a fraction of them. *Rings, all photons detected*: "
-        "N reach the CCD, as the paper's numbers are taken elsewhere in this documentation; 5.6 "
-        "times as many then reach the etalon. *Times the ideal error*: photon noise alone, of N "
-        "photons; the ideal analyser resolves the narrow line of the aerosol, which no other "
-        "here does. *Pulses* are averaged, or their energies added in one pulse of that "
-        "*energy*. *Error by*: of a fit of speed and level that assumes 5 K, or 5 % of the "
-        "photons as aerosol, too much. *Both unknown*: temperature and aerosol are fitted, "
-        "known before to 5 K and 0.05; two filters determine neither. The double edge is "
+        "reach every receiver; *aerosol* is a fraction of them. *Rings, all photons detected*: N "
+        "photons reach the CCD, and 5.6 times as many the etalon (elsewhere in this documentation "
+        "the paper's photon numbers are those on the "
+        "CCD). *Times the ideal error*: error by the photon noise of N photons alone, over that "
+        "of the ideal analyser, which is the only one here that resolves the narrow line of the "
+        "aerosol. *Pulses* are averaged, or their energies added in one pulse of that "
+        "*energy*. *Error by*: bias of a fit of speed and level if the assumed temperature is 5 "
+        "K, or the assumed aerosol 5 % of the photons, too "
+        "high. *Both unknown*: temperature and aerosol are fitted as well, with prior standard "
+        "errors of 5 K and 0.05; a double edge determines neither. The double edge is "
         "collimated to 1 mrad, which takes etalons of 0.28 m behind this telescope (0.41 m, 0.7 "
         "mrad at 56 m); etalons of 0.1 m have 2.8 mrad. Rings and the fringes of a field- "
-        "widened Michelson take such light. Saturation is left out: 1e6 photons in one channel "
-        "are beyond a pixel of the CCD.",
+        "widened Michelson take such light. Saturation is not included: 1e6 photons in one "
+        "channel would exceed the full well of a pixel.",
         (row,),
         (
             (

@@ -168,11 +168,12 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
         "<!-- Written by `python -m validation`; edit validation/ instead. -->",
         "",
         "Comparisons of lidar-mi with independent numbers: closed forms, published",
-        "values, conservation laws and other programs. They concern the light transport, the "
-        "receivers of",
-        "the Doppler shift, the loads of a wake on a wing, the air about it, loads of gusts, "
-        "the track of vortices, and times and poses of beams; errors of the retrievals are under "
-        "[accuracy](accuracy.md). Every row of this page is computed again by",
+        "values, conservation laws and other programs. They concern light transport, Doppler",
+        "receivers, air and vortices, loads on aircraft, the track of vortices, and times and "
+        "poses of beams. The last two sections",
+        "measure the standard errors of retrieved winds; other errors of the retrievals are under "
+        "[accuracy](accuracy.md). Every other row of this",
+        "page is computed again by",
         "",
         "```sh",
         command,

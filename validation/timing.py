@@ -19,7 +19,7 @@ from .report import Check, Row
 TITLE = "Time and pose of beams"
 INTRODUCTION = (
     "Winds retrieved by `multipass` from ideal images (no noise, beams without width) of random "
-    "plane waves of 4 m and longer that a uniform wind carries. 90 x 70 beams, 0.5 m apart in a "
+    "plane waves of 4 m and longer, advected by a uniform wind. 90 x 70 beams, 0.5 m apart in a "
     "slab 501.25 m away, scan it twice, 0.1 s apart, from an aircraft at rest in the frame of the "
     "gates. Numbers are means over all valid vectors; the tolerance of 0.03 m/s is the error that "
     "a texture leaves in a mean."
@@ -106,8 +106,9 @@ def duration(effort):
         for name, got, right in zip("vw", means(wind_of(told)), expected, strict=True):
             rows.append(Row(f"{name}, {how}", reference, right, got, 0.0, TOLERANCE, "m/s"))
     text = (
-        "A raster of 0.09 s, row by row downwards. Air that moves up is met earlier in image 2 "
-        "than image 1 says, and a photograph's retrieval finds it too slow."
+        "A raster of 0.09 s, row by row downwards. Air that moves up meets the downward scan "
+        "earlier in image 2 than in image 1: the time between its two views is shorter. A "
+        "retrieval that assumes instantaneous images finds it too slow."
     )
     return Check("Scan that lasts", text, tuple(rows))
 

@@ -118,12 +118,13 @@ def as_assumed(effort):
     rows += _rows("oblique lines", flights(number, oblique, straight, seed=502), 10)
     return Check(
         "Wakes as assumed",
-        f"{number} flights each. *Walks*: circulations, radii, places, slopes and mean wind walk "
-        "as the default settings say, in steps of half a slab; the drift is that of point "
+        f"{number} flights each. *Walks*: circulations, radii, positions, slopes and mean wind "
+        "are random walks with the variances of the default settings, in steps of half a slab; "
+        "the drift is that of point "
         "vortices. *Oblique lines*: straight lines in space that sink across their axis, crossed "
         "at 10 degrees on a descent of 3 degrees, and a filter without process noise. Fits scatter "
-        "by the covariance of a least-squares fit to vectors. Innovations are from the third slab "
-        "on: that of the second is given by the prior of the slopes.",
+        "by the covariance of a least-squares fit to vectors. Innovations are counted from the "
+        "third slab on, because the prior of the slopes determines that of the second.",
         tuple(rows),
     )
 
@@ -182,7 +183,8 @@ def other_wakes(effort):
         "Other wakes",
         "Default settings. Mean squares per degree of freedom below 1 mean that errors are smaller "
         "than stated. Crow waves of 2.4 m are 5 % of the separation; they do not grow. *Flagged*: "
-        "fits were rejected, the track was lost and began anew, or innovations inflate the errors. "
+        "fits were rejected, the track was lost and started anew, or large innovations have "
+        "increased the stated errors. "
         "*Fits to vectors*: each slab is fitted (scipy) to noisy vectors of two lines in space "
         f"(Biot-Savart; {NOISE:g} m/s, every 4 m) instead of drawn.",
         tuple(rows),

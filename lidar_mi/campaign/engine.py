@@ -132,8 +132,8 @@ def run_campaign(
     Raises
     ------
     InputError
-        A description that is none, too many points, the folder of another campaign, a scheduler
-        without workers or with workers of another version, workers that do not start.
+        An invalid description, too many points, the folder of another campaign, a scheduler without
+        workers or with workers of another version, workers that do not start.
 
     Examples
     --------

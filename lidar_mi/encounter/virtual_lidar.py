@@ -68,9 +68,9 @@ class VirtualLidar:
     in the first gate of the next, so every scan completes a pair of images of one slab; wind and
     vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
     the number of the scan and the pose alone, with `encounter.window.follow` on the estimates
-    before as well: a step that is repeated gives the same images bit for
-    bit, and the same estimate but for rounding, where it starts from nothing; several lidars in one
-    process do not disturb each other. Nothing is written but to `scans`.
+    before as well: a repeated step gives identical images, and the same estimate within rounding if
+    it has no expected pair; several lidars in one process are independent. Nothing is written but
+    to `scans`.
 
     Parameters
     ----------

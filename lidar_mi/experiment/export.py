@@ -39,10 +39,11 @@ def export(
 ) -> list[Path]:
     """Write the results of a run for ParaView, a spreadsheet or MATLAB.
 
-    Winds, volumes, both images, lines of sight and vortices, as far as the run has them; of a
-    flight the aircraft's way in every flight, the vortices of its track, winds and images of the
-    slabs. Values, standard errors, flags and NaN are those of the run; places are x ahead, y to
-    port, z up, m, from the telescope at the first scan, of a flight from the start of its path.
+    Winds, volumes, both images, lines of sight and vortices, as far as the run has them; of an
+    encounter the path of the aircraft in every flight, the vortices of its track, winds and images
+    of the slabs. Values, standard errors, flags and NaN are those of the run. Positions are x
+    ahead, y to port, z up, in m, from the telescope at the first scan, or from the start of the
+    path in an encounter.
 
     Parameters
     ----------

@@ -132,7 +132,7 @@ def calibrate_etalon(
     Raises
     ------
     InputError
-        Frames that are none of the nominal instrument: another size, no rings, a bad fit.
+        Frames that do not belong to the nominal instrument: another size, no rings, a bad fit.
 
     Examples
     --------

@@ -102,7 +102,7 @@ def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
     Raises
     ------
     InputError
-        Not readable, another format, or a covariance that is none.
+        Not readable, another format, or an invalid covariance.
 
     Examples
     --------

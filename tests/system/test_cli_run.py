@@ -70,8 +70,9 @@ def test_check_summarises_a_run(there, lidar_mi):
     output = words_of(out)
     assert "beams 61 x 41, 0.5 m apart" in output  # 30 m x 20 m
     assert "gates 1, from 210 to 212.5 m" in output
-    assert "warning time 3 s at 70 m/s" in output
-    assert "fastest wind windows follow 8.75 m/s, here" in output  # (16 - 8)/2 - 1/2 pixels in dt
+    assert "look-ahead time 3 s at 70 m/s" in output
+    # (16 - 8)/2 - 1/2 pixels in dt
+    assert "search region winds up to 8.75 m/s; largest here" in output
     assert "extinction 0.1 to 0.1 1/km" not in output and "texture, rms 10%" in output
     assert files_in(there) == before
 

@@ -55,15 +55,15 @@ def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str,
     if not large:
         return ""
     named = " and ".join(
-        f"{whole_percent(part.fraction)} by {METHOD_NAMES[part.method]}" for part in large
+        f"{whole_percent(part.fraction)} ({METHOD_NAMES[part.method]})" for part in large
     )
     beyond = " beyond two core radii" if large[0].place else ""
     ratio = ""
     if _FRACTION in metrics:
         ratio = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
     return (
-        f"Of the mean square error of v and w{beyond}, noise of the simulation, not of the lidar, "
-        f"makes {named} ({number}{ratio})."
+        f"Noise of the simulation, which a lidar does not have, causes {named} of the mean square "
+        f"error of v and w{beyond} ({number}{ratio})."
     )
 
 
@@ -113,9 +113,10 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
     where = place({str(dim): int(k) for dim, k in zip(parts.dims, index, strict=True)})
     return (
         f"At {int((parts > _LEAST_PART).sum())} of {parts.size} points, noise of the simulation, "
-        f"not of the lidar, makes more than {whole_percent(_LEAST_PART)} of the mean square error "
-        f"of v and w: up to {whole_percent(float(parts.max()))}{f' ({where})' if where else ''}; "
-        "render.samples_per_beam: auto or more, or a larger render.max_samples, lowers it. "
+        f"which a lidar does not have, causes more than {whole_percent(_LEAST_PART)} of the mean "
+        f"square error of v and w: up to {whole_percent(float(parts.max()))}"
+        f"{f' ({where})' if where else ''}; "
+        "render.samples_per_beam: auto or more, or a larger render.max_samples, reduces it. "
     )
 
 

@@ -141,16 +141,16 @@ def _backscatter(
     pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
     rows = [
         ("laser", _laser(lidar)),
-        ("beam's divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
+        ("beam divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
         ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
-        ("telescope's radius", f"{lidar.aperture_radius:g} m"),
+        ("telescope radius", f"{lidar.aperture_radius:g} m"),
         ("beams", f"{plan.y.size} x {plan.z.size}, {pixel:.3g} m apart"),
-        ("beam's 1/e^2 radius there", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
+        ("1/e^2 beam radius at the gates", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
         ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
-        ("warning time", _warning(plan.gate_start, platform.speed)),
+        ("look-ahead time", _look_ahead(plan.gate_start, platform.speed)),
         ("samples per beam", _samples(asked, chosen)),
         ("time between the images", f"{platform.dt:g} s"),
-        ("air of the second image", _second(asked, wake)),
+        ("second image", _second(asked, wake)),
         *_light(asked, truth, plan, air),
     ]
     if not asked.volume:
@@ -163,7 +163,7 @@ def _second(asked: Experiment, wake: Wake) -> str:
     if wake.stored is not None:
         return f"the state stored at {wake.stored:.15g} s"
     along = wake.second == "advect_3d" or moves_along(wake, asked.volume)
-    return "that of the first, advected by " + ("u, v and w" if along else "v and w")
+    return "air of the first, advected by " + ("u, v and w" if along else "v and w")
 
 
 def _samples(asked: Experiment, chosen: Samples | None) -> str:
@@ -187,13 +187,13 @@ def _light(
     named = kind.aerosol or kind.table
     what = f"{kind.phase} {named}" if named else kind.phase.replace("_", "-")
     rows = [
-        ("scattering", f"{what}, {light.lidar_ratio:.3g} sr of extinction over backscatter"),
+        ("scattering", f"{what}, lidar ratio {light.lidar_ratio:.3g} sr"),
         ("overlap with the field of view", f"{light.overlap:.1%}"),
-        ("transmittance there and back", f"{light.transmittance:.1%}"),
+        ("two-way transmittance", f"{light.transmittance:.1%}"),
     ]
     if light.photoelectrons is not None:
         rows += [
-            ("photoelectrons of a pulse", f"{light.photoelectrons:.3g} in the median pixel"),
+            ("photoelectrons per pulse", f"{light.photoelectrons:.3g} in the median pixel"),
             ("noise of a pixel", f"{light.noise:.2g} of its signal"),
         ]
     return rows
@@ -250,7 +250,8 @@ def _displacements(asked: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     rows = [("methods", ", ".join(settings.methods))]
     if {ImageMethod.CC, ImageMethod.WS} & set(settings.methods):
-        rows.append(("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}"))
+        followed = f"winds up to {reach:.3g} m/s; largest here {fastest:.3g} m/s"
+        rows.append(("search region", followed))
     return rows
 
 
@@ -258,7 +259,7 @@ def _doppler(doppler: Doppler) -> Section:
     lidar = doppler.lidar
     return "Doppler lidar", [
         ("laser", _laser(lidar)),
-        ("beam's divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
+        ("beam divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
         ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
         ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
         ("photons of a pulse", f"{photons(lidar):.3g}"),
@@ -302,7 +303,7 @@ def _sensor(
     ]
 
 
-def _warning(distance: float, speed: float) -> str:
+def _look_ahead(distance: float, speed: float) -> str:
     return f"{look_ahead(distance, speed):.3g} s at {shown(speed, 'm/s')}" if speed else "at rest"
 
 

@@ -34,8 +34,8 @@ def read_lines_of_sight(
     r"""Lines of sight of a Doppler lidar from one file or several, in the order of time.
 
     Halo Photonics (.hpl), NetCDF of ARM (dlppi, dlrhi, dlfpt), WindCube and CfRadial 1 and 2, other
-    NetCDF and tables (CSV) with a mapping of names. Nothing is left out: what is not to be used is
-    flagged, what is unusual is said in the attribute ``remarks``, a line each.
+    NetCDF and tables (CSV) with a mapping of names. Nothing is omitted: invalid values are flagged,
+    and anything unusual is stated in the attribute ``remarks``, one line each.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ def read_lines_of_sight(
     names : mapping, optional
         Our name to the file's, where they differ: {"radial_velocity": "-v_los"}. Ours are time,
         azimuth, elevation, range, radial_velocity, snr, spectral_width, attenuated_backscatter,
-        pitch, roll, latitude, longitude, altitude. A minus sign turns that of a radial velocity
-        that is positive toward the lidar.
+        pitch, roll, latitude, longitude, altitude. A minus sign before the file's name reverses the
+        sign of a radial velocity that is positive toward the lidar.
     min_cnr : float, optional
         Least carrier-to-noise ratio, dB, of a velocity that is not flagged. Default: -21 dB, of
         WindCube -27 dB.

@@ -59,13 +59,13 @@ def fit_vortices_to_lines(
     kind : {"pair", "single"}
     profile : {"lamb_oseen", "burnham_hallock"}
     span : float, optional
-        Of the aircraft's wing, m: where to begin, a separation of pi/4 of it. Default: unknown, 28
-        to 81 m.
+        Wing span of the aircraft, m; the initial separation of the vortices is pi/4 of it. Default:
+        unknown, 28 to 81 m.
     ground : float, optional
         Height of the ground above the lidar, m (-2: the lidar stands 2 m high). Default: no ground;
         with it, vortices have their images.
     core_radius : float, optional
-        Likely core radius, m; a factor of 1.65 is one standard deviation. Default: 5 % of the span,
+        Prior core radius, m; its standard deviation is a factor of 1.65. Default: 5 % of the span,
         or 3 m.
     pulse_length, gate_length : float, optional
         Full width at half maximum of the pulse in range (c tau / 2), and length of the time window
@@ -74,9 +74,9 @@ def fit_vortices_to_lines(
         Least standard error of the velocities, m/s, where the data set does not state it for every
         gate; residuals of neighbouring lines show where it is larger. Default: from these alone.
     false_alarm : float
-        Of scans without a wake, the fraction in which one may be found.
+        Accepted fraction of false detections among scans without a wake.
     notice : callable, optional
-        Called with what is being fitted and how far it is, 0 to 1.
+        Called with a description of the running step and its progress, 0 to 1.
 
     Returns
     -------

@@ -45,9 +45,9 @@ def fit_winds_to_lines(
 ) -> xr.Dataset:
     r"""Profiles of the wind from lines of sight: one for each scan, or for each interval.
 
-    At each height the wind is the average along the path of the lines' gates through the air. Lines
-    that do not belong to the others are left out (outliers). Standard errors contain noise and
-    turbulence: lines of one scan see different air.
+    At each height the wind is the average along the path of the lines' gates through the air.
+    Outlying lines are masked. Standard errors contain noise and turbulence: lines of one scan see
+    different air.
 
     Parameters
     ----------
@@ -55,10 +55,10 @@ def fit_winds_to_lines(
         As of `read_lines_of_sight`; gates with a flag are not used. A variable
         ``radial_velocity_stderr`` (m s-1), if there is one, states the noise of every gate.
     interval : float, optional
-        s; default: a profile for every scan.
+        Duration over which each profile is averaged, s. Default: a profile for every scan.
     height_step : float, optional
-        m; default: the heights of the gates, or of lines of several elevations the distance of
-        the gates.
+        Step of the heights, m. Default: the heights of the gates; for lines of several elevations,
+        the distance between gates.
     noise : float, optional
         Standard error of every velocity, m/s, where the data set does not state it.
     length_scale : float, optional

@@ -70,11 +70,12 @@ class Rings(Tabular):
     misfit : float
         Rms deviation of r^2 from equal steps, in orders; NaN where two rings leave none.
     roundness : float
-        Rms deviation of the crests from the curves fitted: circles, ellipses, tilted circles.
+        Rms deviation of the crests from the fitted curves: circles, ellipses, tilted circles.
     uneven : bool
-        Whether deviations of neighbouring parts of rings correlate, as by uneven plates. Errors
-        then are from six parts of the image, each known to a third. Patches wider than a tenth of
-        the image, which the fit takes for another centre or spacing, may move it by more.
+        Whether deviations of neighbouring parts of rings are correlated, as by uneven plates.
+        Standard errors are then from a jackknife over six parts of the image and uncertain by a
+        third. Patches wider than a tenth of the image are taken for another centre or spacing;
+        their errors may be larger than stated.
     ellipticity : (float, float)
         Cosine and sine part, over twice the angle, of a ring's radius over its mean; the size is
         half the relative difference of its diameters.
@@ -83,7 +84,7 @@ class Rings(Tabular):
         tan(tilt of the camera) over the focal length. 0, as the ellipticity, where the
         detected rings do not determine it.
     doubt : str
-        How the spacing could be another; empty where the image excludes it.
+        Why another spacing is possible; empty if the image excludes it.
     r2, profile : arrays
         Common part of all sectors, mean over circles, for the image; without their backgrounds.
     """

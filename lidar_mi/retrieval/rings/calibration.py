@@ -28,7 +28,7 @@ _LISTED = 6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Tabular):
-    """What the frames of a line say of an instrument.
+    """An instrument as calibrated from frames of a narrow line.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Calibration(Tabular):
     pixel, wavelength, focal_length : float
         m. The focal length is that for the nominal gap.
     order_at_centre : float
-        Of the line, its fraction as the mean of the frames has it.
+        Order of the line at the centre; its fraction is the mean over the frames.
     finesse : float
         Free spectral range over the full width at half maximum of the line's rings.
     centre : (float, float)
@@ -45,6 +45,7 @@ class Calibration(Tabular):
     tilt, distortion, blur, damping, roughness
         As in `lidar_mi.retrieval.rings.model`.
     falloff : float
+        Fall-off q of the illumination, exp(-q r^2 / R^2) with R half of the image's diagonal.
     light : mapping
         Uneven illumination, terms of `LIGHT`.
     std : mapping
@@ -54,11 +55,11 @@ class Calibration(Tabular):
     frame_speed, frame_speed_std : array (frames,)
         Fractional order of every frame as a speed about their mean, m/s: the drift.
     drift : float
-        Standard deviation of that beyond its noise, m/s.
+        Standard deviation of `frame_speed` in excess of its noise, m/s.
     chi_square : float
         Squared misfit over its expectation.
     response : array (height, width)
-        Of the pixels to light; 0 for pixels that are not to be used.
+        Relative sensitivity of each pixel; 0 for masked pixels.
     misfit : array (height, width)
         Mean of the frames less the model, in standard deviations, in blocks of ``block`` pixels.
     block : int
@@ -67,11 +68,11 @@ class Calibration(Tabular):
     lines : tuple of float
         Wavelengths of two or more lines, where their frames gave the gap, m.
     gaps : tuple of (float, float)
-        Gaps, times the refractive index, that agree with the lines' fractional orders, and standard
-        errors, m. Only one determines the order.
+        Gaps, times the refractive index, that agree with the fractional orders of the lines, and
+        their standard errors, m. The order is determined if there is only one.
     whole_orders : tuple of int
-        Whole numbers of the order at the centre that agree with one gap; several are neighbours,
-        and the gap's standard error holds them. Empty: the nominal one.
+        Whole numbers of the order at the centre that agree with one gap. If there are several, they
+        are neighbours, and the standard error of the gap includes them. Empty: the nominal one.
     """
 
     shape: tuple[int, int]

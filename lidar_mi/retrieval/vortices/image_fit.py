@@ -89,12 +89,13 @@ def fit_vortices(
 ) -> VortexPairFit:
     """Two vortices and a mean wind that advect image 1 into image 2.
 
-    Every pixel is followed half a dt back and half a dt on along its curved path; there the images
-    must agree, but for a gain and an offset. The squares of their difference are minimised, each
-    weighted by the inverse variance of the noise and of the model error times the image's slope;
-    the model error is estimated from the residuals of the same fit. The start is the best of all
-    pairs of places (see `lidar_mi.retrieval.vortices.search`), no guess is needed. Where a pair is
-    expected, as in the next of many slabs of air, the fit starts there in a fraction of the time.
+    Every pixel is followed along its curved path to half a dt before and after mid-time; there the
+    images must agree, except for a gain and an offset. The squares of their difference are
+    minimised. Their weights are the inverse of the variance of the noise plus that of the model
+    error times the gradient of the image; the model error is estimated from the residuals of the
+    same fit. The start is the best of all pairs of positions (see
+    `lidar_mi.retrieval.vortices.search`); no guess is needed. Where a pair is expected, as in the
+    next of many slabs of air, the fit starts there in a fraction of the time.
 
     Parameters
     ----------

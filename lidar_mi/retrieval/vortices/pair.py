@@ -30,9 +30,9 @@ class VortexPairFit(Tabular):
     Attributes
     ----------
     parameters : ndarray, shape (10,)
-        In the order of `lidar_mi.retrieval.vortices.model.PARAMETERS`; NaN where there is no fit at
-        all, or those that a fit was tried from, without a covariance. Port is the vortex that
-        rotates from +y towards +z (circulation > 0).
+        In the order of `lidar_mi.retrieval.vortices.model.PARAMETERS`; NaN if there is no fit; the
+        start values, without a covariance, if a fit was attempted and failed. Port is the vortex
+        that rotates from +y towards +z (circulation > 0).
     covariance : ndarray, shape (10, 10)
         Of the parameters: from the noise and from the flow's departure from the model.
     profile : {"lamb_oseen", "burnham_hallock"}
@@ -54,14 +54,14 @@ class VortexPairFit(Tabular):
     from_start : bool
         Whether it was found from an expected pair, without a search.
     probability : float
-        That the images show a vortex, by `lidar_mi.retrieval.vortices.detection`, whether the fit
-        is accepted or not; NaN where it was not asked for.
+        Probability that the images show a vortex, from `lidar_mi.retrieval.vortices.detection`,
+        whether the fit is accepted or not; NaN if it was not requested.
     turned : ndarray, shape (10,), optional
-        Change of the parameters per rad/s by which the observations rotate about y = z = 0 between
-        the scans, from +y towards +z: by an unknown roll.
+        Derivative of the parameters with respect to a rotation (rad/s) of the observations about y
+        = z = 0 between the scans, from +y towards +z, as by an unknown roll.
     inclined : ndarray, shape (10, 2), optional
-        Change of the parameters per slope dy/dx and dz/dx of the pair's axis, if all of the air's
-        motion along x showed in oblique beams; see `with_slopes`.
+        Derivative of the parameters with respect to the slopes dy/dx and dz/dx of the pair's axis,
+        if all motion of the air along x were visible in oblique beams; see `with_slopes`.
     slopes, slope_covariance : ndarray, shapes (2,) and (2, 2), optional
         Of the pair's axis, dy/dx and dz/dx, where more than one slab determines them.
     """
@@ -158,11 +158,11 @@ class VortexPairFit(Tabular):
     ) -> "VortexPairFit":
         """With errors of the wind common to all of its observations, by an unknown pointing error.
 
-        The mean wind is fitted, and so takes all of an error of v and w (m/s); what derives from it
-        (drift, the wind anywhere, places after some time) has it too. Circulations, radii and
-        separation are as certain as without. Places refer to the mean pointing of both scans.
-        A rotation (rad/s, about ``centre``: y, z in m) changes all parameters: a vortex pair cannot
-        rotate everywhere, and the fit attributes part of it to circulation.
+        An error of v and w (m/s) affects only the fitted mean wind and what derives from it: drift,
+        wind at any place, positions after some time. Circulations, radii and separation are not
+        affected. Positions refer to the mean pointing of both scans. A rotation (rad/s, about
+        ``centre``: y, z in m) changes all parameters: a vortex pair cannot rotate everywhere, and
+        the fit attributes part of it to circulation.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class VortexPairFit(Tabular):
         return replace(self, covariance=covariance)
 
     def with_slopes(self, slopes: np.ndarray, covariance: np.ndarray) -> "VortexPairFit":
-        """The pair of images that look at an inclined pair with oblique beams.
+        """The pair, corrected for the inclination of its axis in images from oblique beams.
 
         Images show between none and all of the motion along x that a wholly resolved gate would
         show: none where the texture is the same throughout the depth of the gate, all where it is

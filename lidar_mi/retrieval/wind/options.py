@@ -48,12 +48,12 @@ class VectorValidation:
     Attributes
     ----------
     min_correlation : float
-        Least correlation of a window, -1 to 1 (not of "ws"). Of a field fitted as a whole half way
-        from this to 1.
+        Least correlation of a window, -1 to 1 (not for "ws"). For "variational" the limit is half
+        way from this value to 1.
     min_texture, min_isotropy : float
-        Of images. The rms slope of a template of image 1, in its weakest direction and relative to
-        its mean, must be above the one (px^-1), and at least this fraction of the slope in its
-        strongest direction. See `quality.texture`.
+        For images. The rms gradient of a template of image 1 in its weakest direction, relative to
+        the mean of the template, must be above min_texture (px^-1); its ratio to the rms gradient
+        in the strongest direction must be at least min_isotropy. See `quality.texture`.
     median_size, median_threshold, median_epsilon
         Normalised median test, see `outliers.median_outliers`. Neighbours are taken half a template
         apart (or a stride, if that is more): closer ones share their pixels.

@@ -80,8 +80,8 @@ def retrieve_wind(
     times : sequence of two xr.DataArray, optional
         When each pixel of image 1 and of image 2 was seen, s from its image's reference time, on
         their grid (not with `more`). ``dt`` is then from reference time to reference time, and
-        winds follow from each vector's own time difference, see `beam_times.vector_times`.
-        Default: images are photographs.
+        winds follow from each vector's own time difference, see `beam_times.vector_times`. Default:
+        each image is instantaneous.
     blur : float
         Standard deviation, m, of the Gaussian by which the instrument blurs the air, as a beam of
         1/e^2 radius 2 `blur` does ("variational", which then sharpens; square pixels only).
@@ -89,13 +89,13 @@ def retrieve_wind(
         Of the method of that name.
     checks : bool
         Remove or flag saturated areas, structure at rest, gains of columns and rows, a change of
-        illumination, and images of unrelated air. Without it "variational" takes 0.15 less time.
+        illumination, and images of unrelated air. Without it "variational" is 15 % faster.
     standard_errors : bool
-        False: "cc", "ws" and "multipass" state none and flag no vector for its own, which halves
-        their time. The others have theirs from the fit.
+        False: "cc", "ws" and "multipass" state none, and no vector is flagged because of its
+        standard error; this halves their time. The other methods always state them.
     device : str or torch.device
-        Where to compute: "cpu", "cuda", or "auto" for CUDA where there is one. Where its memory is
-        full, smaller parts are computed at once.
+        Where to compute: "cpu", "cuda", or "auto" for CUDA if there is one. If its memory is full,
+        smaller parts are computed at a time.
 
     Returns
     -------

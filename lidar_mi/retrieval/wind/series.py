@@ -72,7 +72,7 @@ def retrieve_winds(
     Raises
     ------
     InputError
-        Fewer than two images, a pair that is none, arguments that no pair can be retrieved with.
+        Fewer than two images, an impossible pair, arguments with which no pair can be retrieved.
 
     Examples
     --------

@@ -233,13 +233,13 @@ def test_the_first_sentence_says_which_part_is_the_simulations():
     metrics = NOISY | noise("variational", 0.15, 0.2) | noise("cc", 0.03, 0.04)
     first, second = answer(rendered(64), metrics)
     assert first == (
-        "Of the mean square error of v and w, noise of the simulation, not of the lidar, makes "
-        "25 % by variational retrieval (64 Monte Carlo samples per beam, with 1.5 times the "
-        "variance of the detector noise)."
+        "Noise of the simulation, which a lidar does not have, causes 25 % (variational "
+        "retrieval) of the mean square error of v and w (64 Monte Carlo samples per beam, with "
+        "1.5 times the variance of the detector noise)."
     )
     assert second.startswith("Backscatter lidar, ")
     text = simulation_remark(rendered(64), metrics)
-    assert text.startswith("render.samples_per_beam: of the mean square error")
+    assert text.startswith("render.samples_per_beam: noise of the simulation")
     assert text.endswith("; expected 960 or more, or auto")
     text = simulation_remark(rendered("auto"), metrics)
     assert text.startswith("render.max_samples: ") and text.endswith("expected 15 times as many")

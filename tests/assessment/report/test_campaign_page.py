@@ -148,7 +148,7 @@ def test_points_with_noise_of_the_simulation_are_counted_first():
         data[f"{head}rmse_{name}"] = ("range", "energy"), np.full((3, 4), 0.5)
         data[f"{head}monte_carlo_{name}"] = ("range", "energy"), found
     text = answer(data)
-    assert text.startswith("At 2 of 12 points, noise of the simulation, not of the lidar, makes")
+    assert text.startswith("At 2 of 12 points, noise of the simulation, which a lidar does not")
     assert "up to 36 % (range = 150 m, " in text and "; render.samples_per_beam: auto or" in text
     for name in "vw":
         data[f"{head}outside_cores.rmse_{name}"] = data[f"{head}rmse_{name}"]
