@@ -2,7 +2,7 @@
 # ARGS goes to the command behind a target: make test ARGS="tests/system/test_llvm.py -x"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all fuzz bench validate reference docs lint clean
+.PHONY: help setup demo test test-all fuzz bench validate reference pictures docs lint clean
 
 PYTHON_ENV := .venv/bin/python
 EXPERIMENT := wake_sensor
@@ -43,6 +43,10 @@ validate: setup ## check against closed forms, published numbers and other progr
 
 reference: setup ## write the pages of keys, commands, public names and plugins anew, from the code
 	@for page in key command api plugin; do $(PYTHON_ENV) docs/make_$${page}_reference.py || exit 1; done
+
+pictures: setup ## make the pictures of the pages anew, hours; some: make pictures ARGS="wake airport"
+	@$(PYTHON_ENV) -c "import nbclient, nbformat" 2>/dev/null || $(PYTHON_ENV) -m pip install -q -e ".[test]"
+	$(PYTHON_ENV) docs/make_pictures.py $(ARGS)
 
 docs: setup ## check words, links and lengths of the pages and build them as a site in site/, readable offline
 	@$(PYTHON_ENV) -c "import codespell_lib, furo, latex2mathml, myst_parser" 2>/dev/null \

@@ -38,7 +38,9 @@ html_theme = "furo"
 html_title = f"lidar-mi {release}"
 html_copy_source = False
 html_show_sphinx = False
-pygments_style = "tango"
+# contrasts of 4.5 and more, which those of furo have not
+pygments_style = "a11y-high-contrast-light"
+pygments_dark_style = "a11y-high-contrast-dark"
 html_math_renderer = "mathml"
 html_theme_options = {"navigation_with_keys": True}
 

@@ -19,6 +19,7 @@ from matplotlib.quiver import Quiver
 
 import lidar_mi as lm
 from lidar_mi.plots import plot_flights
+from tests.support import figure_rules
 
 Y, Z = np.arange(-2.0, 3.0), np.arange(4.0)
 
@@ -52,6 +53,7 @@ def arrows(axes):
 
 def test_winds_are_drawn_where_they_are(wind):
     axes = wind.lidar.plot()
+    assert figure_rules.faults(axes.figure) == []
     drawn = arrows(axes)
     valid, flagged = drawn[to_rgba("white")], drawn[to_rgba("0.6")]
     assert len(valid) == 19 and flagged == {(0.0, 1.0): (10.0, -10.0)}

@@ -79,7 +79,10 @@ def _backscatter(
         folder, results["truth"], results["scans"], found, cores, results["texture_sweep"], log
     )
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
-    vectors = map_data(found.sel(source=source).isel(algorithm=0), ("v", "w"), cores)
+    wind = found.sel(source=source)
+    # the first method with a valid vector: the others have nothing to look at
+    valid = (wind["flag"] == 0).any(("z", "y")).transpose("algorithm").values
+    vectors = map_data(wind.isel(algorithm=int(valid.argmax())), ("v", "w"), cores)
     return backscatter_chapter(experiment, metrics, cores, drawn, vectors)
 
 

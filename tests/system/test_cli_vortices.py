@@ -10,6 +10,7 @@ import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.assessment.figures.line_vortices import draw_line_vortices
+from tests.support import figure_rules
 from tests.support.command_line import shell, words_of
 from tests.support.line_wakes import Family, drawn, slices
 
@@ -46,7 +47,8 @@ def test_vortices_of_two_scans(folder, tmp_path):
             np.testing.assert_allclose(found[name], expected[name], rtol=1e-5)
         assert found["flag"].attrs["flag_meanings"].startswith("no_wake no_fit outside")
     assert (tmp_path / "vortices.png").stat().st_size > 10_000
-    assert len(draw_line_vortices(lm.read_lines_of_sight(files), expected).axes) == 4
+    figure = draw_line_vortices(lm.read_lines_of_sight(files), expected)
+    assert len(figure.axes) == 4 and figure_rules.faults(figure) == []
     table = shell("vortices", files[0], "-o", "v.csv", "--noise", "0.08 m/s", cwd=tmp_path)
     assert table.returncode == 0, table.stderr
     head = (tmp_path / "v.csv").read_text().splitlines()[0]

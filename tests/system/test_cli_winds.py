@@ -10,6 +10,7 @@ import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.assessment.figures.wind_profile import draw_wind_profiles
+from tests.support import figure_rules
 from tests.support import line_files as made
 from tests.support.command_line import shell, words_of
 
@@ -75,5 +76,6 @@ def test_many_profiles_are_drawn_as_maps():
         },
         {"time": one.time[0] + np.arange(8) * np.timedelta64(60, "s"), "height": np.arange(5.0)},
     )
-    assert len(draw_wind_profiles(data).axes) == 6
-    assert len(draw_wind_profiles(data.isel(time=[0])).axes) == 3
+    for some, panels in ((data, 6), (data.isel(time=[0]), 3)):
+        figure = draw_wind_profiles(some)
+        assert len(figure.axes) == panels and figure_rules.faults(figure) == []

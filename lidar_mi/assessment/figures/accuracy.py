@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import by_factors
+from lidar_mi.assessment.figures.plates import by_factors, one_to_one
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.errors import error_by_quality
 from lidar_mi.assessment.metrics.names import RENDERED, Source
@@ -19,9 +19,8 @@ def truth_vectors(wind: xr.Dataset) -> xr.Dataset:
 
 def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
     """Rms errors in groups of vectors by Cramer-Rao bound; None without noise."""
-    figure = Figure(figsize=(13, 4.6), layout="constrained")
-    span = []
-    for axes, name in zip(figure.subplots(1, 2), ("v", "w"), strict=True):
+    lines: dict[str, list[tuple[str, list[float], list[float]]]] = {"v": [], "w": []}
+    for name, drawn in lines.items():
         for source in (s for s in found["source"].values if s in RENDERED):
             for method in found["algorithm"].values:
                 wind = found.sel(source=source, algorithm=method)
@@ -37,19 +36,22 @@ def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
                     for values in (bound, error)
                 )
                 label = f"{METHOD_NAMES[method]} from {SOURCE_NAMES[source]}"
-                axes.plot(least, rms, "o-", ms=4, label=label)
-                span += [min(least), max(least)]
-        if not span:
-            return None
-        axes.plot([0, max(span)], [0, max(span)], "k--", lw=1, label="bound")
+                drawn.append((label, least, rms))
+    shown = {name: drawn for name, drawn in lines.items() if drawn}
+    if not shown:
+        return None
+    figure = Figure(figsize=(6.5 * len(shown), 6.2), layout="constrained")
+    for axes, (name, drawn) in zip(
+        figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True
+    ):
+        for label, least, rms in drawn:
+            axes.plot(least, rms, "o-", ms=4, label=label)
+        axes.set_title(f"valid vectors, {name}")
+        one_to_one(axes, "bound", logarithmic=True)
         axes.set(
             xlabel=f"Cramer-Rao bound of {name} / m s$^{{-1}}$",
-            xlim=(0, None),
-            ylim=(0, None),
             ylabel=f"rms error of {name} / m s$^{{-1}}$",
-            title=f"valid vectors, {name}",
         )
-        axes.grid(alpha=0.3)
     figure.legend(
         *axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8
     )

@@ -19,8 +19,11 @@ from lidar_mi.assessment.figures.accuracy import error_and_bound, error_by_textu
 from lidar_mi.assessment.figures.plates import (
     Drawn,
     Plate,
+    arrow_scale,
     frame,
     image_panel,
+    mark_cores,
+    panels_of,
     save_all,
     sheet,
     speed_of,
@@ -81,7 +84,7 @@ def draw_all(
     # with measured images alone there are no winds from extinction to compare with
     compared = Source.EXTINCTION in sources
     ideal, lidar = (Source.EXTINCTION, Source.BACKSCATTER) if compared else (sources[-1],) * 2
-    plates: tuple[tuple[str, str, Plate], ...] = (
+    plates: tuple[tuple[str, str, Plate | None], ...] = (
         ("fig00_overview", "Image and retrieved wind", overview(truth, scans, found, cores)),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         (
@@ -115,8 +118,7 @@ def draw_all(
             ),
         )
     plates += (("fig12_error_by_texture", "Error and texture", error_by_texture(found, sweep)),)
-    if (drawn := error_and_bound(found)) is not None:
-        plates += (("fig12b_error_and_bound", "Errors and Cramer-Rao bound", drawn),)
+    plates += (("fig12b_error_and_bound", "Errors and Cramer-Rao bound", error_and_bound(found)),)
     if "depolarization" in scans[0]:
         plates += (
             (
@@ -144,7 +146,20 @@ def draw_all(
                 ),
             ),
         )
-    return save_all(folder, plates, log)
+    there = [(name, title, plate) for name, title, plate in plates if plate is not None]
+    return save_all(folder, there, log)
+
+
+def _with_valid(found: xr.Dataset, *sources: str) -> tuple[list[str], str]:
+    """Methods with a valid vector from each source, and what to say of the others.
+
+    Without a valid vector there is nothing to see: the others are random numbers.
+    """
+    valid = (found["flag"].sel(source=list(sources)) == 0).any(("z", "y")).all("source")
+    methods = [str(name) for name in found["algorithm"].values]
+    those = [name for name in methods if bool(valid.sel(algorithm=name))]
+    others = [METHOD_NAMES[name] for name in methods if name not in those]
+    return those, f" No valid vector by {' and '.join(others)}." if others else ""
 
 
 def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, scale: Scale) -> None:
@@ -162,10 +177,7 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
         "width": 0.0022,
     }
     flagged, valid = known & (flag != 0), known & (flag == 0)
-    if not valid.any():
-        # without a valid vector the others are random numbers
-        axes.text(0.5, 0.5, "no valid vector", transform=axes.transAxes, ha="center", va="center")
-    elif flagged.any():
+    if flagged.any():
         axes.quiver(y[flagged], z[flagged], v[flagged], w[flagged], color="0.75", **style)
     arrows = axes.quiver(
         y[valid],
@@ -177,8 +189,8 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
         norm=Normalize(0, scale.limit),
         **style,
     )
-    for core in cores:
-        axes.plot(core.y, core.z, "+", color="crimson", ms=9)
+    arrow_scale(axes, arrows, scale.limit)
+    mark_cores(axes, cores, "crimson")
     frame(axes, scale.y, scale.z, title)
     axes.figure.colorbar(arrows, ax=axes, label="speed / m s$^{-1}$", pad=0.02, extend="max")
 
@@ -188,12 +200,14 @@ def overview(
 ) -> tuple[Figure, str]:
     """First image of the lidar beside the wind retrieved from two, and a caption; as `draw_all`."""
     scale = _scale(truth)
-    figure, axes = sheet(1, 2)
     detected = "Y_noisy" in scans[0]
+    source = Source.NOISY if detected else Source.BACKSCATTER
+    methods, none = _with_valid(found, source)
+    figure, panels = panels_of(1 + bool(methods))
     first = scans[0]["Y_noisy" if detected else "Y"] * 1e6
     norm = _span(first) if detected else _bright([first])
     image_panel(
-        axes[0, 0],
+        panels[0],
         first,
         "backscatter, $t_1$",
         BACKSCATTER,
@@ -201,14 +215,14 @@ def overview(
         norm=norm,
         cmap="cividis",
     )
-    source = Source.NOISY if detected else Source.BACKSCATTER
-    wind = found.sel(source=source).isel(algorithm=0)
-    _arrows(axes[0, 1], wind, cores, "wind retrieved from two such images", scale)
     noise = " with photon, sky, dark and speckle noise of one pulse per beam" if detected else ""
+    if not methods:
+        return figure, f"The first backscatter image{noise}.{none}"
+    wind = found.sel(source=source, algorithm=methods[0])
+    _arrows(panels[1], wind, cores, "wind retrieved from two such images", scale)
     return figure, (
         f"The first backscatter image{noise}, and the cross-flow wind retrieved from it and the "
-        f"second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are "
-        f"flagged{_crosses(cores)}."
+        f"second one by {METHOD_NAMES[methods[0]]}; grey vectors are flagged{_crosses(cores)}."
     )
 
 
@@ -240,50 +254,55 @@ def _extinction(truth: ObservedAir) -> Plate:
 def _wind_and_truth(
     truth: ObservedAir, found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale
 ) -> Plate:
-    figure, axes = sheet(2, max(2, found.sizes["algorithm"]))
+    methods, none = _with_valid(found, source)
+    figure, (wind, colours, *panels) = panels_of(2 + len(methods))
     first = found.sel(source=source).isel(algorithm=0)
-    _arrows(axes[0, 0], truth_vectors(first), cores, "true wind", scale)
-    speed = speed_of(truth.wind["v"], truth.wind["w"])
+    _arrows(wind, truth_vectors(first), cores, "true wind", scale)
     image_panel(
-        axes[0, 1],
-        speed,
+        colours,
+        speed_of(truth.wind["v"], truth.wind["w"]),
         "speed of the true wind",
         "speed / m s$^{-1}$",
         extend="max",
         norm=Normalize(0, scale.limit),
         cmap="viridis",
     )
-    for axis in axes[0, 2:]:
-        axis.set_axis_off()
-    _retrieved_into(axes[1], found, source, cores, scale)
+    _retrieved_into(panels, found, source, methods, cores, scale)
     return figure, (
-        "Above: the true cross-flow wind and its speed. Below: winds retrieved from the "
-        f"{SOURCE_NAMES[source]} pair. Grey vectors are flagged{_crosses(cores)}."
+        "The true cross-flow wind and its speed, and the winds retrieved from the "
+        f"{SOURCE_NAMES[source]} pair. Grey vectors are flagged{_crosses(cores)}.{none}"
     )
 
 
 def _retrieved_into(
-    axes: np.ndarray, found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale
+    panels: Sequence[Axes],
+    found: xr.Dataset,
+    source: str,
+    methods: Sequence[str],
+    cores: Sequence[Core],
+    scale: Scale,
 ) -> None:
-    methods = [str(method) for method in found["algorithm"].values]
-    for axis in axes[len(methods) :]:
-        axis.set_axis_off()
-    for axis, method in zip(axes[: len(methods)], methods, strict=True):
+    for axis, method in zip(panels, methods, strict=True):
         wind = found.sel(source=source, algorithm=method)
         _arrows(axis, wind, cores, f"{METHOD_NAMES[method]}, {source}", scale)
 
 
-def _retrieved(found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale) -> Plate:
-    figure, axes = sheet(1, max(2, found.sizes["algorithm"]))
-    _retrieved_into(axes[0], found, source, cores, scale)
+def _retrieved(found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale) -> Plate | None:
+    methods, none = _with_valid(found, source)
+    if not methods:
+        return None
+    figure, panels = panels_of(len(methods))
+    _retrieved_into(panels, found, source, methods, cores, scale)
     return figure, (
         f"Winds retrieved from the rendered {source} pair, unfiltered: grey vectors are flagged"
-        f"{_crosses(cores)}."
+        f"{_crosses(cores)}.{none}"
     )
 
 
-def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Plate:
-    methods = [str(m) for m in found["algorithm"].values]
+def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Plate | None:
+    methods, none = _with_valid(found, source, *([reference] if reference else []))
+    if not methods:
+        return None
     figure, axes = sheet(len(methods), 2)
     for row, method in zip(axes, methods, strict=True):
         wind = found.sel(source=source, algorithm=method)
@@ -321,7 +340,7 @@ def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Pl
     against = "the true wind" if reference is None else f"winds from {reference}"
     return figure, (
         f"Deviations of winds from {source} against {against}: speed (left) and direction "
-        "(right). Grey: flagged, or no displacement."
+        f"(right). Grey: flagged, or no displacement.{none}"
     )
 
 

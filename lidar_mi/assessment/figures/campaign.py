@@ -1,7 +1,8 @@
 """Figures of a campaign: maps, lines with bands over members, knobs of a sample, compromises."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from itertools import cycle
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -10,12 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis as MatplotlibAxis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize, to_hex
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.interpolate import RegularGridInterpolator
 
 from lidar_mi.assessment.digits import three
-from lidar_mi.assessment.figures.linked import Mark, as_svg, panel
+from lidar_mi.assessment.figures.linked import Mark, as_svg, panel, wrapped
+from lidar_mi.assessment.figures.plates import one_to_one
 from lidar_mi.assessment.metrics.campaign import MEMBER, Interval, over_members
 from lidar_mi.assessment.metrics.sensitivity import SobolIndices
 
@@ -64,10 +68,24 @@ def colour_scale(values: xr.DataArray) -> Normalize:
     return Normalize(low, high if high > low else low + (abs(low) or 1.0))
 
 
+Limits = Mapping[str, xr.DataArray]
+"""What is not negative where a limit is met, over the knobs, by what the limit is called."""
+
+
 def draw_map(
-    title: str, values: xr.DataArray, x: Axis, y: Axis, points: Points, label: str, norm: Normalize
+    title: str,
+    values: xr.DataArray,
+    x: Axis,
+    y: Axis,
+    points: Points,
+    label: str,
+    norm: Normalize,
+    limits: Limits | None = None,
 ) -> str:
-    """A metric over two knobs; failed points are crossed out, those without a value grey."""
+    """A metric over two knobs, and where it is at its limits.
+
+    Failed points are crossed out, those without a value grey.
+    """
     figure, axes = panel(title)
     values = values.transpose(y.name, x.name)
     cmap = colormaps["viridis"]
@@ -80,10 +98,17 @@ def draw_map(
         lambda v: to_hex(cmap(norm(v))),
         lambda v: f"{label}: {three(v)}",
     )
-    bar = figure.colorbar(ScalarMappable(norm, cmap), ax=axes, label=label)
+    bar = figure.colorbar(ScalarMappable(norm, cmap), ax=axes, label=wrapped(label))
     if isinstance(norm, LogNorm):
         _plain_decades(bar.ax.yaxis)
-    return as_svg(axes, marks, f"{label}, {title}")
+    handles = []
+    for (name, margin), style in zip((limits or {}).items(), cycle(("-", "--", ":")), strict=False):
+        if _boundary(
+            axes, margin.transpose(y.name, x.name), x, y, **_OVER_COLOURS, linestyles=style
+        ):
+            handles.append(Line2D([], [], color="k", ls=style, label=name))
+    _legend_below(figure, handles)
+    return as_svg(axes, marks, f"{label}, {title}{_span(values)}")
 
 
 def draw_requirements(
@@ -105,28 +130,53 @@ def draw_requirements(
         lambda v: "#cfe8d3" if v >= 0 else "#f3d5cf",
         lambda v: f"smallest margin {100 * v:+.0f} %",
     )
-    across, up = (axis.places(worst[axis.name].values) for axis in (x, y))
-    finer = _finer(across, x.logarithmic), _finer(up, y.logarithmic)
     handles = []
     for (name, one), colour in zip(margins.items(), COLOURS * 3, strict=False):
-        mean = means[name].values
-        if min(mean.shape) < 2 or not _crosses_zero(mean):
+        if not _boundary(axes, means[name], x, y, colors=colour, linewidths=1.8):
             continue
-        for values, style in (
-            (mean, {"linewidths": 1.8}),
-            (one.low.transpose(*order).values, {"linewidths": 0.8, "linestyles": "--"}),
-            (one.high.transpose(*order).values, {"linewidths": 0.8, "linestyles": "--"}),
-        ):
-            if _crosses_zero(values):
-                between = _between(values, (across, up), finer, (x.logarithmic, y.logarithmic))
-                axes.contour(*finer, np.ma.masked_invalid(between), [0.0], colors=colour, **style)
+        for end in (one.low, one.high):
+            style = {"linewidths": 0.8, "linestyles": "--"}
+            _boundary(axes, end.transpose(*order), x, y, colors=colour, **style)
         handles.append(Line2D([], [], color=colour, label=name))
+    _legend_below(figure, handles)
+    met = f"all rows met at {int((worst >= 0).sum())} of {int(np.isfinite(worst).sum())} points"
+    return as_svg(axes, marks, f"{title}, {met}")
+
+
+_OVER_COLOURS = {
+    "colors": "k",
+    "linewidths": 1.8,
+    # seen on every colour of a map
+    "path_effects": [withStroke(linewidth=3.6, foreground="w")],
+}
+
+
+def _boundary(axes: Axes, margin: xr.DataArray, x: Axis, y: Axis, **style: Any) -> bool:
+    """Draw where a margin (y, x) is 0; false where it nowhere is."""
+    values = margin.values
+    if min(values.shape) < 2 or not _crosses_zero(values):
+        return False
+    places = (x.places(margin[x.name].values), y.places(margin[y.name].values))
+    finer = _finer(places[0], x.logarithmic), _finer(places[1], y.logarithmic)
+    between = _between(values, places, finer, (x.logarithmic, y.logarithmic))
+    effects = style.pop("path_effects", None)
+    drawn = axes.contour(*finer, np.ma.masked_invalid(between), [0.0], **style)
+    drawn.set_path_effects(effects)
+    return True
+
+
+def _legend_below(figure: Figure, handles: Sequence[Line2D]) -> None:
+    """Beside the map: inside it would hide boundaries."""
     if handles:
-        # beside the map: inside it would hide boundaries
         figure.legend(
             handles=handles, fontsize=8, loc="outside lower center", ncols=3, frameon=False
         )
-    return as_svg(axes, marks, title)
+
+
+def _span(values: xr.DataArray) -> str:
+    """From the smallest to the largest value, as words after a label."""
+    known = values.values[np.isfinite(values.values)]
+    return f": {three(float(known.min()))} to {three(float(known.max()))}" if known.size else ""
 
 
 MET, UNMET = "#2c7a3f", FAILED
@@ -158,13 +208,20 @@ def draw_margins(
         for name, colour in (("all rows met", MET), ("some row not met", UNMET))
     ]
     figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=2, frameon=False)
-    return as_svg(axes, marks, title)
+    return as_svg(axes, marks, f"{title}, all rows met at {int((worst >= 0).sum())} points")
 
 
 def draw_lines(
-    title: str, groups: Mapping[str, tuple[xr.DataArray, Points]], x: Axis, label: str
+    title: str,
+    groups: Mapping[str, tuple[xr.DataArray, Points]],
+    x: Axis,
+    label: str,
+    limit: float | None = None,
 ) -> str:
-    """A metric along one knob, a line per group: mean of the members, band of 68 % of them."""
+    """A metric along one knob, a line per group: mean of the members, band of 68 % of them.
+
+    A limit is marked.
+    """
     _, axes = panel(title)
     marks, known = [], []
     for (name, (values, points)), colour in zip(groups.items(), COLOURS * 3, strict=False):
@@ -188,9 +245,11 @@ def draw_lines(
             axes.plot(p, low, "x", color=FAILED, ms=7, mew=2, clip_on=False)
             marks.append(_dot(p, low, "failed", FAILED, points, {x.name: int(k)}))
     _scale(axes, x, None)
-    axes.set_ylabel(label)
+    axes.set_ylabel(wrapped(label))
     _by_factors(axes, known)
-    if len(groups) > 1:
+    if limit is not None:
+        axes.axhline(limit, color=FAILED, ls="--", lw=1, label="limit")
+    if len(groups) > 1 or limit is not None:
         axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
     return as_svg(axes, marks, f"{label}, {title}")
@@ -232,7 +291,7 @@ def draw_scatter(
         order = chosen[np.argsort(across[chosen])]
         axes.plot(across[order], up[order], color=COLOURS[1], lw=1)
     _scale(axes, x, None)
-    axes.set_ylabel(y.label)
+    axes.set_ylabel(wrapped(y.label))
     axes.grid(alpha=0.3)
     return as_svg(axes, marks, f"{y.label} against {x.label}")
 
@@ -255,7 +314,7 @@ def draw_distributions(
         _plain_decades(axes.xaxis)
     else:
         axes.set(xlim=(0, None))
-    axes.set(xlabel=label, ylabel="fraction of flights")
+    axes.set(xlabel=wrapped(label, 55), ylabel="fraction of flights")
     axes.grid(alpha=0.3)
     figure.legend(fontsize=8, loc="outside lower center", ncols=4, frameon=False)
     return as_svg(axes, [], f"{label}, {title}")
@@ -269,19 +328,17 @@ def draw_against(
     name, across = x
     for (group, values), colour in zip(groups.items(), COLOURS[1:], strict=False):
         axes.plot(across, values, "o", ms=3.5, alpha=0.7, color=colour, label=group)
-    ends = np.array([np.min(across), np.max(across)])
-    axes.plot(ends, ends, color=COLOURS[0], lw=1, label=name)
+    one_to_one(axes, name, logarithmic=True)
     axes.axhline(limit, color=FAILED, ls="--", lw=1, label="limit")
-    axes.set(xscale="log", yscale="log", xlabel=f"{label}, {name}", ylabel=label)
+    axes.set(xlabel=f"{label}, {name}", ylabel=label)
     for side in (axes.xaxis, axes.yaxis):
         _plain_decades(side)
-    axes.grid(alpha=0.3)
     figure.legend(fontsize=8, loc="outside lower center", ncols=4, frameon=False)
     return as_svg(axes, [], f"{label} against {name}")
 
 
-def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> str:
-    """First-order and total indices of every knob with their intervals."""
+def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str], of: str) -> str:
+    """First-order and total indices of every knob for a metric, with their intervals."""
     _, axes = panel(title)
     rows = np.arange(len(found.knobs), dtype=float)[::-1]
     for shift, name, values, interval, colour in (
@@ -293,7 +350,7 @@ def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> 
     axes.set_yticks(rows, [labels[name] for name in found.knobs])
     axes.set(xlim=(0, 1), xlabel="fraction of the variance")
     axes.legend(fontsize=8)
-    return as_svg(axes, [], title)
+    return as_svg(axes, [], f"{title} of {of}")
 
 
 def _finer(places: np.ndarray, logarithmic: bool) -> np.ndarray:
@@ -356,9 +413,10 @@ def _cells(
         )
         if failed[i, j]:
             axes.plot(across[j], up[i], "x", color=FAILED, ms=9, mew=2)
-    _scale(axes, x, y)
+    # how many numbers an axis has follows from its limits
     axes.set_xlim(edges[0].min(), edges[0].max())
     axes.set_ylim(edges[1].min(), edges[1].max())
+    _scale(axes, x, y)
     return marks
 
 
@@ -396,7 +454,7 @@ def _scale(axes: Axes, x: Axis, y: Axis | None) -> None:
     ):
         if knob is None:
             continue
-        set_label(knob.label)
+        set_label(wrapped(knob.label, 55 if side is axes.xaxis else 34))
         if knob.logarithmic:
             set_scale("log")
             _plain_decades(side)

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.assessment.labels import BACKSCATTER
 
 _SPEED = "m s$^{-1}$"
@@ -63,7 +64,7 @@ def draw_comparison(
             )
             panel.set(title=title, aspect="equal", xlim=(y.max(), y.min()), ylim=(z.min(), z.max()))
             for core in cores:
-                panel.plot(*core, "k+", ms=8)
+                panel.plot(*core, "k+", ms=8, label=f"_{TRUE_CORE}")
             figure.colorbar(mesh, ax=panel, label=label, pad=0.02, extend="both")
         row[0].set_ylabel("z / m")
     for panel in axes[-1]:

@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lidar_mi.assessment.described import DopplerDescription, Progress, RingImages
-from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, one_to_one, save_all
 from lidar_mi.assessment.metrics.names import bound_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.instrument.fringe_camera import ring_radii
@@ -269,7 +269,7 @@ def _speeds(found: xr.Dataset) -> Plate:
         }
         left.errorbar(true[order], mean, spread, **style)
         right.errorbar(true[order], mean - true[order], spread, **style)
-    left.axline((0, 0), slope=1, color="k", lw=0.8)
+    one_to_one(left, "the true wind")
     right.axhline(0, color="k", lw=0.8)
     left.set(xlabel="true wind / m s$^{-1}$", ylabel="retrieved wind / m s$^{-1}$")
     right.set(xlabel="true wind / m s$^{-1}$", ylabel="retrieved less true wind / m s$^{-1}$")

@@ -10,7 +10,8 @@ from matplotlib.patches import Circle
 
 from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.encounter_loads import load_factor
-from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, arrow_scale, save_all
+from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
@@ -175,7 +176,7 @@ def _overview(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset, span: fl
     figure = Figure(figsize=(13.6, 4.9), layout="compressed")
     view, angle = figure.subplots(1, 2, width_ratios=(1.25, 1))
     ahead = _draw_slab(view, track, slabs, span)
-    view.set_title(f"backscatter and wind of a slab, {ahead:.1f} s ahead")
+    view.set_title(f"backscatter and wind of a slab, {ahead:.1f} s ahead", loc="left")
     view.legend(loc="lower center", ncols=3, fontsize=8)
     _lines(angle, series, "roll", np.degrees(1))
     angle.set(title="roll angle", ylabel="degrees", xlabel="time of flight / s")
@@ -260,7 +261,7 @@ def draw_vectors(axes: Axes, view: xr.Dataset) -> None:
     y, z = np.meshgrid(view["y"], view["z"])
     step = float(view["y"][1] - view["y"][0])
     # 10 m/s is as long as the vectors are apart
-    axes.quiver(
+    arrows = axes.quiver(
         y,
         z,
         view["v"],
@@ -271,6 +272,7 @@ def draw_vectors(axes: Axes, view: xr.Dataset) -> None:
         scale=10 / step,
         width=0.0022,
     )
+    arrow_scale(axes, arrows, 10.0)
 
 
 def draw_vortices(axes: Axes, at: xr.Dataset) -> None:
@@ -285,7 +287,7 @@ def draw_vortices(axes: Axes, at: xr.Dataset) -> None:
             color="cyan",
             ms=12,
             mew=1.6,
-            label="true cores" if label else None,
+            label="true cores" if label else f"_{TRUE_CORE}",
             ls="none",
         )
         y, z, radius = (float(track[f"{side}_{name}"]) for name in ("y", "z", "core_radius"))

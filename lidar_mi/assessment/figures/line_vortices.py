@@ -10,7 +10,7 @@ _BESIDE = 70.0  # m of the scan that is drawn around the vortices
 
 
 def draw_line_vortices(lines: xr.Dataset, vortices: xr.Dataset, title: str = "") -> Figure:
-    """The scan that shows most, with its vortices; of several scans, places and circulations too.
+    """The scan that shows most, with its vortices; of several with valid ones, their course too.
 
     Parameters
     ----------
@@ -19,7 +19,8 @@ def draw_line_vortices(lines: xr.Dataset, vortices: xr.Dataset, title: str = "")
     vortices : xr.Dataset
         As of `fit_vortices_to_lines` of them.
     """
-    several = vortices.sizes["scan"] > 1
+    # without a valid fit there is nothing to follow
+    several = vortices.sizes["scan"] > 1 and bool((vortices["flag"] == 0).any())
     figure = Figure(figsize=(11, 9 if several else 5), layout="constrained")
     if title:
         figure.suptitle(title)

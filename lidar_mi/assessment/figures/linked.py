@@ -2,6 +2,7 @@
 
 import io
 import re
+import textwrap
 from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
@@ -10,6 +11,8 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+
+from lidar_mi.assessment.figures.seen import seen
 
 
 class Mark(NamedTuple):
@@ -39,19 +42,25 @@ def panel(title: str) -> tuple[Figure, Axes]:
     """A figure of one panel, as wide as a phone; pages put several side by side."""
     figure = Figure(figsize=(5.2, 3.7), dpi=72, layout="constrained")
     axes = figure.subplots()
-    axes.set_title(title, fontsize=10)
+    axes.set_title(wrapped(title, 55), fontsize=10)
     return figure, axes
+
+
+def wrapped(text: str, width: int = 34) -> str:
+    """A label in lines that fit beside a panel; as it is where it has no spaces."""
+    return textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
 
 
 def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     """The axes' figure as an SVG element with marks below its lines; all text is escaped."""
     figure = axes.figure
     assert isinstance(figure, Figure)  # that of `panel`
+    spoken = ". ".join(part for part in (label.strip(" ,"), seen(figure)) if part)
     # cells and dots are behind the frame
     figure.patch.set_visible(False)
     axes.patch.set_visible(False)
     text = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": label}):
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": f"{spoken}{marks}"}):
         FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None})
     svg = text.getvalue()
     height = float(figure.get_figheight() * 72)
@@ -59,7 +68,9 @@ def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     body = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     size = re.search(r'viewBox="([^"]*)"', body)
-    start = f'<svg viewBox="{size[1] if size else ""}" role="img" aria-label="{escape(label)}">'
+    # what holds links is no image
+    role = "group" if marks else "img"
+    start = f'<svg viewBox="{size[1] if size else ""}" role="{role}" aria-label="{escape(spoken)}">'
     drawn = "".join(_element(axes, mark, height) for mark in marks)
     return f"{start}<g>{drawn}</g>{body[body.index('>') + 1 :]}"
 

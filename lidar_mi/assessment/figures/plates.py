@@ -1,5 +1,6 @@
 """Common parts of all figures: files, panels in the pilot's view, logarithmic axes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,12 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from lidar_mi.assessment.described import Progress
+from lidar_mi.assessment.figures.seen import TRUE_CORE, seen
+from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.png import write_png
 
@@ -25,11 +29,12 @@ Plate = tuple[Figure, str]
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure file and what it shows."""
+    """A figure file and what it shows; `seen` says it in numbers, for who does not see it."""
 
     path: Path
     title: str
     caption: str
+    seen: str = ""
 
 
 def save_all(folder: Path, plates: Sequence[tuple[str, str, Plate]], log: Progress) -> list[Drawn]:
@@ -40,7 +45,7 @@ def save_all(folder: Path, plates: Sequence[tuple[str, str, Plate]], log: Progre
         log.bar(f"drawing {title.lower()}", index / len(plates))
         path = folder / f"{name}.png"
         write_png(figure, path, cropped=True)
-        drawn.append(Drawn(path, title, caption))
+        drawn.append(Drawn(path, title, caption, seen(figure)))
     return drawn
 
 
@@ -55,13 +60,43 @@ def sheet(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def panels_of(number: int) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels for slabs, in rows of two or three, and none that is empty."""
+    columns = 3 if number % 2 and number > 1 else min(number, 2)
+    rows = -(-number // columns)
+    figure, grid = sheet(rows, columns)
+    if columns != 2:
+        # one alone has the space of two, three are smaller
+        figure.set_size_inches((8.8, 5.6) if columns == 1 else (18, 4.2 * rows))
+    for spare in grid.ravel()[number:]:
+        spare.remove()
+    return figure, list(grid.ravel()[:number])
+
+
 def frame(
     axes: Axes, y: np.ndarray | xr.DataArray, z: np.ndarray | xr.DataArray, title: str
 ) -> None:
     """The pilot's view: port on the left, up at the top, metres true to scale."""
-    axes.set(title=title, xlabel="y / m (port is left)", ylabel="z / m", aspect="equal")
+    # on the left, as the scale of arrows is on the right
+    axes.set_title(title, loc="left")
+    axes.set(xlabel="y / m (port is left)", ylabel="z / m", aspect="equal")
     axes.set_xlim(float(y.max()), float(y.min()))
     axes.set_ylim(float(z.min()), float(z.max()))
+
+
+def arrow_scale(axes: Axes, arrows: Quiver, largest: float) -> None:
+    """An arrow and its speed, the roundest up to the largest, above a panel on its right."""
+    power = 10 ** math.floor(math.log10(largest))
+    speed = next(n for n in (5, 2, 1) if n * power <= largest) * power
+    axes.quiverkey(
+        arrows, 0.93, 1.045, speed, f"{speed:g} m s$^{{-1}}$", labelpos="W", color="black"
+    )
+
+
+def mark_cores(axes: Axes, cores: Sequence[Core], colour: str, size: float = 9) -> None:
+    """Crosses where the true vortices are."""
+    for core in cores:
+        axes.plot(core.y, core.z, "+", color=colour, ms=size, ls="none", label=f"_{TRUE_CORE}")
 
 
 def image_panel(
@@ -83,6 +118,25 @@ def image_panel(
         bar.formatter.set_useOffset(False)
     if uniform:
         bar.set_ticks([(low + high) / 2], labels=[f"{(low + high) / 2:.3g}"])
+
+
+def one_to_one(axes: Axes, label: str, *, logarithmic: bool = False) -> None:
+    """The line on which both axes of a panel are the same, with the same scales on both."""
+    values = [np.ravel(np.asarray(d, float)) for line in axes.lines for d in line.get_data()]
+    known = np.concatenate([v[np.isfinite(v) & ((v > 0) | (not logarithmic))] for v in values])
+    low, high = float(known.min()), float(known.max())
+    if logarithmic:
+        ends = low / 1.15, high * 1.15
+        axes.set(xscale="log", yscale="log")
+    else:
+        ends = low - 0.05 * (high - low), high + 0.05 * (high - low)
+    axes.plot(ends, ends, "k--", lw=1, label=label)
+    axes.set(xlim=ends, ylim=ends, aspect="equal")
+    axes.grid(alpha=0.3, which="both")
+    for side in (axes.xaxis, axes.yaxis) if logarithmic else ():
+        side.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        side.set_major_formatter("{x:g}")
+        side.set_minor_formatter(NullFormatter())
 
 
 def by_factors(axes: Axes) -> None:

@@ -10,6 +10,7 @@ from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.plates import (
     Drawn,
     Plate,
+    arrow_scale,
     frame,
     image_panel,
     save_all,
@@ -77,7 +78,9 @@ def _wind(axes: Axes, pointing: ScanPointing) -> None:
     some = slice(step // 2, None, step)
     v, w = v[some, some], w[some, some]
     # port, towards larger y, is on the left
-    axes.quiver(v["y"].values, v["z"].values, -v.values, w.values, color="w")
+    arrows = axes.quiver(v["y"].values, v["z"].values, -v.values, w.values, color="w")
+    if (largest := float(speed_of(v, w).max())) > 0:
+        arrow_scale(axes, arrows, largest)
 
 
 def _field(values: np.ndarray, pointing: ScanPointing) -> xr.DataArray:

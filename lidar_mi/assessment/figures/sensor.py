@@ -13,7 +13,7 @@ from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, mark_cores, save_all
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, line_places
 
@@ -44,29 +44,29 @@ def draw_all(
 
 
 def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
-    figure = Figure(figsize=(13.6, 4.6), layout="compressed")
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
     place = line_places(lines)
     speed, true = lines["v_los"].values, lines["v_los_true"].values
     normalised = (speed - true) / lines["v_los_std"].values
     read = np.isfinite(speed)
+    # without a velocity there is only where lines are
+    figure = Figure(figsize=(13.6 if read.any() else 6.8, 4.6), layout="compressed")
+    panels = figure.subplots(1, 1 + read.any(), sharex=True, sharey=True, squeeze=False)[0]
     span = np.quantile(np.where(read, speed, true), (0.0, 1.0))
-    for panel, values, title, label, style in (
+    shown: tuple[tuple[np.ndarray, str, str, dict[str, Any]], ...] = (
         (
-            panels[0],
             speed,
             "velocity along the line of sight",
             _SPEED,
             {"cmap": "cividis", "vmin": span[0], "vmax": span[1]},
         ),
         (
-            panels[1],
             normalised,
             "its error over its standard error",
             "normalised error",
             {"cmap": "RdBu_r", "vmin": -4, "vmax": 4},
         ),
-    ):
+    )
+    for panel, (values, title, label, style) in zip(panels, shown, strict=False):
         dots = panel.scatter(
             place[read, 1],
             place[read, 2],
@@ -77,8 +77,7 @@ def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
             **style,
         )
         panel.plot(place[~read, 1], place[~read, 2], "kx", ms=6)
-        for core in cores:
-            panel.plot(core.y, core.z, "+", color="crimson", ms=9)
+        mark_cores(panel, cores, "crimson")
         panel.set(title=title, aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
         figure.colorbar(dots, ax=panel, label=label, pad=0.02)
     # at least as wide as high, even for lines above each other
@@ -120,8 +119,7 @@ def _maps(found: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
             )
             panel.set(title=title, aspect="equal")
             figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
-            for core in cores:
-                panel.plot(core.y, core.z, "+", color="k", ms=8)
+            mark_cores(panel, cores, "k", 8)
     # lines of sight where they were used
     axes[0, 1].plot(place[:, 1], place[:, 2], "k.", ms=2)
     # the pilot's view: port, of positive y, is left

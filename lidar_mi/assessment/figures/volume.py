@@ -15,7 +15,7 @@ from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, Plate, by_factors, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, by_factors, mark_cores, save_all
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 
@@ -76,8 +76,7 @@ def _cuts(wind: xr.Dataset, cores: Sequence[Core]) -> Plate:
     for row, name in zip(axes, _COMPONENTS, strict=True):
         _row(row, cut, name, "y", "z")
         for panel in row:
-            for core in cores:
-                panel.plot(core.y, core.z, "+", color="k", ms=8)
+            mark_cores(panel, cores, "k", 8)
     for panel in axes[:-1].ravel():
         panel.set_xlabel("")
     return figure, (

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from lidar_mi.assessment.described import Progress
-from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all, speed_of
+from lidar_mi.assessment.figures.plates import Drawn, Plate, arrow_scale, save_all, speed_of
+from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -70,7 +71,8 @@ def _pair(
     first.set_title("first image, fitted pairs")
     limit = float(np.quantile(np.hypot(true["v"], true["w"]), 0.999)) or 1.0
     _arrows(fitted, y, z, model, limit)
-    fitted.set_title(f"wind of the pair from the {ORIGIN_NAMES[best]}")
+    # on the right is the scale of the arrows
+    fitted.set_title(f"wind of the pair from the {ORIGIN_NAMES[best]}", loc="left")
     error = speed_of(model["v"] - true["v"], model["w"] - true["w"]).values
     stderr = speed_of(model["v_stderr"], model["w_stderr"]).values
     most = float(np.quantile(error, 0.995)) or 1.0
@@ -115,6 +117,7 @@ def _arrows(axes: Axes, y: np.ndarray, z: np.ndarray, model: xr.Dataset, limit: 
         scale=limit / (1.8 * step),
         width=0.0022,
     )
+    arrow_scale(axes, arrows, limit)
     axes.figure.colorbar(arrows, ax=axes, label=f"speed / {_SPEED}", pad=0.02, extend="max")
 
 
@@ -141,7 +144,7 @@ def _mark(axes: Axes, fits: Mapping[str, VortexPairFit], cores: Sequence[Core]) 
             "+",
             color="crimson",
             ms=10,
-            label=None if k else "true cores",
+            label=f"_{TRUE_CORE}" if k else "true cores",
             ls="none",
         )
 

@@ -1,5 +1,6 @@
 """The report of a campaign: one self-contained HTML file, from its data set alone."""
 
+import re
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import product
@@ -13,13 +14,14 @@ from lidar_mi.assessment.figures import campaign as figures
 from lidar_mi.assessment.figures.campaign import Axis, Points
 from lidar_mi.assessment.metrics import campaign as numbers
 from lidar_mi.assessment.metrics.campaign import MEMBER, SAMPLE, Interval
+from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 from lidar_mi.assessment.metrics.requirements import QUANTITIES
 from lidar_mi.assessment.report.block import Block, label_of
 from lidar_mi.assessment.report.encounters import encounter_blocks
 from lidar_mi.assessment.report.page import template
 from lidar_mi.assessment.report.sample import margin_blocks, sample_blocks
 from lidar_mi.assessment.report.simulation import points_sentence
-from lidar_mi.units import usual_unit
+from lidar_mi.units import conversion, usual_unit
 
 _PANELS = 16
 _FEW = 4
@@ -344,11 +346,22 @@ def _sweep_block(
     if len(selections) > _PANELS:
         text += f"The first {_PANELS} of {len(selections)} panels. "
     drawn, mean = [], numbers.over_members(values).mean
+    bank = _bank_limit(key, values)
+    limits = _limits(dataset, key, axes)
+    if bank is not None:
+        limits["limit"] = bank - mean
+    if limits and len(at) == 2:
+        text += "Black lines: where the limit is reached. "
     norm = figures.colour_scale(mean)
     for name, where in selections[:_PANELS]:
         here = Points(*(p.isel(where) for p in flat))
         if len(at) == 2:
-            drawn.append(figures.draw_map(name, mean.isel(where), at[0], at[1], here, label, norm))
+            bounds = {what: margin.isel(where) for what, margin in limits.items()}
+            drawn.append(
+                figures.draw_map(
+                    name, mean.isel(where), at[0], at[1], here, label, norm, limits=bounds
+                )
+            )
             continue
         groups = {"": (values.isel(where), here)}
         if lines:
@@ -359,10 +372,30 @@ def _sweep_block(
                 )
                 for k, one in enumerate(lines.labels)
             }
-        drawn.append(figures.draw_lines(name, groups, at[0], label))
+        drawn.append(figures.draw_lines(name, groups, at[0], label, bank))
     if len(at) == 1 and MEMBER in values.dims:
         text += "Bands: 16 to 84 % of the members. "
     return Block(title, f"{text}Key: {key}.", drawn)
+
+
+def _limits(dataset: xr.Dataset, key: str, axes: Mapping[str, Axis]) -> dict[str, xr.DataArray]:
+    """Margins of the requirements of a metric, by application and phase of flight."""
+    found = {}
+    for (application, phase), rows in numbers.requirements(numbers.metrics_of(dataset)).items():
+        row = rows.get(key.replace("sensor.rmse_", "error_"))
+        if row is None:
+            continue
+        mean = numbers.over_members(numbers.judged(dataset, row)).mean
+        others = [dim for dim in mean.dims if dim not in axes]
+        found[f"{application.replace('_', ' ')}, {phase}"] = mean.squeeze(others, drop=True)
+    return found
+
+
+def _bank_limit(key: str, values: xr.DataArray) -> float | None:
+    """The largest bank angle that is accepted, in the unit of the values."""
+    if not re.fullmatch(r"encounter\.\w+\.largest_roll", key):
+        return None
+    return ACCEPTED_BANK * conversion("rad", values.attrs.get("units", "rad"))
 
 
 def _by_member(values: xr.DataArray) -> str:

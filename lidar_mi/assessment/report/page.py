@@ -63,12 +63,13 @@ class Film(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A figure as a data URL, and the fractions of its width at which its panels part."""
+    """A figure as a data URL, the fractions of its width at which panels part, and what is seen."""
 
     title: str
     caption: str
     source: str
     cuts: str
+    alt: str
 
 
 class Chapter(NamedTuple):
@@ -185,7 +186,8 @@ def picture(figure: Drawn) -> Picture:
     """A figure for a page: lossless WebP, two thirds of its PNG."""
     source = f"data:image/webp;base64,{base64.b64encode(as_webp(figure.path)).decode()}"
     cuts = " ".join(f"{cut:.4f}" for cut in panel_cuts(figure.path))
-    return Picture(figure.title, figure.caption, source, cuts)
+    alt = f"{figure.title}. {figure.seen}".strip()
+    return Picture(figure.title, figure.caption, source, cuts, alt)
 
 
 def script(name: str) -> Markup:

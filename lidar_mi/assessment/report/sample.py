@@ -46,7 +46,7 @@ def sample_blocks(
             found = sobol_indices(places, analysed, logarithmic)
             text = ("Of its logarithm. " if factors else "") + _sensitivity_text(found)
             if found.determined:
-                drawn.append(figures.draw_indices("Sobol' indices", found, labels))
+                drawn.append(figures.draw_indices("Sobol' indices", found, labels, title))
         for name, axis in axes.items():
             drawn.append(figures.draw_scatter("", axis, places[name], y, mean, points))
         yield Block(title, f"{text} Key: {key}.", drawn)

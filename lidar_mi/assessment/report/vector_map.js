@@ -1,4 +1,4 @@
-// Vectors of a wind field to be looked at one by one: hover, tap, or arrow keys. Needs nothing else.
+// Vectors of a wind field to be looked at one by one: hover, click or tap to pin, or arrow keys. Needs nothing else.
 (() => {
   "use strict";
   const grey = "#bbb";
@@ -45,7 +45,7 @@
     const half = data.step / 2;
     const left = Math.max(...data.y) + half, right = Math.min(...data.y) - half;
     const top = Math.max(...data.z) + half, bottom = Math.min(...data.z) - half;
-    let chosen = -1, width = 0, height = 0, unit = 1;
+    let chosen = -1, pinned = false, width = 0, height = 0, unit = 1;
 
     const edge = 46, foot = 40;  // px for the axes, left and below
     const px = (y, z) => [edge + (left - y) * unit, (top - z) * unit];
@@ -142,9 +142,11 @@
         const [x, up] = px(data.y[chosen], data.z[chosen]);
         pen.strokeStyle = "#000";
         pen.beginPath();
+        pen.lineWidth = pinned ? 3 : 1.5;
         pen.arc(x, up, 7, 0, 7);
         pen.stroke();
         pen.strokeStyle = "#d62728";
+        pen.lineWidth = 1.5;
         if (v.true[chosen] !== null) arrow(pen, data.y[chosen], data.z[chosen], v.true[chosen], w.true[chosen]);
       }
       key.style.background = "linear-gradient(to right," + what.scale.map(c => "rgb(" + c + ")") + ")";
@@ -153,12 +155,13 @@
     }
 
     function show(k) {
-      if (k === chosen || k < 0) return;
+      if (k < 0) return;
       chosen = k;
       const number = value => value === null || value === undefined ? "\u2013" : value.toFixed(2).replace("-0.00", "0.00");
       const reasons = Object.entries(data.flags).filter(([mask]) => data.flag[k] & mask).map(([, text]) => text);
       where.textContent = "y = " + data.y[k].toFixed(1) + " m, z = " + data.z[k].toFixed(1) + " m: " +
-        (reasons.length ? "rejected, " + reasons.join(", ") : "valid");
+        (reasons.length ? "rejected, " + reasons.join(", ") : "valid") +
+        ", v " + number(v.retrieved[k]) + ", w " + number(w.retrieved[k]) + " m/s" + (pinned ? ", pinned" : "");
       rows.replaceChildren(...data.components.map(c => {
         const row = document.createElement("tr"), f = c.retrieved[k], t = c.true[k];
         const off = f === null || t === null ? null : f - t;
@@ -170,28 +173,56 @@
       draw();
     }
 
+    const hidden = k => v.retrieved[k] === null || w.retrieved[k] === null || (data.flag[k] !== 0 && !flagged.checked);
+
+    // the next one in a direction, however wide the gap: rather straight ahead than near
+    function next(y, z) {
+      let best = -1, least = Infinity;
+      for (let k = 0; k < many; k++) {
+        if (hidden(k)) continue;
+        const dy = data.y[k] - data.y[chosen], dz = data.z[k] - data.z[chosen];
+        const ahead = y * dy + z * dz, aside = Math.abs(y * dz - z * dy);
+        if (ahead < data.step / 2) continue;
+        const far = ahead + 3 * aside;
+        if (far < least) { least = far; best = k; }
+      }
+      return best;
+    }
+
     function nearest(y, z) {
       let best = -1, least = Infinity;
       for (let k = 0; k < many; k++) {
-        if (data.flag[k] !== 0 && !flagged.checked) continue;
+        if (hidden(k)) continue;
         const far = (data.y[k] - y) ** 2 + (data.z[k] - z) ** 2;
         if (far < least) { least = far; best = k; }
       }
       return best;
     }
 
-    function point(event) {
+    function at(event) {
       const box = canvas.getBoundingClientRect();
-      show(nearest(left - (event.clientX - box.left - edge) / unit, top - (event.clientY - box.top) / unit));
+      return nearest(left - (event.clientX - box.left - edge) / unit, top - (event.clientY - box.top) / unit);
     }
 
-    canvas.addEventListener("pointermove", point);
-    canvas.addEventListener("pointerdown", point);
+    canvas.addEventListener("pointermove", event => {
+      if (pinned) return;
+      const k = at(event);
+      if (k !== chosen) show(k);
+    });
+    canvas.addEventListener("click", event => {
+      const k = at(event);
+      pinned = !(pinned && k === chosen);
+      show(k);
+    });
     canvas.addEventListener("keydown", event => {
+      if (event.key === "Escape" && pinned) { pinned = false; show(chosen); }
       const step = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
       if (!step || chosen < 0) return;
       event.preventDefault();
-      show(nearest(data.y[chosen] + step[0] * data.step, data.z[chosen] + step[1] * data.step));
+      const k = next(...step);
+      if (k < 0) return;
+      pinned = true;
+      show(k);
     });
     choice.addEventListener("change", draw);
     flagged.addEventListener("change", draw);

@@ -1,6 +1,6 @@
 """Vectors as data for the report's interactive map."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,7 @@ def map_data(
     step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
     return {
         **place,
+        "seen": _seen(thin, place, numbers("v"), numbers("w")),
         "colour": colour,
         "step": step,
         "components": [
@@ -71,3 +72,22 @@ def map_data(
         },
         "cores": [[round(core.y, 2), round(core.z, 2)] for core in cores],
     }
+
+
+def _seen(
+    thin: xr.Dataset,
+    place: Mapping[str, list[float]],
+    v: Sequence[float | None],
+    w: Sequence[float | None],
+) -> str:
+    """How many vectors there are, and the longest of the valid ones."""
+    speed = np.hypot(np.array(v, dtype=float), np.array(w, dtype=float))
+    speed[thin["flag"].values.ravel() != 0] = np.nan
+    known = int(np.isfinite(speed).sum())
+    if not known:
+        return f"none of {speed.size} vectors is valid"
+    k = int(np.nanargmax(speed))
+    return (
+        f"{known} of {speed.size} vectors are valid, the longest is {speed[k]:.3g} m/s at "
+        f"y = {place['y'][k]:g} m, z = {place['z'][k]:g} m"
+    )

@@ -113,7 +113,8 @@ def test_page_has_the_video_and_the_animation_for_browsers_without():
     shown = Film("The flight", "Frames.", [(b"one", "0.1 s")], 0.2, b"film", "approach.gif")
     chapter = encounter_chapter(numbers(off=25), [], [], shown)
     html = page(check(encounter_keys(), "test"), "name: x", {"lidar-mi": "0"}, {}, [chapter])
-    assert "<video controls" in html and 'src="data:video/mp4;base64,ZmlsbQ=="' in html
+    assert '<video class="paper" controls' in html
+    assert 'src="data:video/mp4;base64,ZmlsbQ=="' in html
     assert 'src="approach.gif"' in html and "for (const film of" not in html
 
 

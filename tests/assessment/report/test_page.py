@@ -123,8 +123,8 @@ def test_the_first_page_has_the_answer_an_image_and_the_files(tmp_path):
         Image.new("RGB", (4, 4)).save(figure.path)
     text = some_page(drawn=drawn, verdict=Tables("Compliance", "", []))
     head, rest = text.split("</section>")
-    assert head.index('class="answer"') < head.index('alt="one"') < head.index("Compliance")
-    assert 'alt="one"' not in rest and 'alt="two"' in rest and 'alt="two"' not in head
+    assert head.index('class="answer"') < head.index('alt="one."') < head.index("Compliance")
+    assert 'alt="one."' not in rest and 'alt="two."' in rest and 'alt="two."' not in head
 
 
 @pytest.mark.parametrize(("panels", "cuts"), [(1, 0), (2, 1), (3, 2)], ids=["one", "two", "three"])
@@ -162,8 +162,56 @@ def test_a_browser_draws_the_map_and_describes_a_vector(tmp_path):
         check=True,
     )
     dom = done.stdout
-    assert '<p class="where">y = 1.0 m, z = 4.0 m: valid</p>' in dom
+    where = r'<p class="where" role="status">y = 1.0 m, z = 4.0 m: valid, v 1.00, w 0.25 m/s</p>'
+    assert where in dom
     rows = re.search("<tbody>(<tr><td>u.*?)</tbody>", dom)[1]
     assert "<td>u</td><td>4.00</td><td>3.50</td><td>0.50</td><td>0.25</td>" in rows
     assert "<td>w</td><td>0.25</td><td>-0.25</td><td>0.50</td><td>0.25</td>" in rows
     assert dom.count("<option") == 5 and '<div class="map">' in dom
+
+
+# pins by a click, crosses three flagged vectors by an arrow key, is not moved by the pointer
+ACTS = """<script>
+  const canvas = document.querySelector(".map canvas"), box = canvas.getBoundingClientRect();
+  const told = document.querySelector(".map .where"), heard = [];
+  const at = (type, x) => canvas.dispatchEvent(new MouseEvent(type,
+    { clientX: box.left + 46 + x * (box.width - 47), clientY: box.top + 20 }));
+  const key = name => canvas.dispatchEvent(new KeyboardEvent("keydown", { key: name }));
+  const hear = () => heard.push(
+    told.textContent.split(":")[0] + told.textContent.includes("pinned"));
+  at("pointermove", 0.01); hear();
+  at("click", 0.01); hear();
+  at("pointermove", 0.99); hear();
+  key("ArrowRight"); hear();
+  key("Escape"); hear();
+  at("pointermove", 0.01); hear();
+  document.body.append(Object.assign(
+    document.createElement("p"), { id: "heard", textContent: heard.join("; ") }));
+</script>"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not BROWSER, reason="no Chromium here")
+def test_a_browser_pins_vectors_and_crosses_gaps(tmp_path):
+    wind = some_wind()
+    wind["flag"][:] = 0
+    wind["flag"][:, 2:5] = 2
+    vectors = {"title": "wind"} | map_data(wind, ("u", "v", "w"), [])
+    path = tmp_path / "report.html"
+    path.write_text(some_page(vectors=vectors).replace("</body>", f"{ACTS}</body>"))
+    done = subprocess.run(
+        [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    heard = re.search('<p id="heard">(.*?)</p>', done.stdout)[1].split("; ")
+    assert heard == [
+        "y = 5.0 m, z = 6.0 mfalse",
+        "y = 5.0 m, z = 6.0 mtrue",
+        "y = 5.0 m, z = 6.0 mtrue",
+        "y = -3.0 m, z = 6.0 mtrue",
+        "y = -3.0 m, z = 6.0 mfalse",
+        "y = 5.0 m, z = 6.0 mfalse",
+    ]
