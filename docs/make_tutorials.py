@@ -38,6 +38,10 @@ SEEN = {
         "Linear depolarisation ratio of the image: high in the puffs, 0 around them",
         "Extinction of the puffs: true, as the blurred image has it, and retrieved",
     ),
+    "cloud": (
+        "Extinction of a cloud against range: the inverse renderer follows the truth, Klett's "
+        "inversion falls short on the near side",
+    ),
 }
 
 
