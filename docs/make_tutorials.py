@@ -78,8 +78,8 @@ def printed(cell: nbformat.NotebookNode) -> str:
 
 
 def linked(text: str) -> str:
-    """Names of other notebooks as links to their pages."""
-    return re.sub(r"`(\w+)\.ipynb`", r"[\1](\1.md)", text)
+    """Names of other notebooks as links to their pages; links to pages as seen from a page."""
+    return re.sub(r"`(\w+)\.ipynb`", r"[\1](\1.md)", text).replace("](../docs/", "](../")
 
 
 def drawn(notebook: nbformat.NotebookNode) -> Iterator[bytes]:
