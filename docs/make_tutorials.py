@@ -38,6 +38,10 @@ SEEN = {
         "Linear depolarisation ratio of the image: high in the puffs, 0 around them",
         "Extinction of the puffs: true, as the blurred image has it, and retrieved",
     ),
+    "cloud": (
+        "Extinction of a cloud against range: the inverse renderer follows the truth, Klett's "
+        "inversion falls short on the near side",
+    ),
 }
 
 
@@ -78,8 +82,9 @@ def printed(cell: nbformat.NotebookNode) -> str:
 
 
 def linked(text: str) -> str:
-    """Names of other notebooks as links to their pages; links to pages as seen from a page."""
-    return re.sub(r"`(\w+)\.ipynb`", r"[\1](\1.md)", text).replace("](../docs/", "](../")
+    """Names of other notebooks and of pages as links."""
+    text = re.sub(r"`docs/((?:\w+/)*)(\w+)\.md`", r"[\2](../\1\2.md)", text)
+    return re.sub(r"`(\w+)\.ipynb`", r"[\1](\1.md)", text)
 
 
 def drawn(notebook: nbformat.NotebookNode) -> Iterator[bytes]:

@@ -42,6 +42,13 @@ bank = {str(flight): float(largest.sel(flight=flight)) for flight in largest["fl
 assert bank["feedforward"] < 0.6 * bank["autopilot"] < 0.6 * bank["off"]
 assert abs(bank["feedforward"] - bank["perfect"]) < 2
 """,
+    # 15 to 25 % of a truth that other seeds do not change; stated errors of 0.7 to 3 %
+    "cloud.ipynb": """
+assert 0.1 < several < 0.4 and error(by_klett) > 0.1
+assert error(retrieved) < 0.05
+normalised = (retrieved - truth) / found["extinction_stderr"].values
+assert 0.1 < np.mean(normalised**2) < 3
+""",
     # air keeps the polarisation; other seeds change the ratio of the errors by 0.05 from 0.5
     "own_scene.ipynb": """
 seen = ratio.values
