@@ -191,10 +191,15 @@ def test_limits_are_drawn_in_maps():
 def test_the_comparison_of_variants(tmp_path):
     described = {
         "name": "two",
-        "wake": {"vortex_pair": SMALL_WAKE, "spacing": 1},
-        "render": {"samples_per_beam": 4, "max_order": 1},
-        "retrieval": {"methods": ["cc"]},
-        "variants": {"near": {"scan": {"range": "150 m"}}, "far": {"scan": {"range": "500 m"}}},
+        "wake": {"vortex_pair": SMALL_WAKE | {"width": 60, "height": 40}, "spacing": 1},
+        "render": {"samples_per_beam": 16, "max_order": 1},
+        "retrieval": {"methods": ["cc"], "stride": 2},
+        "variants": {
+            "near": {"scan": {"range": "150 m"}},
+            "far": {"scan": {"range": "500 m"}},
+            # no photoelectron, and so no valid vector
+            "dark": {"lidar": {"pulse_energy": "1 pJ"}, "detector": {}},
+        },
     }
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(described, sort_keys=False))
     with figure_rules.judged_figures() as found, pytest.MonkeyPatch.context() as patch:
@@ -203,6 +208,7 @@ def test_the_comparison_of_variants(tmp_path):
         study.run("two", config.load_variants(tmp_path / "two.yaml"), tmp_path / "out")
     assert "fig00_comparison" in found and broken(found) == {}
     text = next((tmp_path / "out").glob("*.html")).read_text()
+    assert "Without a valid vector, and so by its image alone: dark." in text
     assert list(page_rules.faults(text)) == []
 
 

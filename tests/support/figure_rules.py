@@ -11,6 +11,7 @@ from matplotlib.lines import AxLine
 from matplotlib.quiver import Quiver, QuiverKey
 
 from lidar_mi.assessment.figures import campaign, linked, plates
+from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.io import png
 
 
@@ -54,7 +55,12 @@ def _of_panel(axes, marks):
 def _has_values(axes):
     of_collections = [one for one in axes.collections if not isinstance(one, Quiver)]
     values = [
-        *(np.ravel(line.get_ydata()) for line in axes.lines if not isinstance(line, AxLine)),
+        # crosses of true cores say nothing of what is retrieved
+        *(
+            np.ravel(line.get_ydata())
+            for line in axes.lines
+            if not isinstance(line, AxLine) and TRUE_CORE not in str(line.get_label())
+        ),
         *(
             np.ma.filled(q.N * 0.0 + np.ma.hypot(q.U, q.V), np.nan)
             for q in axes.collections
