@@ -13,8 +13,8 @@ import pytest
 import yaml
 from matplotlib.figure import Figure
 
+from lidar_mi.assessment.figures import encounter_film
 from lidar_mi.assessment.figures.encounter import draw_all
-from lidar_mi.assessment.figures.encounter_film import film
 from lidar_mi.assessment.report import campaign as campaign_report
 from lidar_mi.assessment.report.encounter import encounter_chapter
 from lidar_mi.assessment.report.page import Film, page
@@ -71,6 +71,15 @@ EXPERIMENTS = {
             "scan": {"count": 3, "elevations": ["0 deg", "30 deg"], "rate": "10 deg/s"},
         },
     },
+    "lines in one direction": {
+        "doppler": COHERENT | {"kind": "coherent", "scan": {"kind": "stare", "count": 12}},
+        "wake": PAIR,
+    },
+    "winds over height": {
+        "doppler": COHERENT
+        | {"kind": "coherent", "scan": {"kind": "dbs", "count": 3, "repeat": "6 s"}},
+        "wake": PAIR,
+    },
 }
 
 
@@ -112,12 +121,20 @@ def flown(tmp_path_factory):
     found = made_up_flights()
     with figure_rules.judged_figures() as figures:
         drawn = draw_all(folder, found.series, found.track, found.slabs, 28.9, Log())
+    canvas = encounter_film.FigureCanvasAgg
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 1)
+        patch.setattr(encounter_film, "RATE", 1)
+        drawn_on = []
+        patch.setattr(
+            encounter_film,
+            "FigureCanvasAgg",
+            lambda figure: drawn_on.append(figure) or canvas(figure),
+        )
         frames = [
             (frame_as_webp(frame.pixels), frame.caption)
-            for frame in film(found.series, found.track, found.slabs, 28.9)
+            for frame in encounter_film.film(found.series, found.track, found.slabs, 28.9)
         ]
+    figures["film"] = figure_rules.faults(*drawn_on)
     metrics = {"encounter.off.largest_roll": math.radians(25), "encounter.off.departed": 0.0}
     texts = [
         page(
