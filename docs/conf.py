@@ -36,6 +36,8 @@ myst_heading_anchors = 4
 
 html_theme = "furo"
 html_title = f"lidar-mi {release}"
+html_static_path = ["_static"]
+html_css_files = ["narrow.css"]
 html_copy_source = False
 html_show_sphinx = False
 # contrasts of 4.5 and more, which those of furo have not

@@ -91,8 +91,9 @@ def winds(
     else:
         write_csv(out, found)
     output.print(f"winds    {out}")
-    write_png(draw_wind_profiles(found, files[0].name), figure)
-    output.print(f"figure   {figure}")
+    if (found["flag"] == 0).any():
+        write_png(draw_wind_profiles(found, files[0].name), figure)
+        output.print(f"figure   {figure}")
 
 
 def _show(found: "xr.Dataset") -> None:

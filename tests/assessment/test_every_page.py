@@ -13,8 +13,8 @@ import pytest
 import yaml
 from matplotlib.figure import Figure
 
+from lidar_mi.assessment.figures import encounter_film
 from lidar_mi.assessment.figures.encounter import draw_all
-from lidar_mi.assessment.figures.encounter_film import film
 from lidar_mi.assessment.report import campaign as campaign_report
 from lidar_mi.assessment.report.encounter import encounter_chapter
 from lidar_mi.assessment.report.page import Film, page
@@ -71,6 +71,15 @@ EXPERIMENTS = {
             "scan": {"count": 3, "elevations": ["0 deg", "30 deg"], "rate": "10 deg/s"},
         },
     },
+    "lines in one direction": {
+        "doppler": COHERENT | {"kind": "coherent", "scan": {"kind": "stare", "count": 12}},
+        "wake": PAIR,
+    },
+    "winds over height": {
+        "doppler": COHERENT
+        | {"kind": "coherent", "scan": {"kind": "dbs", "count": 3, "repeat": "6 s"}},
+        "wake": PAIR,
+    },
 }
 
 
@@ -112,12 +121,20 @@ def flown(tmp_path_factory):
     found = made_up_flights()
     with figure_rules.judged_figures() as figures:
         drawn = draw_all(folder, found.series, found.track, found.slabs, 28.9, Log())
+    canvas = encounter_film.FigureCanvasAgg
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 1)
+        patch.setattr(encounter_film, "RATE", 1)
+        drawn_on = []
+        patch.setattr(
+            encounter_film,
+            "FigureCanvasAgg",
+            lambda figure: drawn_on.append(figure) or canvas(figure),
+        )
         frames = [
             (frame_as_webp(frame.pixels), frame.caption)
-            for frame in film(found.series, found.track, found.slabs, 28.9)
+            for frame in encounter_film.film(found.series, found.track, found.slabs, 28.9)
         ]
+    figures["film"] = figure_rules.faults(*drawn_on)
     metrics = {"encounter.off.largest_roll": math.radians(25), "encounter.off.departed": 0.0}
     texts = [
         page(
@@ -191,10 +208,15 @@ def test_limits_are_drawn_in_maps():
 def test_the_comparison_of_variants(tmp_path):
     described = {
         "name": "two",
-        "wake": {"vortex_pair": SMALL_WAKE, "spacing": 1},
-        "render": {"samples_per_beam": 4, "max_order": 1},
-        "retrieval": {"methods": ["cc"]},
-        "variants": {"near": {"scan": {"range": "150 m"}}, "far": {"scan": {"range": "500 m"}}},
+        "wake": {"vortex_pair": SMALL_WAKE | {"width": 60, "height": 40}, "spacing": 1},
+        "render": {"samples_per_beam": 16, "max_order": 1},
+        "retrieval": {"methods": ["cc"], "stride": 2},
+        "variants": {
+            "near": {"scan": {"range": "150 m"}},
+            "far": {"scan": {"range": "500 m"}},
+            # no photoelectron, and so no valid vector
+            "dark": {"lidar": {"pulse_energy": "1 pJ"}, "detector": {}},
+        },
     }
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(described, sort_keys=False))
     with figure_rules.judged_figures() as found, pytest.MonkeyPatch.context() as patch:
@@ -203,6 +225,7 @@ def test_the_comparison_of_variants(tmp_path):
         study.run("two", config.load_variants(tmp_path / "two.yaml"), tmp_path / "out")
     assert "fig00_comparison" in found and broken(found) == {}
     text = next((tmp_path / "out").glob("*.html")).read_text()
+    assert "Without a valid vector, and so by its image alone: dark." in text
     assert list(page_rules.faults(text)) == []
 
 

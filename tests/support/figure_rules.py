@@ -11,6 +11,7 @@ from matplotlib.lines import AxLine
 from matplotlib.quiver import Quiver, QuiverKey
 
 from lidar_mi.assessment.figures import campaign, linked, plates
+from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.io import png
 
 
@@ -54,7 +55,7 @@ def _of_panel(axes, marks):
 def _has_values(axes):
     of_collections = [one for one in axes.collections if not isinstance(one, Quiver)]
     values = [
-        *(np.ravel(line.get_ydata()) for line in axes.lines if not isinstance(line, AxLine)),
+        *(np.ravel(line.get_ydata()) for line in axes.lines if _is_of_values(axes, line)),
         *(
             np.ma.filled(q.N * 0.0 + np.ma.hypot(q.U, q.V), np.nan)
             for q in axes.collections
@@ -68,6 +69,14 @@ def _has_values(axes):
         *(patch.get_extents().get_points() for patch in axes.patches),
     ]
     return any(np.isfinite(np.ma.filled(np.ma.asarray(v, float), np.nan)).any() for v in values)
+
+
+def _is_of_values(axes, line):
+    """Not a line across the panel, nor crosses of true cores: they say nothing of results."""
+    across = isinstance(line, AxLine) or not all(
+        line.get_transform().contains_branch_seperately(axes.transData)
+    )
+    return not across and TRUE_CORE not in str(line.get_label())
 
 
 def _is_one_to_one(line):

@@ -39,6 +39,15 @@ def test_winds_of_a_scan(scan, tmp_path):
     assert (tmp_path / "winds.csv").read_text().startswith("time,height")
 
 
+def test_no_figure_without_a_valid_wind(tmp_path):
+    """Lines that are all vertical say nothing of the horizontal wind."""
+    (tmp_path / "up.hpl").write_text(made.halo_text(made.lines(elevation=89.9)))
+    done = shell("winds", "up.hpl", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert " 0 of " in words_of(done.stdout) and "figure" not in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"up.hpl", "winds.nc"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

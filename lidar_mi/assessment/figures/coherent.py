@@ -31,8 +31,9 @@ def draw_slices(
     plates = [
         ("fig30_slices", "Vertical slices", _slices(lines, vortices)),
         ("fig31_vortex_track", "The vortices by age", _track(vortices)),
-        ("fig32_vortex_errors", "Errors by age", _errors(vortices)),
     ]
+    if (vortices["flag"] == 0).any():
+        plates.append(("fig32_vortex_errors", "Errors by age", _errors(vortices)))
     return save_all(folder, plates, log)
 
 

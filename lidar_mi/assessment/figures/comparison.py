@@ -58,6 +58,9 @@ def draw_comparison(
             (errors[name], speeds | {"vmin": -top, "vmax": top}, f"{name}: error of w", _SPEED),
         )
         for panel, (field, style, title, label) in zip(row, columns, strict=True):
+            if not field.notnull().any():
+                panel.remove()
+                continue
             y, z = field["y"].values, field["z"].values
             mesh = panel.pcolormesh(
                 y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
@@ -67,13 +70,17 @@ def draw_comparison(
                 panel.plot(*core, "k+", ms=8, label=f"_{TRUE_CORE}")
             figure.colorbar(mesh, ax=panel, label=label, pad=0.02, extend="both")
         row[0].set_ylabel("z / m")
-    for panel in axes[-1]:
-        panel.set_xlabel("y / m (port is left)")
+    for column in axes.T:
+        for panel in [panel for panel in column if panel in figure.axes][-1:]:
+            panel.set_xlabel("y / m (port is left)")
     caption = (
         "Each variant's first image, the vertical wind retrieved by its first method (white: "
         "flagged vectors), and its error; winds are on one scale, errors on another, that of the "
         "middle variant. Crosses: true cores. Of several gates the first, of winds in three "
         "dimensions the layer nearest to it."
     )
+    without = [name for name, error in errors.items() if not error.notnull().any()]
+    if without:
+        caption += f" Without a valid vector, and so by its image alone: {', '.join(without)}."
     plate = ("fig00_comparison", "The variants side by side", (figure, caption))
     return save_all(folder, [plate], log)

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredText
+from matplotlib.patheffects import withStroke
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
 from lidar_mi.assessment.figures.encounter import SIDES, draw_image, draw_vortices, flight_style
@@ -25,6 +26,8 @@ SCALE_LENGTH, SCALE_SPEED = 20.0, 10.0
 
 _SIZE, _DOTS = (7.2, 8.0), 90  # even numbers of pixels, as video codecs expect
 _WINGS = ("off", "feedforward")
+_EDGE = (withStroke(linewidth=2.5, foreground="black"),)
+"""Of white words, seen on bright backscatter too."""
 
 
 class Frame(NamedTuple):
@@ -133,6 +136,7 @@ class _SlabView:
             pad=0.6,
             size_vertical=0.6,
         )
+        self._scale.txt_label.get_children()[0].set_path_effects(_EDGE)
         self._words = AnchoredText("", "upper right", frameon=True, pad=0.25, prop={"size": 10})
         self._words.patch.set(alpha=0.75, lw=0)
         for artist in (self._scale, self._words):
@@ -186,8 +190,9 @@ def _draw_vectors(axes: Axes, slab: xr.Dataset) -> None:
         width=0.0045,
         zorder=3,
     )
-    key = {"labelpos": "N", "labelcolor": "white", "coordinates": "axes"}
-    axes.quiverkey(arrows, 0.92, 0.04, SCALE_SPEED, f"{SCALE_SPEED:g} m/s", **key)
+    style = {"labelpos": "N", "labelcolor": "white", "coordinates": "axes"}
+    key = axes.quiverkey(arrows, 0.92, 0.04, SCALE_SPEED, f"{SCALE_SPEED:g} m/s", **style)
+    key.text.set_path_effects(_EDGE)
 
 
 class _Wings:

@@ -78,8 +78,8 @@ def _wind(axes: Axes, pointing: ScanPointing) -> None:
     some = slice(step // 2, None, step)
     v, w = v[some, some], w[some, some]
     # port, towards larger y, is on the left
-    arrows = axes.quiver(v["y"].values, v["z"].values, -v.values, w.values, color="w")
     if (largest := float(speed_of(v, w).max())) > 0:
+        arrows = axes.quiver(v["y"].values, v["z"].values, -v.values, w.values, color="w")
         arrow_scale(axes, arrows, largest)
 
 

@@ -41,13 +41,23 @@ def draw_all(
     """
     source = found["source"].values[-1]
     best = found.sel(source=source).isel(algorithm=-1)
-    plates = (
-        ("fig30_volume", "The observed volume", _volume_section(volumes, cores)),
-        ("fig31_wind_in_three_dimensions", "The wind in three dimensions", _cuts(best, cores)),
-        ("fig32_wind_along_x", "The wind along the flight path", _along_x(best, cores)),
-        ("fig33_volume_errors", "Errors of the winds", _errors(found.sel(source=source))),
-    )
+    across = best.isel(x=best.sizes["x"] // 2)
+    along = best.sel(z=cores[0].z if cores else 0, method="nearest")
+    plates = [("fig30_volume", "The observed volume", _volume_section(volumes, cores))]
+    # a cut without a valid vector has nothing to show
+    if _any_valid(across):
+        title = "The wind in three dimensions"
+        plates.append(("fig31_wind_in_three_dimensions", title, _across_x(across, cores)))
+    if _any_valid(along):
+        plates.append(("fig32_wind_along_x", "The wind along the flight path", _along_x(along)))
+    if _any_valid(found.sel(source=source)):
+        errors = _errors(found.sel(source=source))
+        plates.append(("fig33_volume_errors", "Errors of the winds", errors))
     return save_all(folder, plates, log)
+
+
+def _any_valid(wind: xr.Dataset) -> bool:
+    return bool((wind["flag"] == 0).any())
 
 
 def _volume_section(volumes: Sequence[xr.DataArray], cores: Sequence[Core]) -> Plate:
@@ -69,10 +79,9 @@ def _volume_section(volumes: Sequence[xr.DataArray], cores: Sequence[Core]) -> P
     )
 
 
-def _cuts(wind: xr.Dataset, cores: Sequence[Core]) -> Plate:
+def _across_x(cut: xr.Dataset, cores: Sequence[Core]) -> Plate:
     figure = Figure(figsize=(17, 10.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
-    cut = wind.isel(x=wind.sizes["x"] // 2)
     for row, name in zip(axes, _COMPONENTS, strict=True):
         _row(row, cut, name, "y", "z")
         for panel in row:
@@ -85,10 +94,9 @@ def _cuts(wind: xr.Dataset, cores: Sequence[Core]) -> Plate:
     )
 
 
-def _along_x(wind: xr.Dataset, cores: Sequence[Core]) -> Plate:
+def _along_x(cut: xr.Dataset) -> Plate:
     figure = Figure(figsize=(17, 5.4), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
-    cut = wind.sel(z=cores[0].z if cores else 0, method="nearest")
     for row, name in zip(axes, _COMPONENTS, strict=True):
         _row(row, cut, name, "y", "x", stretch=2)
     for panel in axes[:-1].ravel():

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 import lidar_mi as lm
+from lidar_mi.assessment.figures.coherent import draw_slices
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
+from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.stages.coherent_lines import (
     coherent_lines,
@@ -21,6 +23,7 @@ from lidar_mi.experiment.stages.coherent_lines import (
     ring_fraction,
 )
 from lidar_mi.experiment.stages.line_retrieval import line_vortices, line_winds
+from tests.support import figure_rules
 from tests.support.experiments import check
 
 QUIET = {"signal": {"cnr": 30, "profile": "constant"}}
@@ -219,7 +222,7 @@ def test_what_cannot_be_measured_is_refused(doppler, wake, message):
 
 
 @pytest.mark.parametrize(("exhaust", "flagged"), [("tracer", True), (None, False)])
-def test_slices_of_an_uneven_echo_are_flagged(exhaust, flagged):
+def test_slices_of_an_uneven_echo_are_flagged(exhaust, flagged, tmp_path):
     """Exhaust in the cores hides the air around them from gates of 30 m: no error bar says so."""
     wake = {"file": "wake_slab_40s.nc", "time": "40 s", "extinction": {"tracer": exhaust}}
     wake["extinction"]["aerosol"] = None
@@ -234,3 +237,7 @@ def test_slices_of_an_uneven_echo_are_flagged(exhaust, flagged):
     mask = int(masks[meanings.index("uneven_echo")])
     assert bool(int(found["flag"][0]) & mask) == flagged
     assert len(meanings) == len(masks) == len(set(masks.tolist()))
+    # flagged slices have no errors to show
+    with figure_rules.judged_figures() as figures:
+        draw_slices(tmp_path, lines, found, Log())
+    assert len(figures) == 3 - flagged and not any(figures.values()), figures

@@ -16,11 +16,13 @@ import torch
 import xarray as xr
 from scipy.stats import chi2
 
+from lidar_mi.assessment.figures.calibration import draw_calibration
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.calibration import calibrated, calibration_of
 from lidar_mi.retrieval.rings.calibration_fit import TOLERANCES, calibrate_rings
 from lidar_mi.retrieval.rings.likelihood_fit import difference, fit_rings
 from lidar_mi.retrieval.rings.model import INSTRUMENT
+from tests.support import figure_rules
 from tests.support.calibrations import (
     DEFECTS,
     NOISE,
@@ -52,6 +54,10 @@ def test_the_instrument_is_recovered(found):
     assert abs(found.chi_square - 1) < 0.05
     # lower by 5 % of the mirrors' and by line and roughness: 8.19 of the nominal instrument
     assert 7.7 < found.finesse < 7.95
+
+
+def test_the_figure(found):
+    assert figure_rules.faults(draw_calibration(found)) == []
 
 
 def test_bad_pixels_are_found(found):
