@@ -302,7 +302,7 @@ def test_texture_behind_noise_is_not_there_by_chance():
 
 # fractions of the errors within one and within 1.96 standard errors
 NORMAL = 0.683, 0.950
-# in images of little noise errors follow the shear, and stated ones, means over 1.5 windows, do not:
+# where noise is little errors follow the shear, and stated ones, means over 1.5 windows, do not:
 # advected with texture of 10 %, rms 0.54 m/s where 0.77 are stated in the half of least shear, and
 # 1.15 where 0.85 are in the tenth of most
 OF_CORES = 0.80, 0.97
