@@ -10,9 +10,10 @@ from torch.nn.functional import avg_pool3d, pad
 
 from lidar_mi.retrieval.correlation.cross_correlation import cross_correlation
 from lidar_mi.retrieval.correlation.outliers import validated
+from lidar_mi.retrieval.images.inpainting import filled_in
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.spline import Spline
-from lidar_mi.retrieval.images.windows import Windows, averaged, separable
+from lidar_mi.retrieval.images.windows import Windows, averaged, separable, working
 from lidar_mi.retrieval.symmetric import largest_eigenvalue
 
 # Voxels of shifted volumes that are correlated at once: more do not fit into a core's cache.
@@ -77,7 +78,8 @@ def first_pass(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacement (components, *grid.shape) by large windows, and where it was replaced.
 
-    Windows that the correlation flags or their neighbours contradict take the neighbours' median.
+    Windows without a vector (`whole_pixels`), or that their neighbours contradict, take the
+    neighbours' median.
     Images are also correlated by windows of half and of a quarter of the size. These count where
     the images, warped by what they find, correlate better by 0.1: in a rotation of 0.3 px per px
     the texture at the rim of a window of 32 px moves 5 px away from that in the middle.
@@ -95,7 +97,7 @@ def first_pass(
     if windows.dims > 2:
         d, centres = _of_volumes(images, spline, windows)
         return _on(grid, d, centres, continued=True)
-    coarse, *smaller = _sizes(windows)
+    coarse, *smaller = window_sizes(windows)
     d, replaced = _on(grid, *_of_images(images, coarse))
     width = windows.template / 2
     # sheared texture decorrelates in large windows: smaller ones compete with them
@@ -111,7 +113,7 @@ def first_pass(
     return d, replaced
 
 
-def _sizes(windows: Windows) -> list[Windows]:
+def window_sizes(windows: Windows) -> list[Windows]:
     """Windows of images from large to small, all of the same range but for the largest."""
     sizes = [coarse_windows(windows)]
     for template in (windows.template, windows.template // 2):
@@ -156,13 +158,24 @@ def coarse_windows(windows: Windows) -> Windows:
 def _of_images(
     images: Sequence[torch.Tensor], windows: Windows
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Displacements of windows of images, NaN where the correlation is flagged, and centres."""
-    sizes = windows.template, windows.search, windows.stride
-    found = cross_correlation(images[0], images[1], *sizes)
-    # whole pixels suffice to start from
-    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
-    d = torch.where(usable, found.d, torch.nan)
+    """Displacements of windows of images, see `whole_pixels`, and their centres."""
+    d = whole_pixels(images[0], images[1], windows)
     return d, [windows.centres(axis).to(d.device) for axis in (0, 1)]
+
+
+def whole_pixels(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Displacements (2, rows, columns) of windows of images, px, at least to whole pixels.
+
+    Pixels that are not finite have smooth values (`inpainting.inpainted`). NaN where the
+    correlation is flagged, and where more than half of a template of image 1 or of a search region
+    of image 2 is not finite.
+    """
+    one, two = (working(torch.isfinite(image)) for image in (image1, image2))
+    sizes = windows.template, windows.search, windows.stride
+    found = cross_correlation(filled_in(image1), filled_in(image2), *sizes)
+    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
+    usable &= (windows.of_templates(one) >= 0.5) & (windows.of_regions(two) >= 0.5)
+    return torch.where(usable, found.d, torch.nan)
 
 
 def _of_volumes(

@@ -3,10 +3,8 @@
 import torch
 from torch.nn.functional import grid_sample, pad
 
-from lidar_mi.retrieval.correlation.cross_correlation import cross_correlation
-from lidar_mi.retrieval.correlation.first_pass import coarse_windows
+from lidar_mi.retrieval.correlation.first_pass import whole_pixels
 from lidar_mi.retrieval.images.inpainting import nearest_in
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows, linear_weights, separable
 
 # Coarse vectors along each axis whose median is the motion around a place.
@@ -18,20 +16,18 @@ def motion_around(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacement (2, z, y) around every pixel, px, and how far (z, y) vectors there are from it.
 
-    The median of 5 x 5 coarse vectors, and that of their distances from it; where there is none 0,
-    or the nearest ones (`continued`).
+    The median of 5 x 5 vectors of such windows, and that of their distances from it; where there
+    is none 0, or the nearest ones (`continued`).
     """
-    coarse = coarse_windows(windows)
-    found = cross_correlation(image1, image2, coarse.template, coarse.search, coarse.stride)
-    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
-    d = pad(torch.where(usable, found.d, torch.nan), (_AROUND // 2,) * 4, value=torch.nan)
+    found = whole_pixels(image1, image2, windows)
+    d = pad(found, (_AROUND // 2,) * 4, value=torch.nan)
     near = d.unfold(1, _AROUND, 1).unfold(2, _AROUND, 1).flatten(3)
     d = near.nanmedian(-1).values
     scatter = (near - d[..., None]).norm(dim=0).nanmedian(-1).values
     if continued:
         d, scatter = (nearest_in(part) for part in (d, scatter))
     weights = [
-        linear_weights(coarse.centres(axis).to(d), torch.arange(n).to(d))
+        linear_weights(windows.centres(axis).to(d), torch.arange(n).to(d))
         for axis, n in enumerate(windows.shape)
     ]
     both = separable(torch.cat([d, scatter[None]]).nan_to_num(0.0), weights)

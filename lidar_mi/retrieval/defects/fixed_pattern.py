@@ -11,6 +11,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 from torch.nn.functional import pad
 
+from lidar_mi.retrieval.correlation.first_pass import coarse_windows
 from lidar_mi.retrieval.correlation.motion import motion_around, moved
 from lidar_mi.retrieval.images.windows import Windows, averaged, box_sum, working
 
@@ -123,7 +124,7 @@ def fixed_pattern(
     unknown = {}
     for _ in range(_ITERATIONS):
         now = [working(image) / _gain(gains, image) for image in images]
-        d = motion_around(now[0], now[1], windows)[0].cpu().numpy()
+        d = motion_around(now[0], now[1], coarse_windows(windows))[0].cpu().numpy()
         for axis in prior:
             others = _gain({other: p for other, p in gains.items() if other != axis}, now[0])
             values = [_relative(working(image) / others) for image in images]

@@ -1,6 +1,6 @@
 """Pixels that stand out of all around them, as no image of air does that a beam or a lens blurs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import reduce
 
 import numpy as np
@@ -185,32 +185,33 @@ def sharp(pair: torch.Tensor) -> torch.Tensor:
 
 
 def stray(
-    pair: torch.Tensor, found: torch.Tensor, rest: torch.Tensor, d: torch.Tensor
+    pair: torch.Tensor, found: torch.Tensor, rest: torch.Tensor, motions: Iterable[torch.Tensor]
 ) -> torch.Tensor:
     """Of `outstanding` pixels (images, z, y) those that air does not advect from one to another.
 
     A pixel has a match if the other image has one of at least half its height within 2 px of where
-    the motion d leads. If three times as many have one as in images that are rolled, the texture
-    itself is of such pixels (particles, wisps of smoke): then only those without a match count that
-    are higher than all with one. Else all do that are not at `rest`.
+    the motion leads. If by one of the motions (2, z, y) three times as many have one as in images
+    that are rolled, the texture itself is of such pixels (particles, wisps of smoke): then only
+    those without a match count that are higher than all with one. Else all do that are not at
+    `rest`.
     """
     found = found & ~rest
     if not bool(found.any()):
         return found
     heights = torch.stack([height(image) for image in torch.where(rest, torch.nan, pair)])
     heights = heights.nan_to_num(0.0).abs() * found
-    advected = [_advected(heights, way, 0, 0, d) for way in (0, 1)]
-    matched = torch.stack([found[k] & advected[k] for k in (0, 1)])
-    rows, columns = d.shape[1:]
-    chance = torch.stack(
-        [
-            (found[0] & _advected(heights, 0, int(i * rows / 3), int(j * columns / 3), d)).sum()
-            for i, j in THIRDS
-        ]
-    )
-    if int(matched[0].sum()) <= _BEYOND_CHANCE * float(chance.double().median()):
-        return found
-    return found & ~matched & (heights > heights[matched].max())
+    for d in motions:
+        matched = found & torch.stack([_advected(heights, way, 0, 0, d) for way in (0, 1)])
+        rows, columns = d.shape[1:]
+        chance = torch.stack(
+            [
+                (found[0] & _advected(heights, 0, int(i * rows / 3), int(j * columns / 3), d)).sum()
+                for i, j in THIRDS
+            ]
+        )
+        if int(matched[0].sum()) > _BEYOND_CHANCE * float(chance.double().median()):
+            return found & ~matched & (heights > heights[matched].max())
+    return found
 
 
 def _advected(

@@ -1,6 +1,7 @@
 """What does not move with the air: saturated areas and structure at rest in two images."""
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from scipy import ndimage
 from torch.nn.functional import pad
 
+from lidar_mi.retrieval.correlation.first_pass import window_sizes
 from lidar_mi.retrieval.correlation.motion import motion_around, moved
 from lidar_mi.retrieval.defects import impulses
 from lidar_mi.retrieval.defects.fixed_pattern import FixedPattern, fixed_pattern
@@ -217,15 +219,25 @@ def at_rest(
     hidden = outstanding | _candidates(pair, found)
     for _ in range(_ITERATIONS):
         soft = [_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True)]
-        d, _ = motion_around(soft[0], soft[1], windows, continued=True)
+        motions = _motions(soft, windows)
+        d = next(motions)
         if not bool(d.any()):  # what stands out is all that there is
             return found, torch.zeros_like(outstanding), d
-        stray = impulses.stray(pair, outstanding, found, d)
+        stray = impulses.stray(pair, outstanding, found, chain([d], motions))
         new = _still(torch.where(stray, torch.nan, pair), found, d)
         if not bool((new & ~found).any()):
             break
         found = found | new
     return found, stray & ~found, d
+
+
+def _motions(images: Sequence[torch.Tensor], windows: Windows) -> Iterator[torch.Tensor]:
+    """The motion around every pixel (2, z, y), from large windows, then from smaller ones.
+
+    As in `first_pass`: in strong shear particles do not correlate in large ones.
+    """
+    for size in window_sizes(windows):
+        yield motion_around(images[0], images[1], size, continued=True)[0]
 
 
 def _normalised(pair: torch.Tensor, but: torch.Tensor) -> torch.Tensor:

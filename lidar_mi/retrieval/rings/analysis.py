@@ -280,8 +280,7 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     )
     if pattern is None:
         raise wrong
-    excess = pattern.unexplained - 2 * noise * pattern.freedom
-    if excess > UNEXPLAINED * pattern.power:
+    if not _explains(pattern, noise):
         raise wrong
     off = np.abs((pattern.phase(places) + 0.5) % 1 - 0.5).min(0)
     if (off > max(0.5 * pattern.width, 2 * LAW)).any():
@@ -289,15 +288,24 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     return pattern, doubt
 
 
+def _explains(pattern: Pattern, noise: float) -> bool:
+    """Whether all of the profile but noise is of the pattern."""
+    return pattern.unexplained - 2 * noise * pattern.freedom <= UNEXPLAINED * pattern.power
+
+
 def _rings_alone(sectors: Sectors, spacing: float | None) -> Pattern | None:
-    """Lines of the strongest period where they explain the profile, of a longer one where not."""
+    """Lines of the strongest period where they explain the profile, of a longer one where not.
+
+    None where neither does: nothing is hidden of rings that are not there.
+    """
     profile, noise = _profile(sectors)
     if spacing is None:
         with threads_for(len(profile.r2)):
             found = lines_at(profile, strongest_period(profile), noise, most=1)
         if found is not None and found.unexplained < UNEXPLAINED * found.power:
             return found
-    return _found(sectors, spacing)[0]
+    found, _, noise = _found(sectors, spacing)
+    return found if found is not None and _explains(found, noise) else None
 
 
 def _profile(sectors: Sectors) -> tuple[Profile, float]:

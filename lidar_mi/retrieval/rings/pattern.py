@@ -163,13 +163,19 @@ class Profile:
         found = np.linalg.solve(_squares(columns), columns.T @ (self.value * self.root))
         return self.value * self.root - columns @ found, columns, found
 
-    def matched(self, pattern: Pattern, bins: int = 64) -> tuple[np.ndarray, np.ndarray]:
-        """Fractions, and the height that a further line at each of them would have."""
+    def matched(
+        self, pattern: Pattern, bins: int = 64
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fractions, height that a further line at each would have, its error for unit noise.
+
+        On a line of the pattern a further one is not determined: its height is anything.
+        """
         residual, columns, _ = self.residual(pattern)
         fraction = np.arange(bins) / bins
         shape = _sums(self.waves(pattern), fraction) * self.root
         shape = shape - np.linalg.solve(_squares(columns), columns.T @ shape.T).T @ columns.T
-        return fraction, shape @ residual / np.maximum((shape**2).sum(1), 1e-9)
+        square = np.maximum((shape**2).sum(1), 1e-9)
+        return fraction, shape @ residual / square, 1 / np.sqrt(square)
 
     def fitted(self, pattern: Pattern, free_spacing: bool = True) -> Pattern:
         """The pattern by nonlinear least squares from a start; heights may come out negative."""
@@ -346,17 +352,19 @@ def lines_at(profile: Profile, spacing: float, noise: float, most: int = LINES) 
 def _first(profile: Profile, spacing: float, loss: float) -> Pattern:
     """One line of that width where it explains most."""
     none, one = np.zeros(0), np.ones(1)
-    fraction, height = profile.matched(Pattern(spacing, none, none, loss, 0.0))
-    return Pattern(spacing, fraction[[height.argmax()]], one, loss, 0.0)
+    fraction, height, std = profile.matched(Pattern(spacing, none, none, loss, 0.0))
+    return Pattern(spacing, fraction[[(height / std).argmax()]], one, loss, 0.0)
 
 
-def _starts(pattern: Pattern, further: tuple[np.ndarray, np.ndarray], most: int) -> list[Pattern]:
-    """Further lines: at the highest of `Profile.matched`, or the highest line in two or three."""
-    fraction, height = further
+def _starts(pattern: Pattern, further: tuple[np.ndarray, ...], most: int) -> list[Pattern]:
+    """Further lines: where `Profile.matched` explains most, or the highest one in two or three."""
+    fraction, height, height_std = further
     top = int(pattern.height.argmax())
     others = np.delete(pattern.fraction, top)
     half = max(0.35 * pattern.width, 0.02)
-    added = replace(pattern, fraction=np.append(pattern.fraction, fraction[height.argmax()]))
+    added = replace(
+        pattern, fraction=np.append(pattern.fraction, fraction[(height / height_std).argmax()])
+    )
     narrow = replace(pattern, loss=max(pattern.loss / 2, 0.05), spread=pattern.spread / 4)
     three = np.array([-1, 0, 1])
     parts = [half * three[::2], 1.4 * half * three, 2.2 * half * three]
@@ -376,7 +384,9 @@ def _plausible(pattern: Pattern, profile: Profile, noise: float) -> bool:
     distance = np.diff(np.append(fraction, fraction[0] + 1))
     std = profile.height_std(pattern, noise)
     top = profile.top(pattern)
-    floor = np.abs(profile.matched(pattern)[1]).max() / top
+    _, other, other_std = profile.matched(pattern)
+    above_noise = np.abs(other) > SIGNIFICANT * math.sqrt(noise) * other_std
+    floor = np.abs(other[above_noise]).max(initial=0.0) / top
     least = np.maximum(SIGNIFICANT * std, max(FAINT, 2 * floor))
     if (pattern.height < least).any() or distance.min() < DISTINCT * pattern.width:
         return False

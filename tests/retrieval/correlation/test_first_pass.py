@@ -14,20 +14,7 @@ from tests.support.turning import displacement, turning_pair
     [
         ("particles", "variational", 16, 0.1),
         ("particles", "multipass", 16, 0.3),
-        pytest.param(
-            "particles",
-            "variational",
-            32,
-            0.1,
-            marks=[
-                pytest.mark.slow,
-                pytest.mark.xfail(
-                    strict=True,
-                    reason="particles whose motion windows of 32 px miss are masked as strays of "
-                    "one image: every window then holds one; 0.02 px without checks",
-                ),
-            ],
-        ),
+        pytest.param("particles", "variational", 32, 0.1, marks=pytest.mark.slow),
         pytest.param("texture", "variational", 32, 0.1, marks=pytest.mark.slow),
         # windows of 32 px smooth the core: 0.6 to 1.1 px where air moves by 4 to 8
         pytest.param("particles", "multipass", 32, 1.5, marks=pytest.mark.slow),
