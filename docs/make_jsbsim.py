@@ -16,7 +16,7 @@ from lidar_mi.io.jsbsim_files import shipped_aircraft
 
 PAGE = Path(__file__).parent / "guide" / "jsbsim.md"
 BEGIN, END = "<!-- aircraft: begin -->", "<!-- aircraft: end -->"
-HEAD = "| aircraft | trims at, m/s | refused: it has, or JSBSim says |\n| --- | --- | --- |"
+HEAD = "| aircraft | trims at, m/s | reason of refusal, or JSBSim's message |\n| --- | --- | --- |"
 OTHER_SPEED = re.compile(r"another speed, such as (\S+) m/s$")
 REASONS = (
     re.compile(r"is not allowed: it has (.*); expected"),

@@ -82,7 +82,8 @@ def printed(cell: nbformat.NotebookNode) -> str:
 
 
 def linked(text: str) -> str:
-    """Names of other notebooks as links to their pages."""
+    """Names of other notebooks and of pages as links."""
+    text = re.sub(r"`docs/((?:\w+/)*)(\w+)\.md`", r"[\2](../\1\2.md)", text)
     return re.sub(r"`(\w+)\.ipynb`", r"[\1](\1.md)", text)
 
 

@@ -78,7 +78,7 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     assert (tmp_path / "summary.txt").read_text().split("\n")[:-1] == flight.answer
     assert flight.answer[-1].startswith("Landing, flight control, from wind vectors: ")
     page = (tmp_path / "report.html").read_text()
-    assert "with the lidar by" in page and "meets the goal of 80 %" in page
+    assert "with the lidar by" in page and "own goal of 80 %" in page
     assert "Requirements, as measured in flight" in page
     row = 'data-head="required">at least 10 Hz</td><td data-head="in flight">10 Hz</td>'
     assert f"slabs per second</td><td {row}" in page

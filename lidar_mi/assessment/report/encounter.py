@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 
 GOAL = 0.8
-"""Fraction of what perfect preview removes that the lidar should remove."""
+"""The lidar should achieve this fraction of the reduction by perfect preview: the project's own
+goal, from no standard and not from the paper."""
 
 _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
@@ -204,8 +205,8 @@ def encounter_answer(
         if removed >= 1:
             reduces = "at least the reduction by perfect preview"
         answer += (
-            f" Compared with no control, the lidar achieves {reduces}: it {verdict} the goal of "
-            f"{percent(GOAL)}."
+            f" Compared with no control, the lidar achieves {reduces}: it {verdict} lidar-mi's own "
+            f"goal of {percent(GOAL)}."
         )
         answer += _beyond_autopilot(metrics, controller)
     best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"

@@ -38,8 +38,8 @@ def test_answer_comes_first():
         "Without control, the wake rolls the aircraft by 25 degrees; with the same autopilot, but "
         "no preview, by 7 degrees; with the lidar by 9 degrees; with perfect preview by 2 degrees.",
         "Compared with no control, the lidar achieves 70 % of the reduction by perfect preview: it "
-        "misses the goal of 80 %. Compared with the autopilot, it achieves nothing of the "
-        "reduction by perfect preview.",
+        "misses lidar-mi's own goal of 80 %. Compared with the autopilot, it achieves nothing of "
+        "the reduction by perfect preview.",
         "The flight with the lidar exceeds the 7 degrees of bank",
     ):
         assert words in answer
