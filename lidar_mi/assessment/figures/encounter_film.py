@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredText
-from matplotlib.patheffects import withStroke
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
 from lidar_mi.assessment.figures.encounter import SIDES, draw_image, draw_vortices, flight_style
@@ -26,7 +26,7 @@ SCALE_LENGTH, SCALE_SPEED = 20.0, 10.0
 
 _SIZE, _DOTS = (7.2, 8.0), 90  # even numbers of pixels, as video codecs expect
 _WINGS = ("off", "feedforward")
-_EDGE = (withStroke(linewidth=2.5, foreground="black"),)
+_EDGE: list[AbstractPathEffect] = [withStroke(linewidth=2.5, foreground="black")]
 """Of white words, seen on bright backscatter too."""
 
 

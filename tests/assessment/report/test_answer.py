@@ -266,7 +266,7 @@ def test_without_a_detector_all_noise_is_the_simulations():
     }
     experiment = rendered(64, detector=False)
     first, _ = answer(experiment, metrics | part)
-    assert "makes 40 % by variational retrieval (64 Monte Carlo samples per beam)." in first
+    assert "causes 40 % (variational retrieval) of the mean square error of v and w (64" in first
     # 64 x 0.4 / 0.6 / 0.1
     assert simulation_remark(experiment, metrics | part).endswith("; expected 430 or more")
     lost = {"backscatter.variational.valid_fraction": 0.0}
