@@ -109,7 +109,7 @@ def looked_at(kind: str, name: str, content: bytes, *, spacing: bool) -> st.Sear
     pair += ["--spacing", "0.5"] if spacing else []
     calls = [tuple(pair), ("rings", name, "-o", "r.png")] + [("info", name)] * 2
     return st.sampled_from(calls).map(
-        lambda call: Case(kind, call, {name: content}, ("w.nc", "r.png"))
+        lambda call: Case(kind, call, {name: content}, ("w.nc", "w.png", "r.png"))
     )
 
 
