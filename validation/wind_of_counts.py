@@ -37,6 +37,7 @@ _DAMPING = 0.7
 """Of a step: whole ones swing about the maximum where texture is weak."""
 _RIM = 8
 """Pixels at the edge that are not judged."""
+_INNER = (..., slice(_RIM, -_RIM), slice(_RIM, -_RIM))
 _LINEAR = 1 / 6
 """Variance, px^2, of the linear interpolation between the nodes that the beams see."""
 
@@ -73,11 +74,18 @@ class Judged(NamedTuple):
 
 def judged(found: torch.Tensor, true: torch.Tensor, covariance: torch.Tensor) -> Judged:
     """Errors within the rim; covariance (2, 2, z, y), px^2."""
-    inner = (..., slice(_RIM, -_RIM), slice(_RIM, -_RIM))
-    error = (found - true)[inner]
-    variance = covariance.diagonal(dim1=0, dim2=1).movedim(-1, 0)[inner]
-    w, v = (error.square().mean((1, 2)).sqrt() * SPACING / DT).tolist()
-    return Judged(v, w, float((error.square() / variance).mean()))
+    square = (found - true)[_INNER].square()
+    return Judged(*_rms(square), float((square / _variances(covariance)[_INNER]).mean()))
+
+
+def _rms(square: torch.Tensor) -> tuple[float, float]:
+    """rms of v and w, m/s, of squares (2, z, y) of w and v, px^2."""
+    w, v = (square.mean((1, 2)).sqrt() * SPACING / DT).tolist()
+    return v, w
+
+
+def _variances(covariance: torch.Tensor) -> torch.Tensor:
+    return covariance.diagonal(dim1=0, dim2=1).movedim(-1, 0)
 
 
 def of_case(name: str, distance: float, depth: float, noise: float, seed: int) -> list[Judged]:
@@ -99,8 +107,8 @@ def of_case(name: str, distance: float, depth: float, noise: float, seed: int) -
     # of vectors at windows' centres, which lie within the rim
     margin = (windows.shape[0] - vectors.d.shape[-2]) // 2
     covariance = torch.ones(2, 2, *windows.shape, dtype=torch.double)
-    low, high = margin, (margin + n for n in vectors.d.shape[-2:])
-    covariance[..., low : next(high), low : next(high)] = torch.as_tensor(vectors.covariance)
+    within = (slice(margin, margin + n) for n in vectors.d.shape[-2:])
+    covariance[..., *within] = torch.as_tensor(vectors.covariance)
     results = [judged(mesh.field(retrieved), true.flow, covariance)]
 
     prior = precision_of(start.prior.to(retrieved), start.settings.ridge)
@@ -135,11 +143,7 @@ def _expected(counts: Counts, mesh: Mesh, truth: torch.Tensor, prior: torch.Tens
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(information + prior))
     bias = mesh.field((inverse @ prior @ truth.reshape(-1)).reshape(truth.shape))
     noise = _of_pixels(mesh, inverse @ information @ inverse)
-    inner = (slice(_RIM, -_RIM), slice(_RIM, -_RIM))
-    w, v = (
-        float((bias[k].square() + noise[k, k])[inner].mean().sqrt()) * SPACING / DT for k in (0, 1)
-    )
-    return Judged(v, w)
+    return Judged(*_rms((bias.square() + _variances(noise))[_INNER]))
 
 
 def _of_pixels(mesh: Mesh, covariance: torch.Tensor) -> torch.Tensor:
@@ -147,17 +151,7 @@ def _of_pixels(mesh: Mesh, covariance: torch.Tensor) -> torch.Tensor:
     knots = [axis.knots for axis in mesh.axes]
     parts = covariance.reshape(2, *knots, 2, *knots)
     z, y = mesh.basis(0).to(covariance), mesh.basis(1).to(covariance)
-    return torch.stack(
-        [
-            torch.stack(
-                [
-                    torch.einsum("pi,qj,ijkl,pk,ql->pq", z, y, parts[c, :, :, d], z, y)
-                    for d in (0, 1)
-                ]
-            )
-            for c in (0, 1)
-        ]
-    )
+    return torch.einsum("pi,qj,cijdkl,pk,ql->cdpq", z, y, parts, z, y)
 
 
 def wind(effort: Effort) -> Check:
