@@ -6,6 +6,7 @@ Of programs that state no errors, `lidar_mi.standard_errors` does.
 import contextlib
 import io
 from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -28,17 +29,11 @@ def ours(method: str) -> Program:
     return find
 
 
-def openpiv(backend: str) -> Program:
-    """OpenPIV with correlations by SciPy, or by the package openpiv-rust."""
+def openpiv(first: xr.DataArray, second: xr.DataArray, dt: float, backend: str) -> xr.Dataset:
+    """Window deformation with windows of 32, 16, 16 px, validation as it comes.
 
-    def find(first: xr.DataArray, second: xr.DataArray, dt: float) -> xr.Dataset:
-        return _openpiv(first, second, dt, backend)
-
-    return find
-
-
-def _openpiv(first: xr.DataArray, second: xr.DataArray, dt: float, backend: str) -> xr.Dataset:
-    """Window deformation with windows of 32, 16, 16 px, validation as it comes."""
+    Correlations are by SciPy ("scipy"), or by the package openpiv-rust ("rust").
+    """
     from openpiv.settings import PIVSettings
     from openpiv.windef import simple_multipass
 
@@ -116,9 +111,9 @@ PROGRAMS: dict[str, Program] = {
     "lidar-mi cc": ours("cc"),
 }
 if find_spec("openpiv"):
-    PROGRAMS["OpenPIV, 16 px"] = openpiv("scipy")
+    PROGRAMS["OpenPIV, 16 px"] = partial(openpiv, backend="scipy")
     if find_spec("openpiv_rust"):
-        PROGRAMS["OpenPIV in Rust, 16 px"] = openpiv("rust")
+        PROGRAMS["OpenPIV in Rust, 16 px"] = partial(openpiv, backend="rust")
 if find_spec("ffpiv"):
     PROGRAMS["FF-PIV, 16 px"] = ffpiv
 if find_spec("cv2"):
