@@ -22,6 +22,8 @@ coverage             standard errors of winds where air changes: its section, by
 instrument           winds by an etalon with defects; only by name
 flows                winds of families of flows that judge, and of those that build: its section
                      of the page; only by name
+defects              winds of images with defects, by families of which half only judge; only by
+                     name
 several_gates        motion through the image plane, explained by gates beside; only by name
 resolution           winds from fewer, larger pixels, against their bound; only by name
 line_vortices        vortices from slices of a Doppler lidar: errors, coverage, false alarms; only
@@ -48,7 +50,15 @@ GROUPS = (
     "stored_state",
     "coverage",
 )
-OPEN = ("instrument", "flows", "resolution", "several_gates", "line_vortices", "wind_of_counts")
+OPEN = (
+    "instrument",
+    "flows",
+    "defects",
+    "resolution",
+    "several_gates",
+    "line_vortices",
+    "wind_of_counts",
+)
 """Run only by name: some of their rows fail."""
 SECTIONS = ("coverage", "flows")
 """Groups whose text is a section of the page, between marks, that short runs leave as it is."""
