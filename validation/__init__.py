@@ -49,5 +49,3 @@ OPEN = ("instrument", "flows", "resolution", "line_vortices")
 """Run only by name: some of their rows fail."""
 SECTIONS = ("coverage", "flows")
 """Groups whose text is a section of the page, between marks, that short runs leave as it is."""
-FORMER_NAMES = {"error_bars": "standard_errors"}
-"""Groups by the names of earlier versions, which the command line still accepts."""
