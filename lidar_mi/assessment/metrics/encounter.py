@@ -84,7 +84,8 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
     for quantity, least in LEAST_REMOVED.items():
         keys = [f"encounter.{mode}.{quantity}" for mode in ("autopilot", "feedforward", "perfect")]
         if all(key in found for key in keys):
-            added = float(fraction_added(*(found[key] for key in keys), least))
+            before, ours, best = (found[key] for key in keys)
+            added = float(fraction_added(before, ours, best, least))
             found[f"encounter.removed_beyond_autopilot.{quantity}"] = added
     if track is not None:
         more = _tracking(series, track) | wind_ahead_metrics(track)
