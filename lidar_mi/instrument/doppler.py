@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import AliasChoices, Field, model_validator
+from pydantic import Field, model_validator
 
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.description import Description
@@ -97,9 +97,7 @@ class DopplerLidar(Description):
         Field(2.70e-5, description="extinction coefficient")
     )
     aerosol_fraction: Annotated[Number, Within(0, 1, "definition of a fraction")] = Field(
-        0.0,
-        description="fraction of the backscattered photons that aerosol scatters",
-        validation_alias=AliasChoices("aerosol_fraction", "aerosol_share"),  # its former name
+        0.0, description="fraction of the backscattered photons that aerosol scatters"
     )
     line_shape: Literal["rayleigh", "rayleigh_brillouin"] = Field(
         "rayleigh_brillouin", description="spectral line of the molecular backscatter"

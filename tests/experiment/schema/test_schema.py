@@ -541,23 +541,3 @@ def test_a_wake_is_no_experiment(tmp_path):
 def test_a_scene_is_no_experiment(tmp_path):
     with pytest.raises(InputError, match=r"slab\.xml: .*expected lidar-mi render .*slab\.xml"):
         load(tmp_path / "slab.xml")
-
-
-def test_former_names_of_keys_are_accepted_and_not_written(tmp_path):
-    """Each as its key of today; both at once are refused."""
-    path = tmp_path / "old.yaml"
-    path.write_text(
-        "name: old\n"
-        "wake: {file: wake_slab_40s.nc, time: 40 s}\n"
-        "scattering: {phase: mixture, parts: [{phase: molecules, share: 3}]}\n"
-        "doppler: {photon_samples: 5, lidar: {aerosol_share: 0.25}}\n"
-    )
-    experiment = load(path)
-    assert experiment.scattering.parts[0].fraction == 3
-    assert experiment.doppler.path_samples == 5
-    assert experiment.doppler.lidar.aerosol_fraction == 0.25
-    written = dump(experiment)
-    assert "path_samples: 5" in written and "aerosol_fraction: 0.25" in written
-    assert not re.search("photon_samples|share", written)
-    with pytest.raises(InputError, match="photon_samples: unknown key"):
-        load(path, ["doppler.path_samples=5"])
