@@ -77,7 +77,7 @@ def retrieved(images: Sequence[np.ndarray], method: str, checks: bool = True) ->
     """The wind by a method."""
     pair = [data_array(image) for image in images]
     if pair[0].ndim > 2:
-        return retrieve_wind_volume(*pair, DT, method)
+        return retrieve_wind_volume(*pair, DT, method, checks=checks)
     sizes = WindowSizes(8, WINDOW, STRIDE)
     if method != "others":
         return retrieve_wind(*pair, DT, method, windows=sizes, checks=checks)

@@ -29,7 +29,7 @@ CLEAN = "none"
 
 def defects(effort) -> Check:
     """What is required of each family and method, and all numbers as text."""
-    families = [f for f in chosen(effort.purpose) if len(f.shape) in (2, 3)]
+    families = chosen(effort.purpose)
     seeds = SEEDS[effort.scale]
     found = measured(families, METHODS, seeds)
     text = f"Written by `python -m validation defects`, {seeds} seeds each.\n\n{markdown(found)}"
@@ -50,7 +50,7 @@ def measured(families: Sequence[Family], methods: Sequence[str], seeds: int) -> 
 def _outcome(family: str, method: str, seeds: int) -> Outcome:
     """By the family's name: defects are no data that another process could be sent."""
     one = BY_NAME[family]
-    loss = one.kind == CLEAN and len(one.shape) == 2 and method != "others"
+    loss = one.kind == CLEAN and method != "others"
     return outcome(one, method, range(1, seeds + 1), loss)
 
 

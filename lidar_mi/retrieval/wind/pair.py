@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.defects.removal import CleanImages, as_they_are, without_defects
+from lidar_mi.retrieval.defects.sampling import Sampling, no_structure, sampling
 from lidar_mi.retrieval.defects.unrelated import unrelated
 from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
@@ -27,10 +29,12 @@ from lidar_mi.retrieval.images.quality import (
 )
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.threads import threads_for
+from lidar_mi.retrieval.wind.dataset import centres
 from lidar_mi.retrieval.wind.methods import Method
 from lidar_mi.retrieval.wind.options import IMAGE_WINDOWS, VALIDATION, VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair_dataset import Vectors, pair_dataset
 from lidar_mi.retrieval.wind.pair_input import PairInput, checked_input, method_of
+from lidar_mi.retrieval.wind.samples import at_windows, samples_fit, samples_of, sizes_of_samples
 
 
 @checked_arguments
@@ -86,8 +90,9 @@ def retrieve_wind(
     settings : MultipassSettings or VariationalSettings, optional
         Of the method of that name.
     checks : bool
-        Remove or flag saturated areas, structure at rest, gains of columns and rows, a change of
-        illumination, and images of unrelated air. Without it "variational" is 15 % faster.
+        Remove or flag structure of the sampling, saturated areas, structure at rest, gains of
+        columns and rows, a change of illumination, and images of unrelated air. Without it
+        "variational" is 15 % faster.
     standard_errors : bool
         False: "cc", "ws" and "multipass" state none, and no vector is flagged because of its
         standard error; this halves their time. The other methods always state them.
@@ -107,7 +112,8 @@ def retrieve_wind(
         and "ws", half the displacement. "vortex_fit" adds the pair's numbers, see
         `VortexPairFit.quantities`. Rejected vectors keep their value, or NaN if there is none.
         Attributes name what was found in the images: `defects`, `fixed_pattern`, `illumination`,
-        `identical_images` (bit for bit, from which no motion can be known: no vector is valid).
+        `identical_images` (bit for bit, from which no motion can be known: no vector is valid),
+        `sampling` (`defects.sampling`: copied or repeated pixels, interlaced rows, no picture).
 
     Raises
     ------
@@ -132,6 +138,17 @@ def retrieve_wind(
     chosen = method_of(method)
     images = [image1, image2, *more]
     given = checked_input(images, dt, chosen, windows, noise, times, blur, device)
+    structure = sampling(given.pixels) if checks else no_structure(given.pixels)
+    options: dict[str, Any] = {
+        "validation": validation,
+        "blur": blur,
+        "settings": settings,
+        "standard_errors": standard_errors,
+        "device": device,
+    }
+    if structure.thinned and samples_fit(given.images[0], structure, windows, blur > 0):
+        return _from_samples(given, structure, windows, chosen, noise, times, options)
+    given = given._replace(pixels=structure.masked(given.pixels))
 
     def found() -> tuple[CleanImages, Vectors]:
         remove = without_defects if checks else as_they_are
@@ -140,7 +157,31 @@ def retrieve_wind(
 
     with threads_for(image1.size):
         clean, vectors = within_memory(found)
-    return pair_dataset(chosen, given, clean, vectors, validation)
+    wind = pair_dataset(chosen, given, clean, vectors, validation)
+    if structure.spoilt or structure.thinned:
+        wind["flag"] = wind["flag"] | np.int16(Flag.AT_REST)
+    return wind.assign_attrs(sampling=structure.said) if structure.said else wind
+
+
+def _from_samples(
+    given: PairInput,
+    structure: Sampling,
+    windows: WindowSizes,
+    method: Method,
+    noise: float | xr.DataArray | None,
+    times: Sequence[xr.DataArray] | None,
+    options: dict[str, Any],
+) -> xr.Dataset:
+    """The wind from the samples of images that have more pixels than samples."""
+    one, two, *more = (samples_of(image, structure) for image in given.images)
+    level = samples_of(noise, structure) if isinstance(noise, xr.DataArray) else noise
+    seen = None if times is None else [samples_of(t, structure) for t in times]
+    sizes = sizes_of_samples(windows, structure)
+    found = retrieve_wind(
+        one, two, given.dt, method, windows=sizes, noise=level, more=more, times=seen, **options
+    )
+    places = centres(given.images[0], given.windows, "template")
+    return at_windows(found, places, structure, windows)
 
 
 def _vectors(

@@ -17,7 +17,7 @@ from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.threads import SMALL, in_turn, threads_for
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
-_PER_PAIR = "identical_images", "fixed_pattern", "illumination"
+_PER_PAIR = "identical_images", "sampling", "fixed_pattern", "illumination"
 """Attributes of a wind that are remarks on its images."""
 
 

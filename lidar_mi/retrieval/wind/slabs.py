@@ -89,6 +89,6 @@ def wind_of_slab(
 
     chosen = replace(METHODS["variational"], find=find)
     wind = retrieve_wind(image1, image2, dt, chosen, checks=start is None, **options)
-    if {"fixed_pattern", "illumination"} & set(wind.attrs):
+    if {"fixed_pattern", "illumination", "sampling"} & set(wind.attrs):
         flow = None
     return wind.assign_attrs(from_start=int(near is not None)), flow

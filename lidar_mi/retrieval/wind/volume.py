@@ -16,7 +16,9 @@ from lidar_mi.retrieval.correlation.multipass import multipass
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.defects.rest import all_at_rest
+from lidar_mi.retrieval.defects.sampling import no_structure, sampling
 from lidar_mi.retrieval.defects.unrelated import unrelated
+from lidar_mi.retrieval.defects.voxels import outstanding
 from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
@@ -30,6 +32,7 @@ from lidar_mi.retrieval.wind.options import (
     VectorValidation,
     WindowSizes,
 )
+from lidar_mi.retrieval.wind.samples import at_windows, samples_fit, samples_of, sizes_of_samples
 
 AXES = ("x", "z", "y")
 
@@ -52,6 +55,7 @@ def retrieve_wind_volume(
     noise: float | xr.DataArray | None = None,
     more: Sequence[xr.DataArray] = (),
     settings: MultipassSettings | VariationalSettings | None = None,
+    checks: bool = True,
     device: str | torch.device = "cpu",
 ) -> xr.Dataset:
     """Wind in three dimensions from two volumes of the same air, dt apart.
@@ -79,6 +83,9 @@ def retrieve_wind_volume(
         Further volumes, each dt after the one before ("variational" only).
     settings : MultipassSettings or VariationalSettings, optional
         Of "correlation" or "variational". Default: those of volumes.
+    checks : bool
+        Replace voxels that stand out of their neighbours, as hard targets and dead gates do, and
+        remove or flag structure of the sampling.
     device : str or torch.device
         Where to compute.
 
@@ -90,7 +97,7 @@ def retrieve_wind_volume(
         `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
         beyond half a voxel in some direction). Those of "correlation" are from `bootstrap` where
         there are enough windows. Rejected vectors keep their value, or NaN where
-        there is none. `identical_images` as of `wind.retrieve_wind`.
+        there is none. `identical_images`, `sampling` and `defects` as of `wind.retrieve_wind`.
 
     Raises
     ------
@@ -124,10 +131,25 @@ def retrieve_wind_volume(
     raw = [on_device(volume, device) for volume in stack]
     known = on_device(level, device) if isinstance(level, xr.DataArray) else level
     steps, same = spacing(stack[0]), identical(stack, "volumes")
+    structure = sampling(raw) if checks else no_structure(raw)
+    if structure.thinned and samples_fit(stack[0], structure, windows, False):
+        one, two, *others = (samples_of(volume, structure) for volume in stack)
+        noise = samples_of(level, structure) if isinstance(level, xr.DataArray) else level
+        sizes = sizes_of_samples(windows, structure)
+        options = {"validation": validation, "settings": settings, "device": device}
+        wind = retrieve_wind_volume(
+            one, two, dt, method, windows=sizes, noise=noise, more=others, **options
+        )
+        return at_windows(wind, centres(stack[0], frame, "window"), structure, windows)
+    seen = structure.masked(raw)
+    strange = [outstanding(v) if checks else torch.zeros_like(v, dtype=torch.bool) for v in seen]
+    seen = [
+        torch.where(s, torch.nan, v) if s.any() else v for s, v in zip(strange, seen, strict=True)
+    ]
     found = within_memory(
-        lambda: _displacements(raw, known, method, frame, validation, settings, steps)
+        lambda: _displacements(seen, known, method, frame, validation, settings, steps)
     )
-    if same:
+    if same or structure.spoilt or structure.thinned:
         found = found._replace(flag=found.flag | Flag.AT_REST.value)
     variables = winds(found, AXES, steps, dt)
     long_name = "correlation of the volumes warped to mid-time"
@@ -139,8 +161,13 @@ def retrieve_wind_volume(
         "dt": dt,
         "min_correlation": validation.min_correlation,
     }
-    if same:
-        attributes["identical_images"] = same
+    number = sum(int(s.sum()) for s in strange)
+    said = {
+        "identical_images": same,
+        "sampling": structure.said,
+        "defects": f"replaced voxels: {number} in {len(strange)} volumes" if number else "",
+    }
+    attributes |= {name: value for name, value in said.items() if value}
     coords = centres(stack[0], frame, "window")
     return dataset(variables, coords, "Wind from two volumes", attributes, found)
 

@@ -1,0 +1,61 @@
+"""Winds from the samples of images that have more pixels than samples."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.retrieval.defects.sampling import Sampling
+from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.options import WindowSizes
+
+
+def samples_fit(
+    image: xr.DataArray, structure: Sampling, windows: WindowSizes, square: bool
+) -> bool:
+    """Whether the samples of an image are enough for the windows, square ones if they must be."""
+    lengths = [n // step for n, step in zip(image.shape, structure.steps, strict=True)]
+    return min(lengths) >= windows.search + 2 and not (square and len(set(structure.steps)) > 1)
+
+
+def samples_of(image: xr.DataArray, structure: Sampling) -> xr.DataArray:
+    """The first pixel of each sample that is whole, at the place of the sample."""
+    parts, coords = {}, {}
+    for name, step, first, middle in zip(
+        map(str, image.dims), structure.steps, structure.first, structure.middle, strict=True
+    ):
+        # without a middle a sample is one pixel of each kind, whole without the others
+        last = image.sizes[name] - (step - 1 if middle else 0)
+        parts[name] = slice(first, last, step)
+        axis = image[name]
+        spacing = float(axis[-1] - axis[0]) / (axis.size - 1)
+        coords[name] = axis[parts[name]].copy(data=axis.values[parts[name]] + middle * spacing)
+    return image.isel(parts).assign_coords(coords)
+
+
+def sizes_of_samples(windows: WindowSizes, structure: Sampling) -> WindowSizes:
+    """Windows of as many samples as they have pixels, as densely as they were."""
+    stride = max(1, windows.stride // max(structure.steps))
+    return WindowSizes(windows.template, windows.search, stride)
+
+
+def at_windows(
+    found: xr.Dataset, coords: Mapping[str, Any], structure: Sampling, windows: WindowSizes
+) -> xr.Dataset:
+    """A wind from samples at the places of the windows of the pixels.
+
+    It is interpolated linearly between vectors that are a sample or a stride apart. A vector has
+    the flags of the nearest one.
+    """
+    axes: Sequence[str] = [name for name in found["v"].dims if name in coords]
+    at = {name: xr.DataArray(np.asarray(coords[name][1]), dims=name) for name in axes}
+    near = found["flag"].interp(at, method="nearest", kwargs={"fill_value": "extrapolate"})
+    wind = found.drop_vars("flag").interp(at)
+    outside = ~np.isfinite(wind["v"]) & (near == 0)
+    flag = near.where(~outside, Flag.NO_MATCH.value).astype(found["flag"].dtype)
+    wind = wind.assign(flag=flag.assign_attrs(found["flag"].attrs))
+    for name in axes:
+        wind[name].attrs.update(found[name].attrs)
+    said = ", ".join(filter(None, [structure.said, found.attrs.get("sampling", "")]))
+    return wind.assign_attrs(found.attrs, stride=windows.stride, sampling=said)
