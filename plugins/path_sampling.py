@@ -438,8 +438,7 @@ class Lidar:
             # of all three strategies together (Veach & Guibas 1995, balance heuristic): none has a
             # large weight where another one would have drawn the direction
             density = PHASE_FRACTION * pdf + backward * from_telescope
-            aimed_density = rest.density(rest.excess, one_plus_cosine)
-            density += (1 - PHASE_FRACTION - backward) * aimed_density
+            density += (1 - PHASE_FRACTION - backward) * rest.density(rest.excess, wo)
             # never 0 where there may be light: the medium may be a different one there
             target = (0.95 * received[0] + 0.05 * scattered[0] * back_pdf) * volume
             target = dr.select(in_view & (density > 0), target, 0)
@@ -481,7 +480,7 @@ class Lidar:
             one_plus_cosine = rest.one_plus_cosine(wo)
             leg = rest.leg(used, one_plus_cosine)
             scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
-            density = dr.lerp(rest.density(used, one_plus_cosine), pdf, PHASE_FLIGHT_FRACTION)
+            density = dr.lerp(rest.density(used, wo), pdf, PHASE_FLIGHT_FRACTION)
             density *= rest.slope(used, one_plus_cosine, leg) * gap_density
             end = mei.p + wo * leg
             inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
