@@ -50,7 +50,13 @@ If one sample contributes half of the variance or more, the standard error is un
 of two at least, and most of the light may not have been sampled. Without ``shares``, a warning is
 given if this holds for more than 1 % of the pixels that receive light. The integrator's attributes
 ``untrusted`` and ``lit`` are the numbers of such pixels and of all pixels that receive light. Light
-that no sample has reached cannot be detected in this way.
+that no sample has reached cannot be detected in this way. An integrator warns once, at its first
+such image.
+
+Coordinates are in single precision. Its attribute ``rejected`` is the number of samples whose last
+vertex was drawn in the field of view and rounded out of it; about as much of the light of order two
+and higher is lost. There is a warning from 0.1 % on: 1 km from the origin of coordinates with a
+field of view of 0.05 mrad (half angle).
 
 The Stokes vector of the received light, like that of the emitted light, refers to the horizontal
 axis e_h of the beam, projected perpendicular to the returning light, as for an analyser fixed to
@@ -174,6 +180,8 @@ MAGNIFIED = 2.0**50
 # Fraction of the variance of S0 that comes from one sample from which on the standard error is
 # unreliable. A little less than one half: of two samples each has exactly that.
 HALF = 0.4999
+# Fraction of samples lost to rounding from which on it is said: about that of the light.
+REJECTED = 1e-3
 
 
 def define() -> type:
@@ -189,9 +197,10 @@ def define() -> type:
             self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             self.candidates = whole(props, NAME, "candidates", 1, 1)
-            # pixels of the last image that receive light, and those of them whose standard error
-            # is unreliable
-            self.lit, self.untrusted = 0, 0
+            # pixels of the last image that receive light, those of them whose standard error is
+            # unreliable, and samples that were lost to rounding
+            self.lit, self.untrusted, self.rejected = 0, 0, 0
+            self.warned = False
             # of the orders that count, for comparing order by order
             self.lowest_order = 1
             self.physical = Physical(NAME)
@@ -238,7 +247,7 @@ def define() -> type:
             done, total = 0, _moments(arrays)
             # of the finished pixels that receive light: how many there are, and how many of them
             # have an unreliable standard error
-            counts = np.array(arrays.get("counts", (0, 0)))
+            counts = np.array(arrays.get("counts", (0, 0, 0)))
             with dr.suspend_grad(), _nothing_freed():
                 passes = enumerate(self._passes(sensor, samples), 1)
                 for number, (first, count, start, now, complete) in passes:
@@ -246,7 +255,7 @@ def define() -> type:
                     # random numbers depend on beam and number alone: stored passes are skipped
                     if number <= before:
                         continue
-                    part = trace(scene, sensor, seed, first, count, start, now)
+                    part, rejected = trace(scene, sensor, seed, first, count, start, now)
                     total = part if total is None else _merge(total, part)
                     if complete:
                         cells = self._places(first * gates, count * gates)
@@ -255,8 +264,9 @@ def define() -> type:
                             dr.scatter(image, value, place)
                         dr.eval(image)
                         lit, fraction = results[0].numpy() > 0, results[-1].numpy()
-                        counts += lit.sum(), (lit & (fraction >= HALF)).sum()
+                        counts += lit.sum(), (lit & (fraction >= HALF)).sum(), 0
                         total = None
+                    counts[2] += rejected[0]
                     # kernels run asynchronously: what is reported or stored must have been computed
                     if self.progress or self.batches:
                         dr.eval(image, total)
@@ -268,11 +278,29 @@ def define() -> type:
                         self.batches.store(number, made)
                     if self.progress:
                         self.progress(done, beams * samples)
-            self.lit, self.untrusted = (int(count) for count in counts)
-            if not self.shares:
-                _warn_of_unreliable(self.lit, self.untrusted)
+            self.lit, self.untrusted, self.rejected = (int(count) for count in counts)
+            self._warn(beams * samples)
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
+
+        def _warn(self, samples: int) -> None:
+            """Of an image that is not what it should be, at an integrator's first such image."""
+            said = []
+            if self.untrusted > 0.01 * self.lit and not self.shares:
+                said.append(
+                    f"in {self.untrusted} of {self.lit} pixels that receive light one sample "
+                    "carries half of the variance or more; their standard errors are unreliable; "
+                    "expected more samples"
+                )
+            if self.rejected > REJECTED * samples:
+                said.append(
+                    f"{self.rejected} of {samples} samples left the field of view by rounding, and "
+                    "as much light of order two and higher is lost; expected the scene nearer to "
+                    "the origin, or a wider field of view"
+                )
+            if said and not self.warned:
+                self.warned = True
+                warnings.warn(f"{NAME}: {'; '.join(said)}", stacklevel=3)
 
         def render_backward(
             self,
@@ -438,7 +466,7 @@ def define() -> type:
             count: int,
             start: int,
             rounds: int,
-        ) -> Moments:
+        ) -> tuple[Moments, UInt]:
             """Means and summed products of deviations, last collisions forced into the gates."""
             gates = sensor.gate_count
             lidar, sample, cell, low, high = self._samples(
@@ -462,7 +490,7 @@ def define() -> type:
             if self.max_order > 1:
                 more = lidar.further(sample, *path, self.max_order, self.orders, by_order, cell)
                 stokes = [a + b for a, b in zip(stokes, more, strict=True)]
-            dr.eval(stokes, by_order)
+            dr.eval(stokes, by_order, lidar.rejected)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
             # deviations from the pass's own mean: a sum of squares less a square would cancel in
             # single precision
@@ -472,7 +500,8 @@ def define() -> type:
             ]
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
-            return rounds, means + self._per_order(by_order, rounds), deviations, largest
+            means += self._per_order(by_order, rounds)
+            return (rounds, means, deviations, largest), lidar.rejected
 
         def _analog(
             self,
@@ -483,7 +512,7 @@ def define() -> type:
             count: int,
             start: int,
             rounds: int,
-        ) -> Moments:
+        ) -> tuple[Moments, UInt]:
             """The same, with analog free flights."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * rounds)
@@ -517,7 +546,8 @@ def define() -> type:
             # so that squares exceed the mean's by far and hardly cancel
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
-            return rounds, means + self._per_order(by_order, rounds), deviations, largest
+            means += self._per_order(by_order, rounds)
+            return (rounds, means, deviations, largest), lidar.rejected
 
         def _products(self) -> tuple[tuple[int, int], ...]:
             """The pairs of Stokes components whose products are summed."""
@@ -630,16 +660,6 @@ def _errors(number: Float, deviations: list[Float]) -> list[Float]:
     both = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
     errors[2] = dr.select(both > 0, dr.clip(mixed / both, -1, 1), 0)
     return errors
-
-
-def _warn_of_unreliable(lit: int, unreliable: int) -> None:
-    if unreliable > 0.01 * lit:
-        warnings.warn(
-            f"{NAME}: in {unreliable} of {lit} pixels that receive light one sample carries "
-            "half of the variance or more; their standard errors are unreliable; expected more "
-            "samples",
-            stacklevel=3,
-        )
 
 
 register(KIND, NAME, define)

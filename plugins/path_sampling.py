@@ -109,6 +109,9 @@ class Lidar:
         # of the delays, half the path: so ranges of a gate shift by as much
         self.pulse_sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
         self.context = mi.PhaseFunctionContext()
+        # last vertices that were drawn in the field of view and are not in it: rounding alone
+        self.rejected = dr.zeros(mi.UInt32, 1)
+        dr.make_opaque(self.rejected)
 
     def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
         """Samples of beams by their index, with independent random numbers."""
@@ -343,10 +346,20 @@ class Lidar:
         if others:
             more, _ = self._scatter_all(medium, mei, others, closing, volume > 0)
             several += more
+        # once more by the coordinates that the connection uses
+        end = mei.p + closing * leg - sample.aperture
+        self._reject((volume > 0) & ~self.sensor.in_field_of_view(sample.axes, end))
         gains = self._connect(
             sample, rng, mei.p, closing, leg, medium, several, width * volume, volume > 0
         )
         return rest, gains, active
+
+    def _reject(self, lost: Mask) -> None:
+        """Count samples of which a sampler has left its own domain."""
+        one = mi.UInt32(1)
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, self.rejected, one, mi.UInt32(0), lost, mode=dr.ReduceMode.Local
+        )
 
     def _first_flight(
         self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
@@ -427,6 +440,7 @@ class Lidar:
             # not from the end's coordinates, which are rounded to those of the world
             to_end = rest.away * rest.distance + wo * leg
             in_view = active & self.sensor.in_field_of_view(axes, to_end)
+            self._reject(active & by_back & ~in_view)
             # both legs meet the ellipsoid at the same angle
             from_telescope = dr.square(leg / (path - leg)) / self._field_solid_angle()
             from_telescope = dr.select(in_view, from_telescope, 0)
