@@ -18,6 +18,8 @@ from .variant_types import Float, Point, Vector
 
 # of the components of the sum of two unit vectors in single precision
 ROUNDING = 1e-6
+# m, of what is divided by
+TINY = 1e-30
 
 
 class OpenPath:
@@ -51,6 +53,16 @@ class OpenPath:
     def leg(self, used: Float, one_plus_cosine: Float) -> Float:
         """Length of a flight that consumes ``used`` of the excess length."""
         return used * (0.5 * used + self.distance) / (used + self.distance * one_plus_cosine)
+
+    def from_telescope(self, direction: Vector) -> Vector:
+        """Direction from the vertex to where one from the telescope closes the path."""
+        one_plus_cosine = 0.5 * dr.squared_norm(direction - self.away)
+        consumed = self.excess + self.distance * one_plus_cosine
+        # how much farther from the telescope the path closes than the vertex lies, as one fraction:
+        # a difference of both distances would cancel
+        beyond = 0.5 * dr.square(self.excess) - dr.square(self.distance) * one_plus_cosine
+        across = self.distance * (direction - self.away)
+        return dr.normalize(direction * (beyond / consumed) + across)
 
     def slope(self, used: Float, one_plus_cosine: Float, leg: Float) -> Float:
         """Derivative of the excess length consumed with respect to the length of the flight."""
@@ -103,9 +115,12 @@ def closing_distance(offset: Vector, direction: Vector, path: Float) -> Float:
     -1 where the path is shorter than the straight line.
     """
     length = dr.norm(offset)
-    # not path^2 - length^2: a path little longer than the straight line would have no digits
-    end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
-    return dr.select(path > length, end, -1)
+    excess = path - length
+    # path + offset.direction, without the cancellation of a flight towards the goal
+    consumed = excess + 0.5 * dr.squared_norm(offset + direction * length) / dr.maximum(
+        length, TINY
+    )
+    return dr.select(excess > 0, 0.5 * excess * (path + length) / consumed, -1)
 
 
 def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[Float, Float]:

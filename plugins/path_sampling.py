@@ -261,10 +261,10 @@ class Lidar:
         # local names, as the loop records local variables only
         aperture, rng = sample.aperture, sample.rng
         total, order = _copied([0, 0, 0, 0]), mi.UInt32(2)
-        path, medium = mi.Float(path), mi.MediumPtr(medium)
+        medium = mi.MediumPtr(medium)
         position, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
         stokes = _copied(sample.stokes)
-        flight, weight = self._first_flight(rng, position, direction, aperture, path)
+        flight, excess, weight = self._first_flight(rng, position, direction, aperture, path)
         active = flight > 0
         while dr.hint(active, label="scattering orders"):
             out, medium = transmittance(
@@ -290,8 +290,9 @@ class Lidar:
             survival = dr.select(order == 2, 1, dr.minimum(ROULETTE_FACTOR * weight, 1))
             active &= (weight > 0) & (rng.next_float32(active) < survival)
             stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
-            path -= flight
-            rest, gains, active = self._close(sample, rng, medium, mei, stokes, path, width, active)
+            rest, gains, active = self._close(
+                sample, rng, medium, mei, stokes, excess, width, active
+            )
             gain = gains[0]
             total = _sum(total, gain)
             if dr.hint(split, mode="scalar"):
@@ -299,7 +300,7 @@ class Lidar:
 
             order += 1
             active &= order <= last
-            direction, stokes, flight, weight = self._next_flight(
+            direction, stokes, flight, excess, weight = self._next_flight(
                 rng, medium, mei, stokes, rest, active
             )
             active &= weight > 0
@@ -312,19 +313,21 @@ class Lidar:
         medium: MediumPtr,
         mei: Interaction,
         stokes: Stokes,
-        path: Float,
+        excess: Float,
         width: Float,
         active: Mask,
         others: Sequence[Stokes] = (),
     ) -> tuple[OpenPath, list[Stokes], Mask]:
         """The path closed by one more vertex.
 
-        Returns what remains of it at the vertex, the Stokes vectors of the light about e_h of
-        ``stokes`` and of ``others``, and where the path is still open.
+        ``excess`` is that of the remaining path, handed on from flight to flight: as the difference
+        of path and distance it would have few digits. Returns the open path at the vertex, the
+        Stokes vectors of the light about e_h of ``stokes`` and of ``others``, and where the path is
+        still open.
         """
         away = mei.p - sample.aperture
         distance = dr.norm(away)
-        away, excess = away / distance, path - distance
+        away = away / distance
         active = active & (excess > 0)
         _, reach = slabs(self.low, self.high, mei.p, -away)
         # as long as the path is open, its remainder exceeds the straight way back
@@ -347,9 +350,13 @@ class Lidar:
 
     def _first_flight(
         self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
-    ) -> tuple[Float, Float]:
-        """Length of a first flight and the inverse of its density; -1 where there is no air."""
-        reach = closing_distance(origin - aperture, direction, path)
+    ) -> tuple[Float, Float, Float]:
+        """Length of a first flight, the excess length that it leaves, the inverse of its density.
+
+        The length is -1 where there is no air.
+        """
+        offset = origin - aperture
+        reach = closing_distance(offset, direction, path)
         enters, leaves = slabs(self.low, self.high, origin, direction)
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
         # half the field of view's radius at half the path: nearer vertices send most of what they
@@ -363,7 +370,12 @@ class Lidar:
         density = dr.lerp(
             dr.rcp((gap + scale) * steps), near_density(gap, least, most, scale), NEAR_FRACTION
         )
-        return dr.select((path > 0) & (most > least), reach - gap, -1), dr.rcp(density)
+        # gap + |closure| - |closure - gap direction|, without the difference of both distances
+        closure = offset + direction * reach
+        both = path - reach + dr.norm(closure - direction * gap)
+        excess = gap * (1 + (2 * dr.dot(direction, closure) - gap) / both)
+        flight = dr.select((path > 0) & (most > least), reach - gap, -1)
+        return flight, excess, dr.rcp(density)
 
     def _half_field(self, axes: Frame, away: Vector) -> Float:
         """Tangent of half the widest angle between a direction and one of the field of view."""
@@ -407,14 +419,14 @@ class Lidar:
         # a quarter turn about the axis has the angle to it for which the first one was drawn
         tried = []
         for wo in (first, quarter_turn(axis, first)):
-            # towards the vertex that a direction from the telescope stands for, where drawn so
-            end = sample.aperture + wo * closing_distance(sample.aperture - mei.p, wo, path)
-            wo = dr.select(by_back, dr.normalize(end - mei.p), wo)
+            wo = dr.select(by_back, rest.from_telescope(wo), wo)
             one_plus_cosine = rest.one_plus_cosine(wo)
             leg = rest.leg(rest.excess, one_plus_cosine)
             volume = dr.rcp(rest.slope(rest.excess, one_plus_cosine, leg))
             end = mei.p + wo * leg
-            in_view = active & self.sensor.in_field_of_view(axes, end - sample.aperture)
+            # not from the end's coordinates, which are rounded to those of the world
+            to_end = rest.away * rest.distance + wo * leg
+            in_view = active & self.sensor.in_field_of_view(axes, to_end)
             # both legs meet the ellipsoid at the same angle
             from_telescope = dr.square(leg / (path - leg)) / self._field_solid_angle()
             from_telescope = dr.select(in_view, from_telescope, 0)
@@ -443,8 +455,11 @@ class Lidar:
         stokes: Stokes,
         rest: OpenPath,
         active: Mask,
-    ) -> tuple[Vector, Stokes, Float, Float]:
-        """Direction, Stokes vector (of unchanged S0), length and weight of a further flight."""
+    ) -> tuple[Vector, Stokes, Float, Float, Float]:
+        """A further flight: direction, Stokes vector (of unchanged S0), length, excess, weight.
+
+        The excess length is what the flight leaves.
+        """
         phase, rest = medium.phase_function(), rest.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
@@ -475,7 +490,8 @@ class Lidar:
         (wo, scattered, leg), weight = choose(rng, *tried)
         # the change of S0 goes into the weight, on which roulette is played
         factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
-        return wo, _scaled(scattered, factor), leg, dr.select(factor > 0, weight / factor, 0)
+        weight = dr.select(factor > 0, weight / factor, 0)
+        return wo, _scaled(scattered, factor), leg, 2 * gap, weight
 
     def _field_solid_angle(self) -> Float:
         cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
