@@ -12,7 +12,6 @@ from lidar_mi.experiment.schema.keys import explain
 from lidar_mi.experiment.schema.reading import load, load_variants
 from lidar_mi.experiment.shipped import experiments
 
-
 SCENES = Path(__file__).parents[2] / "scenes"
 
 
