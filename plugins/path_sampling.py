@@ -98,6 +98,25 @@ class Sample:
         self.delay, self.stokes = delay, stokes
 
 
+class Orders:
+    """Sums of S0 by scattering order, in rows of few samples: one sum of millions loses digits."""
+
+    def __init__(self, rows: int, max_order: int) -> None:
+        self.sums = dr.zeros(mi.Float, rows * max_order)
+        dr.make_opaque(self.sums)
+        self.rows, self.max_order = dr.opaque(mi.UInt32, rows), max_order
+
+    def add(self, value: Float, order: UInt, row: UInt, active: Mask = True) -> None:
+        """Add values of samples, each to its row."""
+        add(self.sums, value, (order - 1) * self.rows + row, active)
+
+    def totals(self, parts: int) -> list[Float]:
+        """Of each order, the sums of so many rows each."""
+        row = dr.arange(mi.UInt32, dr.width(self.sums) // self.max_order)
+        first = (self.rows * dr.opaque(mi.UInt32, k) for k in range(self.max_order))
+        return [dr.block_sum(dr.gather(mi.Float, self.sums, row + k), parts) for k in first]
+
+
 class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
@@ -112,7 +131,10 @@ class Lidar:
         self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
         # of the delays, half the path: so ranges of a gate shift by as much
-        self.pulse_sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
+        self.pulse_sigma = None
+        if sensor.laser.pulse_duration > 0:
+            sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
+            self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
         # last vertices that were drawn in the field of view and are not in it: rounding alone
         self.rejected = dr.zeros(mi.UInt32, 1)
@@ -128,7 +150,7 @@ class Lidar:
         origin, direction, aperture = self._ends(rng, frame, start)
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
-        if sensor.laser.pulse_duration > 0:
+        if self.pulse_sigma is not None:
             delay = self.pulse_sigma * mi.warp.square_to_std_normal(pair(rng)).x
         stokes = self._emitted(axes, direction)
         return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
@@ -147,7 +169,7 @@ class Lidar:
         if not mi.is_polarized:
             return [mi.Float(1)]
         return rotate_stokes(
-            [mi.Float(s) for s in self.sensor.laser.stokes],
+            self.sensor.laser.m_stokes,
             direction,
             transverse(axes.s, direction),
             mi.mueller.stokes_basis(direction),
@@ -191,10 +213,11 @@ class Lidar:
         origin, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
         aperture, path = mi.Point3f(sample.aperture), mi.Float(0)
         total, target, number = mi.Float(0), mi.Float(0), mi.UInt32(0)
+        pulse = None if self.pulse_sigma is None else 2 * self.pulse_sigma
         while dr.hint(number < candidates, label="candidates"):
             start, onward, end = self._ends(rng, sample.frame, sample.start)
             part = (mi.Float(number) + rng.next_float32()) / mi.Float(candidates)
-            length, weight = pulse_in_gate(part, low, high, 2 * self.pulse_sigma)
+            length, weight = pulse_in_gate(part, low, high, pulse)
             closure, volume = closed(start, onward, end, length)
             place = start + onward * closure
             active = (length > 0) & (closure > 0)
@@ -235,22 +258,19 @@ class Lidar:
         low: Float,
         high: Float,
         position: Float,
-        max_order: int,
-        split: bool,
-        by_order: Float,
-        cell: UInt,
+        max_order: UInt,
+        by_order: Orders | None,
+        row: UInt,
     ) -> Stokes:
         """The sum of all orders from the second up to ``max_order``, as `single` gives the first.
 
         ``low`` and ``high`` are twice the gate's ranges less the sample's delay, ``position`` (0
-        to 1) is the place of the sample's whole path between them. With ``split`` each order's S0
-        is also added to ``by_order``.
+        to 1) is the place of the sample's whole path between them. Each order's S0 is also added
+        to ``by_order``.
         """
         medium = mi.MediumPtr(self.sensor.get_medium())
         path = dr.lerp(low, high, position)
-        return self._further(
-            sample, medium, path, high - low, mi.UInt32(max_order), split, by_order, cell, max_order
-        )
+        return self._further(sample, medium, path, high - low, max_order, by_order, row)
 
     @dr.syntax
     def _further(
@@ -260,10 +280,8 @@ class Lidar:
         path: Float,
         width: Float,
         last: UInt,
-        split: bool,
-        by_order: Float,
-        cell: UInt,
-        max_order: int,
+        by_order: Orders | None,
+        row: UInt,
     ) -> Stokes:
         """Orders from two on: the path is closed once from every vertex but the last."""
         # local names, as the loop records local variables only
@@ -303,8 +321,7 @@ class Lidar:
             )
             gain = gains[0]
             total = _sum(total, gain)
-            if dr.hint(split, mode="scalar"):
-                add(by_order, gain[0], cell * max_order + order - 1, active)
+            _split(by_order, gain[0], order, row, active)
 
             order += 1
             active &= order <= last
@@ -634,20 +651,21 @@ class Lidar:
     def analog(
         self,
         sample: Sample,
-        max_order: int,
-        base: UInt,
-        gates: int,
+        max_order: UInt,
+        row: UInt,
+        parts: UInt,
+        gates: UInt,
         sums: Sequence[Float],
         products: Products,
         largest: UInt,
         magnified: float,
-        split: bool,
-        by_order: Float,
+        by_order: Orders | None,
     ) -> None:
         """Analog free flights; every collision is connected to the telescope.
 
         Adds contributions to ``sums``, and their products, each factor ``magnified``, to
-        ``products``; ``largest`` becomes the bits of the largest square.
+        ``products``; ``largest`` becomes the bits of the largest square. ``row`` is a sample's
+        place in them for the first gate, ``parts`` the step from gate to gate.
 
         A sample's apparent range does not decrease from one order to the next (triangle
         inequality), so its contribution to a gate is complete when a later gate is reached: only
@@ -689,13 +707,13 @@ class Lidar:
             # the distance to the last vertex is drawn, not forced: it has no weight of its own
             gains = self._receive(sample, rng, medium, mei, [stokes], counts, mi.Float(1))
             gain = gains[0]
-            now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
+            now = dr.minimum(mi.UInt32(dr.select(counts, fraction * gates, 0)), gates - 1)
+            now = dr.select(counts, now, gate)
             done = now != gate
-            _deposit(sums, products, largest, magnified, base + gate, held, done)
+            _deposit(sums, products, largest, magnified, row + gate * parts, held, done)
             held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
             gate = now
-            if dr.hint(split, mode="scalar"):
-                add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
+            _split(by_order, gain[0], order, row + gate * parts, counts)
             order += 1
             # later orders arrive from farther away still
             active &= (order <= max_order) & (range_ < high)
@@ -705,7 +723,13 @@ class Lidar:
             stokes = apply_phase_function(value, stokes, self.channel)
             direction = mi.Vector3f(onward)
             active &= (density > 0) & (stokes[0] > 0)
-            _deposit(sums, products, largest, magnified, base + gate, held, began & ~active)
+            ended = began & ~active
+            _deposit(sums, products, largest, magnified, row + gate * parts, held, ended)
+
+
+def _split(by_order: Orders | None, value: Float, order: UInt, row: UInt, active: Mask) -> None:
+    if by_order is not None:
+        by_order.add(value, order, row, active)
 
 
 def _even_or_ahead(distance: Float, most: Float, nearest: Float) -> Float:

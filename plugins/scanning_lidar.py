@@ -45,6 +45,7 @@ is at x reaches these planes at ranges that are shorter by x over that cosine. `
 are ranges from each beam's own origin, shorter by x: the gates follow the air, not the lidar.
 
 Files of tables are ``.npy``, or text with numbers separated by blanks or commas and ``#`` comments.
+They are searched beside the scene, in Mitsuba's other folders and among those of the package.
 Integrators other than :ref:`gated_volpath <integrator-gated_volpath>` use this sensor as a camera
 along the beams, without laser and gates, and a warning says so.
 
