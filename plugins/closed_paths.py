@@ -169,12 +169,21 @@ def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[
 
 def sample_ahead(most: Float, scale: Float, sample: Float) -> Float:
     """A distance from 0 to ``most``, of a density proportional to 1 / (distance + scale)."""
-    return scale * (dr.exp(dr.log(1 + most / scale) * sample) - 1)
+    x = _steps(most, scale) * sample
+    # exp(x) - 1, without cancellation
+    half = dr.tanh(0.5 * dr.minimum(x, 1))
+    return scale * dr.select(x < 1, 2 * half / (1 - half), dr.exp(x) - 1)
 
 
 def ahead_density(distance: Float, most: Float, scale: Float) -> Float:
     """Of `sample_ahead`, per metre."""
-    return dr.rcp((distance + scale) * dr.log(1 + most / scale))
+    return dr.rcp((distance + scale) * _steps(most, scale))
+
+
+def _steps(most: Float, scale: Float) -> Float:
+    """ln(1 + most / scale), without cancellation."""
+    ratio = most / scale
+    return dr.select(ratio < 1, 2 * dr.atanh(dr.minimum(ratio, 1) / (2 + ratio)), dr.log(1 + ratio))
 
 
 def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: Float) -> Float:

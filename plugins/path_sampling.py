@@ -26,7 +26,7 @@ from .closed_paths import (
 )
 from .gate_sampling import pulse_in_gate
 from .laser import channel_of
-from .media import coefficients, collision, interaction, transmittance
+from .media import coefficients, collision, interaction, narrowest_peak, transmittance
 from .mitsuba_tables import has_tables, off_the_poles
 from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
@@ -53,9 +53,9 @@ Products: TypeAlias = Mapping[tuple[int, int], Float]
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
-# Of first vertices, the fraction sampled anywhere in front of the gate, if paths go on from them;
-# of the others, the fraction sampled where isotropic scattering closes paths most often.
-EVEN_FRACTION = 0.6
+# Of first vertices, the fraction sampled anywhere in front of the gate, and of the others that
+# sampled where isotropic scattering closes paths most often.
+EVEN_FRACTION = 0.3
 NEAR_FRACTION = 0.35
 # Of intermediate flights, the fraction with directions sampled from the phase function; the others
 # mostly stay in a field of view that is wider than the telescope's by this factor.
@@ -64,9 +64,12 @@ WIDER = 2.5
 # Of intermediate flights, the fraction that ends anywhere on the way to the gate, as likely in each
 # part of it; the others end in front of where the path would close.
 EVEN_FLIGHT_FRACTION = 0.6
-# Distances in front of that place are sampled evenly in their logarithm, from this part of the
-# field of view's radius on: with a forward peak light returns into view from very near.
-NEAREST = 0.05
+# Distances in front of that place are sampled evenly in their logarithm, beyond half the radius of
+# the field of view or, if that is less, this fraction of the width of the forward peak times the
+# way back through air: light scattered back is scattered forwards again on that way.
+NEAREST = 0.03
+# Least of them, over half the field's radius.
+LEAST_NEAREST = 1e-6
 # Russian roulette: probability of survival over the weight.
 ROULETTE_FACTOR = 30.0
 
@@ -136,6 +139,7 @@ class Lidar:
             sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
             self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
+        self.peak = narrowest_peak(media_of(scene, sensor), self.wavelengths)
         # last vertices that were drawn in the field of view and are not in it: rounding alone
         self.rejected = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self.rejected)
@@ -384,18 +388,11 @@ class Lidar:
         )
 
     def _first_flight(
-        self,
-        rng: Generator,
-        origin: Point,
-        direction: Vector,
-        aperture: Point,
-        path: Float,
-        even: float = 0.5 * EVEN_FRACTION,
+        self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
     ) -> tuple[Float, Float, Float]:
         """Length of a first flight, the excess length that it leaves, the inverse of its density.
 
-        The length is -1 where there is no air. The fraction ``even`` of them ends anywhere; without
-        a value of its own, what serves two scatterings and more alike.
+        The length is -1 where there is no air.
         """
         offset = origin - aperture
         reach = closing_distance(offset, direction, path)
@@ -405,20 +402,25 @@ class Lidar:
         # scatter through the field, farther ones past it
         scale = 0.25 * path * self.sensor.m_fov_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
-        # for phase functions with a stronger forward peak than the isotropic one
-        nearest, depth = least + 2 * NEAREST * scale, most - least
+        # for phase functions with a stronger forward peak than the isotropic one, and for paths
+        # that go on
+        depth, nearest = most - least, least + self._nearest(scale, most)
         ahead = least + sample_ahead(depth, nearest, choice.y)
-        gap = dr.select(choice.x < NEAR_FRACTION * (1 - even), near, ahead)
-        gap = dr.select(choice.x > 1 - even, dr.lerp(least, most, choice.y), gap)
+        gap = dr.select(choice.x < NEAR_FRACTION * (1 - EVEN_FRACTION), near, ahead)
+        gap = dr.select(choice.x > 1 - EVEN_FRACTION, dr.lerp(least, most, choice.y), gap)
         density = dr.lerp(
             ahead_density(gap - least, depth, nearest),
             near_density(gap, least, most, scale),
             NEAR_FRACTION,
         )
-        density = dr.lerp(density, dr.rcp(depth), even)
+        density = dr.lerp(density, dr.rcp(depth), EVEN_FRACTION)
         excess = shortened(offset + direction * reach, direction, gap)
         flight = dr.select((path > 0) & (most > least), reach - gap, -1)
         return flight, excess, dr.rcp(density)
+
+    def _nearest(self, scale: Float, way: Float) -> Float:
+        """Distance from which on places in front of the one that closes a path are sampled."""
+        return dr.clip(NEAREST * self.peak * way, LEAST_NEAREST * scale, scale)
 
     def _half_field(self, axes: Frame, away: Vector) -> Float:
         """Tangent of half the widest angle between a direction and one of the field of view."""
@@ -493,7 +495,8 @@ class Lidar:
         phase, rest = medium.phase_function(), rest.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        most, nearest = 0.5 * rest.excess, NEAREST * rest.distance * self.sensor.m_fov_tan
+        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.sensor.m_fov_tan
+        nearest = self._nearest(scale, rest.reach)
         # transmittances to the gate differ little: any part of the way is about as likely
         choice, sample = pair(rng), pair(rng)
         even = choice.x < EVEN_FLIGHT_FRACTION
