@@ -26,6 +26,8 @@ Parameter                    Type    Meaning                                    
                                      the depolarisation ratio)
 ``shares``                   bool    also give the largest fraction of the variance of S0     false
                                      that is due to one sample
+``random_numbers``           string  ``independent``: every beam and gate has its own;        independent
+                                     ``common``: all have the same (``gated`` only)
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
                                      memory, does not change the result
 ============================ ======= ======================================================= =======
@@ -59,8 +61,14 @@ colour channel nearest to the wavelength of the laser.
 
 ``sample_count`` of the sensor's sampler (or ``spp``) is the number of Monte Carlo samples per beam.
 The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
-the same number, at least two. Samples are independent; the random numbers of a sample depend only
-on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
+the same number, at least two. Samples of a beam are independent; the random numbers of a sample
+depend only on the seed, its beam, its gate and its number. With ``random_numbers`` ``common`` they
+depend on the seed and the number alone: every beam and gate, and every image of the same seed, is
+sampled by the same rays of the laser, points of the telescope and places in the gate, and their
+errors are nearly the same where the air is the same. The standard error of a pixel is unchanged.
+``gateNNN.S0_mc_error``, behind the orders, is then one realisation of the Monte Carlo error of S0:
+half the difference of the means of samples of even and of odd number, which is correlated among
+pixels, gates and images as the errors themselves are. Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
 S0 to S3 of all orders are differentiable, in reverse and forward mode (``dr.backward`` and
@@ -151,6 +159,7 @@ from .passes import Batches, Progress, stored_passes
 from .path_gradients import gradients
 from .path_sampling import Lidar, Sample, add
 from .physical import Physical
+from .random_numbers import generator
 from .registration import register
 from .supported import check_air, check_supported
 from .surfaces import media_of
@@ -189,6 +198,10 @@ def define() -> type:
             self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             self.candidates = whole(props, NAME, "candidates", 1, 1)
+            numbers = ("independent", "common")
+            self.random_numbers = choice(props, NAME, "random_numbers", numbers[0], numbers)
+            if self.common and self.estimator != "gated":
+                fail(NAME, "random_numbers", "common", "independent for free flights")
             # pixels of the last image that receive light, and those of them whose standard error
             # is unreliable
             self.lit, self.untrusted = 0, 0
@@ -203,13 +216,19 @@ def define() -> type:
         def aov_names(self) -> list[str]:
             return []
 
+        @property
+        def common(self) -> bool:
+            """Whether all beams and gates have the same random numbers."""
+            return self.random_numbers == "common"
+
         def quantities(self) -> list[str]:
             """Quantities that are rendered for every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
             more = COVARIANCE if self.covariance else ()
             by_order = (f"order{order}.S0" for order in orders)
+            error = ("S0_mc_error",) if self.common else ()
             shares = ("S0_largest_share",) if self.shares else ()
-            return [*STOKES, "S0_stderr", *by_order, *more, *shares]
+            return [*STOKES, "S0_stderr", *by_order, *error, *more, *shares]
 
         def channel_names(self, sensor: Sensor) -> list[str]:
             """Names of the last axis of the rendered tensor."""
@@ -419,10 +438,13 @@ def define() -> type:
             rounds_ = dr.opaque(mi.UInt32, rounds)
             cell = lane // rounds_
             beam, gate = cell // gates, cell % gates
-            number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
+            number = lane - cell * rounds_ + dr.opaque(mi.UInt32, start)
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, self.bounds, differentiable)
-            sample = lidar.emit(seed, beam, number)
+            if self.common:
+                sample = lidar.emit(generator(seed, mi.UInt32(0), number), beam)
+            else:
+                sample = lidar.emit(generator(seed, beam, number * gates + gate), beam)
             low, high = sensor.ranges(sample.frame.n, sample.start)
             # whole paths, twice the ranges
             width = 2 * (high - low) / gates
@@ -472,7 +494,12 @@ def define() -> type:
             ]
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
-            return rounds, means + self._per_order(by_order, rounds), deviations, largest
+            means += self._per_order(by_order, rounds)
+            if self.common:
+                odd = (dr.arange(mi.UInt32, dr.width(cell)) - cell * dr.opaque(mi.UInt32, rounds)) & 1
+                halves = dr.block_sum(dr.select(odd == 0, off[0], -off[0]), rounds)
+                means.append(halves / (MAGNIFIED * _opaque(rounds)))
+            return rounds, means, deviations, largest
 
         def _analog(
             self,
@@ -491,7 +518,8 @@ def define() -> type:
             beam = lane // rounds_
             number = lane - beam * rounds_ + dr.opaque(mi.UInt32, start)
             lidar = Lidar(scene, sensor, self.bounds)
-            sample = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
+            index = beam + dr.opaque(mi.UInt32, first)
+            sample = lidar.emit(generator(seed, index, number), index)
 
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
             sums = [dr.zeros(mi.Float, count * gates) for _ in STOKES]
