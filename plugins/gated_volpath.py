@@ -26,8 +26,8 @@ Parameter                    Type    Meaning                                    
                                      the depolarisation ratio)
 ``shares``                   bool    also give the largest fraction of the variance of S0     false
                                      that is due to one sample
-``random_numbers``           string  ``independent``: every beam and gate has its own;        independent
-                                     ``common``: all have the same (``gated`` only)
+``random_numbers``           string  ``independent``, the default: every beam and gate has
+                                     its own; ``common``: all have the same (``gated`` only)
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
                                      memory, does not change the result
 ============================ ======= ======================================================= =======
@@ -535,7 +535,9 @@ def define() -> type:
                 means += [one / _opaque(rounds) for one in by_order.totals(parts)]
             if self.common:
                 # without the sample's number of the pass: of every beam the same passes are traced
-                odd = (dr.arange(mi.UInt32, dr.width(cell)) - cell * dr.opaque(mi.UInt32, rounds)) & 1
+                odd = (
+                    dr.arange(mi.UInt32, dr.width(cell)) - cell * dr.opaque(mi.UInt32, rounds)
+                ) & 1
                 halves = dr.block_sum(dr.select(odd == 0, off[0], -off[0]), rounds)
                 means.append(halves / (MAGNIFIED * _opaque(rounds)))
             return (rounds, means, deviations, largest), lidar.rejected

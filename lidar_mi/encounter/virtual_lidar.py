@@ -285,7 +285,8 @@ class VirtualLidar:
 
         The pilot is of the nominal pose, so that images do not depend on the first pose.
         """
-        experiment, settings = self.experiment, self.experiment.render
+        experiment = self.experiment
+        settings = experiment.render.for_winds()
         if settings.samples_per_beam != "auto":
             return settings
         plan = self.gates.plan()

@@ -231,8 +231,6 @@ def _renderer(
     air: LayeredAir,
     settings: RenderSettings,
 ) -> ScanRenderer:
-    # counts of all beams are summed: errors that beams share would not average out
-    settings = settings.model_copy(update={"random_numbers": "independent"})
     return ScanRenderer(
         _grid(profile, plan, air), plan, lidar, air.environment, air.phase, air.albedo, settings
     )
@@ -317,7 +315,8 @@ def _checked(
         )
     if not air.environment > 0:
         raise InputError(f"air.environment: {air.environment} is not allowed; expected above 0")
-    if settings.random_numbers == "common":
+    # counts of all beams are summed: errors that beams share would not average out
+    if settings.common:
         raise InputError(
             "render.random_numbers: common is not allowed for an inversion; expected independent"
         )

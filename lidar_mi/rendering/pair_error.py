@@ -40,13 +40,11 @@ def unshared_fraction(
     stderr : (z, y) array
         Standard error of the first image, same unit.
     rows, columns : (z, y) array
-        Where the air of the first image's pixels is in the second one, px.
+        Where the air of the first image's pixels is in the second one, px; NaN where not known.
     """
-    known = np.isfinite(second)
-    moved, there = (
-        scipy.ndimage.map_coordinates(values, [rows, columns], order=order, mode="nearest")
-        for values, order in ((np.where(known, second, 0.0), 3), (known.astype(float), 1))
-    )
+    known, at = np.isfinite(second), np.nan_to_num([rows, columns], nan=-1.0)
+    moved = scipy.ndimage.map_coordinates(np.where(known, second, 0.0), at, order=3, mode="nearest")
+    there = scipy.ndimage.map_coordinates(known.astype(float), at, order=1, mode="constant")
     off = (moved - first) ** 2 / 2
     counts = np.isfinite(off) & np.isfinite(stderr) & (there > 0.999)
     different, whole = (

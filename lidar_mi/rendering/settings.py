@@ -70,8 +70,8 @@ class RenderSettings(Description):
     random_numbers: Literal["auto", "independent", "common"] = Field(
         "auto",
         description="of beams, gates and scans: their own, or the same in all, whose errors winds "
-        "do not see; auto: common for winds from images, independent where photons are counted "
-        "(inversion) and with analog sampling",
+        "hardly see; auto: common for winds from images, independent where photons are counted "
+        "and with analog sampling",
     )
     candidates: Annotated[int, Within(1, 1024, "more cost time and hardly lower the noise")] = (
         Field(
@@ -104,11 +104,18 @@ class RenderSettings(Description):
             )
         return self
 
+    def for_winds(self) -> "RenderSettings":
+        """Settings of images that winds are retrieved from: auto is common, if sampling is gated.
+
+        Elsewhere auto is independent: errors that all beams share do not average out in counts.
+        """
+        if self.random_numbers == "auto" and self.estimator == "gated":
+            return self.model_copy(update={"random_numbers": "common"})
+        return self
+
     @property
     def common(self) -> bool:
-        """Whether all beams, gates and scans of an image velocimetry have the same numbers."""
-        if self.random_numbers == "auto":
-            return self.estimator == "gated"
+        """Whether all beams, gates and scans have the same random numbers."""
         return self.random_numbers == "common"
 
     def scan_seed(self, seed: int, scan: int) -> int:

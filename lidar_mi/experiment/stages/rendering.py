@@ -271,7 +271,7 @@ def _rendered(
         lidar,
         environment_extinction(wake),
         *air,
-        render,
+        render.for_winds(),
         seed,
         scans=wanted,
         molecules=molecules(wake.extinction.molecules, lidar.wavelength, scattering.band),
@@ -400,9 +400,7 @@ def detect_images(
     return [one.assign_attrs(monte_carlo_fraction=monte_carlo_fraction(one)) for one in found]
 
 
-def with_pair_stderr(
-    scans: Sequence[xr.Dataset], wind: xr.Dataset, dt: float
-) -> list[xr.Dataset]:
+def with_pair_stderr(scans: Sequence[xr.Dataset], wind: xr.Dataset, dt: float) -> list[xr.Dataset]:
     """Scans with ``S0_pair_stderr``, the Monte Carlo error that the other scan does not share.
 
     By `unshared_fraction`, between the nodes that the true wind moves one into the other; errors
@@ -421,22 +419,22 @@ def with_pair_stderr(
     moved = {}
     for axis, name in (("z", "w"), ("y", "v")):
         nodes, others = first[axis], second[axis].values
-        there = nodes + dt * wind[name].interp(z=first["z"], y=first["y"]).transpose("z", "y")
-        moved[axis] = ((there - others[0]) / (others[1] - others[0])).values
-    still = {axis: np.nan_to_num(index, nan=-1.0) for axis, index in moved.items()}
+        there = nodes + dt * wind[name].interp(z=first["z"], y=first["y"])
+        moved[axis] = ((there - others[0]) / (others[1] - others[0])).transpose("z", "y").values
+    errors = first["S0_mc_error"], second["S0_mc_error"], first["S0_stderr"]
     fractions = np.stack(
         [
-            unshared_fraction(*(x.values.astype(float) for x in of_gate), still["z"], still["y"])
-            for of_gate in zip(
-                first["S0_mc_error"], second["S0_mc_error"], first["S0_stderr"], strict=True
-            )
+            unshared_fraction(a, b, c, moved["z"], moved["y"])
+            for a, b, c in zip(*(one.values.astype(float) for one in errors), strict=True)
         ]
     )
     found = []
     for scan in scans:
         fraction = xr.DataArray(fractions, first["S0_stderr"].coords, ("gate", "z", "y"))
         if places:
-            at = {axis: scan[f"{axis}_reported"].clip(*first[axis].values[[0, -1]]) for axis in "zy"}
+            at = {
+                axis: scan[f"{axis}_reported"].clip(*first[axis].values[[0, -1]]) for axis in "zy"
+            }
             fraction = fraction.interp(at).drop_vars(["z", "y"], errors="ignore")
         error = scan["S0_stderr"].transpose("gate", "z", "y")
         values = (error.values * np.sqrt(fraction.values)).astype(np.float32)
