@@ -65,7 +65,10 @@ colour channel nearest to the wavelength of the laser.
 
 ``sample_count`` of the sensor's sampler (or ``spp``) is the number of Monte Carlo samples per beam.
 The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
-the same number, at least two. Samples are independent; the random numbers of a sample depend only
+the same number, at least two. Of few samples a gate the standard error is itself uncertain: for
+normal ones, the value plus and minus 1.96 of it holds the truth in 70 % of the pixels with 2
+samples, 86 % with 4, 91 % with 8, 93 % with 16, instead of 95 % (Student's t). Samples are
+independent; the random numbers of a sample depend only
 on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
@@ -155,7 +158,7 @@ from .laser import channel_of
 from .parameters import choice, fail, whole
 from .passes import Batches, Progress, stored_passes
 from .path_gradients import gradients
-from .path_sampling import Lidar, Sample, add
+from .path_sampling import Lidar, Orders, Sample, add
 from .physical import Physical
 from .registration import register
 from .supported import check_air, check_supported
@@ -180,6 +183,8 @@ MAGNIFIED = 2.0**50
 # Fraction of the variance of S0 that comes from one sample from which on the standard error is
 # unreliable. A little less than one half: of two samples each has exactly that.
 HALF = 0.4999
+# Samples that are added up one by one.
+ROW = 1024
 # Fraction of samples lost to rounding from which on it is said: about that of the light.
 REJECTED = 1e-3
 
@@ -441,20 +446,21 @@ def define() -> type:
 
             Of light emitted later there is less before the gate: the sample's delay is taken off.
             """
-            gates = sensor.gate_count
-            lane = dr.arange(mi.UInt32, count * gates * rounds)
-            # opaque, so that neither the number of samples nor the pass is compiled into the kernel
+            lane = dr.arange(mi.UInt32, count * sensor.gate_count * rounds)
+            # opaque, so that numbers of gates, samples and passes are not compiled into the kernel
+            gates = dr.opaque(mi.UInt32, sensor.gate_count)
             rounds_ = dr.opaque(mi.UInt32, rounds)
             cell = lane // rounds_
-            beam, gate = cell // gates, cell % gates
+            beam = cell // gates
+            gate = cell - beam * gates
             number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, self.bounds, differentiable)
             sample = lidar.emit(seed, beam, number)
             low, high = sensor.ranges(sample.frame.n, sample.start)
             # whole paths, twice the ranges
-            width = 2 * (high - low) / gates
-            near = 2 * (low - sample.delay) + width * gate
+            width = 2 * (high - low) / mi.Float(gates)
+            near = 2 * (low - sample.delay) + width * mi.Float(gate)
             return lidar, sample, cell, near, near + width
 
         def _gated(
@@ -468,12 +474,14 @@ def define() -> type:
             rounds: int,
         ) -> tuple[Moments, UInt]:
             """Means and summed products of deviations, last collisions forced into the gates."""
-            gates = sensor.gate_count
             lidar, sample, cell, low, high = self._samples(
                 scene, sensor, seed, first, count, start, rounds
             )
             path = low, high, sample.rng.next_float32()
-            by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
+            parts, cells = -(-rounds // ROW), count * sensor.gate_count
+            number = dr.arange(mi.UInt32, cells * rounds) - cell * dr.opaque(mi.UInt32, rounds)
+            row = cell * dr.opaque(mi.UInt32, parts) + number // ROW
+            by_order = Orders(cells * parts, self.max_order) if self.orders else None
             if self.candidates == 1 or lidar.air.sheets:
                 stokes = lidar.single(sample, dr.lerp(*path), high - low)
             else:
@@ -485,12 +493,13 @@ def define() -> type:
                     dr.opaque(mi.UInt32, self.candidates),
                 )
                 stokes = lidar.single(chosen, place, weight * (high - low))
-            if self.orders:
-                add(by_order, stokes[0], cell * self.max_order)
+            if by_order:
+                by_order.add(stokes[0], mi.UInt32(1), row)
             if self.max_order > 1:
-                more = lidar.further(sample, *path, self.max_order, self.orders, by_order, cell)
+                last = dr.opaque(mi.UInt32, self.max_order)
+                more = lidar.further(sample, *path, last, by_order, row)
                 stokes = [a + b for a, b in zip(stokes, more, strict=True)]
-            dr.eval(stokes, by_order, lidar.rejected)
+            dr.eval(stokes, lidar.rejected, by_order.sums if by_order else None)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
             # deviations from the pass's own mean: a sum of squares less a square would cancel in
             # single precision
@@ -500,7 +509,8 @@ def define() -> type:
             ]
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
-            means += self._per_order(by_order, rounds)
+            if by_order:
+                means += [one / _opaque(rounds) for one in by_order.totals(parts)]
             return (rounds, means, deviations, largest), lidar.rejected
 
         def _analog(
@@ -514,31 +524,36 @@ def define() -> type:
             rounds: int,
         ) -> tuple[Moments, UInt]:
             """The same, with analog free flights."""
-            gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * rounds)
             rounds_ = dr.opaque(mi.UInt32, rounds)
             beam = lane // rounds_
-            number = lane - beam * rounds_ + dr.opaque(mi.UInt32, start)
+            within = lane - beam * rounds_
             lidar = Lidar(scene, sensor, self.bounds)
+            number = within + dr.opaque(mi.UInt32, start)
             sample = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
-
-            by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
-            sums = [dr.zeros(mi.Float, count * gates) for _ in STOKES]
-            products = {pair: dr.zeros(mi.Float, count * gates) for pair in self._products()}
-            largest = dr.zeros(mi.UInt32, count * gates)
+            parts, gates = -(-rounds // ROW), sensor.gate_count
+            parts_, gates_ = dr.opaque(mi.UInt32, parts), dr.opaque(mi.UInt32, gates)
+            rows = count * gates * parts
+            by_order = Orders(rows, self.max_order) if self.orders else None
+            sums = [dr.zeros(mi.Float, rows) for _ in STOKES]
+            products = {pair: dr.zeros(mi.Float, rows) for pair in self._products()}
+            largest = dr.zeros(mi.UInt32, rows)
             lidar.analog(
                 sample,
-                self.max_order,
-                beam * gates,
-                gates,
+                dr.opaque(mi.UInt32, self.max_order),
+                beam * gates_ * parts_ + within // ROW,
+                parts_,
+                gates_,
                 sums,
                 products,
                 largest,
                 MAGNIFIED,
-                self.orders,
                 by_order,
             )
-            dr.eval(sums, products, largest, by_order)
+            dr.eval(sums, products, largest, by_order.sums if by_order else None)
+            sums = [dr.block_sum(one, parts) for one in sums]
+            products = {pair: dr.block_sum(one, parts) for pair, one in products.items()}
+            largest = dr.block_reduce(dr.ReduceOp.Max, largest, parts)
             number = _opaque(rounds)
             means = [s / number for s in sums]
             large = [MAGNIFIED * mean for mean in means]
@@ -546,21 +561,13 @@ def define() -> type:
             # so that squares exceed the mean's by far and hardly cancel
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
-            means += self._per_order(by_order, rounds)
+            if by_order:
+                means += [one / number for one in by_order.totals(parts)]
             return (rounds, means, deviations, largest), lidar.rejected
 
         def _products(self) -> tuple[tuple[int, int], ...]:
             """The pairs of Stokes components whose products are summed."""
             return PRODUCTS if self.covariance else PRODUCTS[:1]
-
-        def _per_order(self, by_order: Float, rounds: int) -> list[Float]:
-            if not self.orders:
-                return []
-            cells = dr.arange(mi.UInt32, dr.width(by_order) // self.max_order)
-            return [
-                dr.gather(mi.Float, by_order, cells * self.max_order + order) / _opaque(rounds)
-                for order in range(self.max_order)
-            ]
 
         def to_string(self) -> str:
             return f"GatedVolpath[max_order={self.max_order}, estimator={self.estimator}]"
