@@ -20,7 +20,8 @@ Parameter                 Type       Meaning                                    
 ``pulse_energy``          float      energy of a pulse, J                                 1
 ``pulse_duration``        float      full width at half maximum of the pulse, s;          0
                                      Gaussian in time; 0 = instantaneous
-``to_world``              transform  light leaves along local +z, e_h is local +x         identity
+``to_world``              transform  light leaves along local +z, e_h is local +x. In a   identity
+                                     lidar, the pose in the frame of each of its beams
 ========================= ========== ==================================================== =======
 
 .. code-block:: xml

@@ -29,7 +29,7 @@ from .laser import channel_of
 from .media import coefficients, collision, interaction, narrowest_peak, transmittance
 from .mitsuba_tables import has_tables, off_the_poles
 from .polarization import apply_phase_function, rotate_stokes, transverse
-from .random_numbers import generator, pair
+from .random_numbers import pair
 from .resampling import choose
 from .surfaces import Air, media_of
 from .variant_types import (
@@ -140,14 +140,16 @@ class Lidar:
             self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
         self.peak = narrowest_peak(media_of(scene, sensor), self.wavelengths)
+        # of each sample's beam, once they are emitted
+        self.field_tan = sensor.field_tangent(mi.UInt32(0))
         # last vertices that were drawn in the field of view and are not in it: rounding alone
         self.rejected = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self.rejected)
 
-    def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
-        """Samples of beams by their index, with independent random numbers."""
-        rng = generator(seed, beam, number)
+    def emit(self, rng: Generator, beam: UInt) -> Sample:
+        """Samples of beams by their index."""
         sensor = self.sensor
+        self.field_tan = sensor.field_tangent(beam)
         to_world = sensor.world_transform()
         frame = sensor.beam_frame(beam)
         start, time = sensor.beam_origin(beam), sensor.beam_time(beam)
@@ -163,8 +165,9 @@ class Lidar:
         """Origin and direction of a ray of the laser, and a point of the telescope."""
         sensor, to_world = self.sensor, self.sensor.world_transform()
         origin, direction = sensor.laser.sample_local(pair(rng), pair(rng))
-        origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(origin)))
-        direction = dr.normalize(to_world @ frame.to_world(direction))
+        pose = sensor.laser.m_pose
+        origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(pose @ origin)))
+        direction = dr.normalize(to_world @ frame.to_world(pose @ direction))
         aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
         return origin, direction, aperture
 
@@ -172,10 +175,11 @@ class Lidar:
         """The laser's Stokes vector about Mitsuba's axes of a direction."""
         if not mi.is_polarized:
             return [mi.Float(1)]
+        laser = self.sensor.laser
         return rotate_stokes(
-            self.sensor.laser.m_stokes,
+            laser.m_stokes,
             direction,
-            transverse(axes.s, direction),
+            transverse(axes.to_world(laser.m_pose @ mi.Vector3f(1, 0, 0)), direction),
             mi.mueller.stokes_basis(direction),
         )
 
@@ -225,7 +229,7 @@ class Lidar:
             closure, volume = closed(start, onward, end, length)
             place = start + onward * closure
             active = (length > 0) & (closure > 0)
-            active &= self.sensor.in_field_of_view(axes, place - end)
+            active &= self._in_view(axes, place - end)
             crossings = self.air.crossings(start, onward)
             _, _, _, medium, _ = self.air.next_surface(
                 crossings, start, onward, closure, mi.Float(dr.inf), around, active
@@ -374,7 +378,7 @@ class Lidar:
             several += more
         # once more by the coordinates that the connection uses
         end = mei.p + closing * leg - sample.aperture
-        self._reject((volume > 0) & ~self.sensor.in_field_of_view(sample.axes, end))
+        self._reject((volume > 0) & ~self._in_view(sample.axes, end))
         gains = self._connect(
             sample, rng, mei.p, closing, leg, medium, several, width * volume, volume > 0
         )
@@ -400,7 +404,7 @@ class Lidar:
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
         # half the field of view's radius at half the path: nearer vertices send most of what they
         # scatter through the field, farther ones past it
-        scale = 0.25 * path * self.sensor.m_fov_tan
+        scale = 0.25 * path * self.field_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
         # for phase functions with a stronger forward peak than the isotropic one, and for paths
         # that go on
@@ -429,8 +433,11 @@ class Lidar:
         field = self._half_fov()
         return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
+    def _in_view(self, axes: Frame, to_source: Vector) -> Mask:
+        return self.sensor.in_field_of_view(axes, to_source, self.field_tan)
+
     def _half_fov(self) -> Float:
-        return self.sensor.m_fov_tan / (1 + dr.sqrt(1 + dr.square(self.sensor.m_fov_tan)))
+        return self.field_tan / (1 + dr.sqrt(1 + dr.square(self.field_tan)))
 
     def _last_flight(
         self,
@@ -460,7 +467,7 @@ class Lidar:
             end = mei.p + wo * leg
             # not from the end's coordinates, which are rounded to those of the world
             to_end = rest.away * rest.distance + wo * leg
-            in_view = active & self.sensor.in_field_of_view(axes, to_end)
+            in_view = active & self._in_view(axes, to_end)
             if wo is inward:
                 self._reject(active & ~in_view)
             # both legs meet the ellipsoid at the same angle
@@ -495,7 +502,7 @@ class Lidar:
         phase, rest = medium.phase_function(), rest.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.sensor.m_fov_tan
+        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.field_tan
         nearest = self._nearest(scale, rest.reach)
         # transmittances to the gate differ little: any part of the way is about as likely
         choice, sample = pair(rng), pair(rng)
@@ -536,8 +543,8 @@ class Lidar:
         return wo, _scaled(scattered, factor), leg, excess, weight
 
     def _field_solid_angle(self) -> Float:
-        cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
-        return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
+        cosine = dr.rsqrt(1 + dr.square(self.field_tan))
+        return dr.two_pi * dr.square(self.field_tan * cosine) / (1 + cosine)
 
     def _in_field(self, axes: Frame, rng: Generator) -> Vector:
         """A direction of the field of view, uniform in solid angle."""
@@ -565,7 +572,7 @@ class Lidar:
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
         """
         vertex = position + direction * distance
-        active = active & self.sensor.in_field_of_view(sample.axes, vertex - sample.aperture)
+        active = active & self._in_view(sample.axes, vertex - sample.aperture)
         out, medium = transmittance(
             self.air,
             self.bounds,
@@ -599,7 +606,7 @@ class Lidar:
         back = sample.aperture - mei.p
         distance = dr.norm(back)
         wo = back / distance
-        active = active & self.sensor.in_field_of_view(sample.axes, -back)
+        active = active & self._in_view(sample.axes, -back)
         out, _ = transmittance(
             self.air,
             self.bounds,

@@ -350,7 +350,7 @@ def test_directions_of_the_field_of_view(world, fov):
     x, y, z = np.array(local, float)
     below = (x**2 + y**2) / (1 + z)
     assert kstest(below, lambda b: b / (1 - math.cos(fov * 1e-3))).pvalue > 1e-3
-    inside = np.array(sensor.in_field_of_view(axes, axes.to_world(local)))
+    inside = np.array(sensor.in_field_of_view(axes, axes.to_world(local), sensor.m_fov_tan))
     assert (~inside).mean() < 1e-4
     disc = np.array(sensor.sample_aperture(axes, pairs(7)), float)
     r2 = (disc**2).sum(0) / np.array(sensor.aperture_area())[0] * math.pi
