@@ -23,6 +23,7 @@ _ENCOUNTER = {
     "largest_roll": "rad",
     "largest_roll_rate": "rad/s",
     "largest_lift": "N",
+    "preview_from": "s",
     "lead_time": "s",
     "look_ahead": "s",
     "core_error": "m",

@@ -29,13 +29,11 @@ from lidar_mi.retrieval.images.quality import (
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.wind.methods import Method
-from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.options import IMAGE_WINDOWS, VALIDATION, VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair_dataset import Vectors, pair_dataset
 from lidar_mi.retrieval.wind.pair_input import PairInput, checked_input, method_of
 
 
-@with_old_keywords
 @checked_arguments
 def retrieve_wind(
     image1: xr.DataArray,
