@@ -26,6 +26,8 @@ Parameter                    Type    Meaning                                    
                                      the depolarisation ratio)
 ``shares``                   bool    also give the largest fraction of the variance of S0     false
                                      that is due to one sample
+``random_numbers``           string  ``independent``, the default: every beam and gate has
+                                     its own; ``common``: all have the same (``gated`` only)
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
                                      memory, does not change the result
 ============================ ======= ======================================================= =======
@@ -67,9 +69,15 @@ colour channel nearest to the wavelength of the laser.
 The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
 the same number, at least two. Of few samples a gate the standard error is itself uncertain: for
 normal ones, the value plus and minus 1.96 of it holds the truth in 70 % of the pixels with 2
-samples, 86 % with 4, 91 % with 8, 93 % with 16, instead of 95 % (Student's t). Samples are
-independent; the random numbers of a sample depend only
-on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
+samples, 86 % with 4, 91 % with 8, 93 % with 16, instead of 95 % (Student's t). Samples of a beam
+are independent; the random numbers of a sample depend only on the seed, its beam, its gate and its
+number. With ``random_numbers`` ``common`` they depend on the seed and the number alone: every beam
+and gate, and every image of the same seed, is sampled by the same rays of the laser, points of the
+telescope and places in the gate, and their errors are nearly the same where the air is the same.
+The standard error of a pixel is unchanged. ``gateNNN.S0_mc_error``, behind the orders, is then one
+realisation of the Monte Carlo error of S0: half the difference of the means of samples of even and
+of odd number, which is correlated among pixels, gates and images as the errors themselves are.
+Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
 S0 to S3 of all orders are differentiable, in reverse and forward mode (``dr.backward`` and
@@ -169,6 +177,7 @@ from .passes import Batches, Progress, stored_passes
 from .path_gradients import gradients
 from .path_sampling import Lidar, Orders, Sample, add
 from .physical import Physical
+from .random_numbers import generator
 from .registration import register
 from .supported import check_air, check_supported
 from .surfaces import media_of
@@ -211,6 +220,10 @@ def define() -> type:
             self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             self.candidates = whole(props, NAME, "candidates", 1, 1)
+            numbers = ("independent", "common")
+            self.random_numbers = choice(props, NAME, "random_numbers", numbers[0], numbers)
+            if self.common and self.estimator != "gated":
+                fail(NAME, "random_numbers", "common", "independent for free flights")
             # pixels of the last image that receive light, those of them whose standard error is
             # unreliable, and samples that were lost to rounding
             self.lit, self.untrusted, self.rejected = 0, 0, 0
@@ -226,13 +239,19 @@ def define() -> type:
         def aov_names(self) -> list[str]:
             return []
 
+        @property
+        def common(self) -> bool:
+            """Whether all beams and gates have the same random numbers."""
+            return self.random_numbers == "common"
+
         def quantities(self) -> list[str]:
             """Quantities that are rendered for every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
             more = COVARIANCE if self.covariance else ()
             by_order = (f"order{order}.S0" for order in orders)
+            error = ("S0_mc_error",) if self.common else ()
             shares = ("S0_largest_share",) if self.shares else ()
-            return [*STOKES, "S0_stderr", *by_order, *more, *shares]
+            return [*STOKES, "S0_stderr", *by_order, *error, *more, *shares]
 
         def channel_names(self, sensor: Sensor) -> list[str]:
             """Names of the last axis of the rendered tensor."""
@@ -462,10 +481,13 @@ def define() -> type:
             cell = lane // rounds_
             beam = cell // gates
             gate = cell - beam * gates
-            number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
+            number = lane - cell * rounds_ + dr.opaque(mi.UInt32, start)
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, self.bounds, differentiable)
-            sample = lidar.emit(seed, beam, number)
+            if self.common:
+                sample = lidar.emit(generator(seed, mi.UInt32(0), number), beam)
+            else:
+                sample = lidar.emit(generator(seed, beam, number * gates + gate), beam)
             low, high = sensor.ranges(sample.frame.n, sample.start)
             # whole paths, twice the ranges
             width = 2 * (high - low) / mi.Float(gates)
@@ -524,6 +546,13 @@ def define() -> type:
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
             if by_order:
                 means += [one / _opaque(rounds) for one in by_order.totals(parts)]
+            if self.common:
+                # without the sample's number of the pass: of every beam the same passes are traced
+                odd = (
+                    dr.arange(mi.UInt32, dr.width(cell)) - cell * dr.opaque(mi.UInt32, rounds)
+                ) & 1
+                halves = dr.block_sum(dr.select(odd == 0, off[0], -off[0]), rounds)
+                means.append(halves / (MAGNIFIED * _opaque(rounds)))
             return (rounds, means, deviations, largest), lidar.rejected
 
         def _analog(
@@ -543,7 +572,8 @@ def define() -> type:
             within = lane - beam * rounds_
             lidar = Lidar(scene, sensor, self.bounds)
             number = within + dr.opaque(mi.UInt32, start)
-            sample = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
+            index = beam + dr.opaque(mi.UInt32, first)
+            sample = lidar.emit(generator(seed, index, number), index)
             parts, gates = -(-rounds // ROW), sensor.gate_count
             parts_, gates_ = dr.opaque(mi.UInt32, parts), dr.opaque(mi.UInt32, gates)
             rows = count * gates * parts

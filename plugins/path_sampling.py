@@ -26,7 +26,7 @@ from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
 from .mitsuba_tables import has_tables, off_the_poles
 from .polarization import apply_phase_function, rotate_stokes, transverse
-from .random_numbers import generator, pair
+from .random_numbers import pair
 from .resampling import choose
 from .surfaces import Air, media_of
 from .variant_types import (
@@ -139,9 +139,8 @@ class Lidar:
         self.rejected = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self.rejected)
 
-    def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
-        """Samples of beams by their index, with independent random numbers."""
-        rng = generator(seed, beam, number)
+    def emit(self, rng: Generator, beam: UInt) -> Sample:
+        """Samples of beams by their index."""
         sensor = self.sensor
         self.field_tan = sensor.field_tangent(beam)
         to_world = sensor.world_transform()
