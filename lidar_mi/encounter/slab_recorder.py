@@ -38,10 +38,12 @@ class SlabRecorder:
             vectors = estimate.wind
             every = max(1, round(vectors.sizes["y"] / _VECTORS))
             some = slice(every // 2, None, every)
-            vectors = vectors[["v", "w", "flag"]].isel(y=some, z=some).transpose("z", "y")
+            vectors = vectors[["v", "w", "flag"]].reset_coords(drop=True)
+            vectors = vectors.isel(y=some, z=some).transpose("z", "y")
             valid = vectors["flag"] == 0
             found |= {name: vectors[name].where(valid).astype(np.float32) for name in ("v", "w")}
-        about = {"time": estimate.time, "x": estimate.x, "delivered": estimate.delivered}
+        late = estimate.delivered if estimate.wind_delivered is None else estimate.wind_delivered
+        about = {"time": estimate.time, "x": estimate.x, "delivered": late}
         self._slabs.append(xr.Dataset(found).assign(about))
 
     def dataset(self) -> xr.Dataset | None:
@@ -51,10 +53,15 @@ class SlabRecorder:
         """
         if not self._slabs:
             return None
-        first = self._slabs[0]
-        grid = {name: first[name] for name in first.dims}
-        found = xr.concat([one.interp(grid) for one in self._slabs], "slab")
-        # interpolation gives double precision, which no figure needs
-        return found.assign(
-            {name: found[name].astype(np.float32) for name in first if first[name].ndim}
+        grid = {}
+        for one in self._slabs[::-1]:
+            grid |= {name: one[name] for name in one.dims}
+        # a slab whose wind the computer skipped has images alone
+        found = xr.concat(
+            [one.interp({n: grid[n] for n in one.dims}) for one in self._slabs],
+            "slab",
+            data_vars="all",
+            join="outer",
         )
+        # interpolation gives double precision, which no figure needs
+        return found.assign({n: a.astype(np.float32) for n, a in found.items() if a.ndim > 1})
