@@ -50,7 +50,13 @@ If one sample contributes half of the variance or more, the standard error is un
 of two at least, and most of the light may not have been sampled. Without ``shares``, a warning is
 given if this holds for more than 1 % of the pixels that receive light. The integrator's attributes
 ``untrusted`` and ``lit`` are the numbers of such pixels and of all pixels that receive light. Light
-that no sample has reached cannot be detected in this way.
+that no sample has reached cannot be detected in this way. An integrator warns once, at its first
+such image.
+
+Coordinates are in single precision. Its attribute ``rejected`` is the number of samples whose last
+vertex was drawn in the field of view and rounded out of it; about as much of the light of order two
+and higher is lost. There is a warning from 0.1 % on: 1 km from the origin of coordinates with a
+field of view of 0.05 mrad (half angle).
 
 The Stokes vector of the received light, like that of the emitted light, refers to the horizontal
 axis e_h of the beam, projected perpendicular to the returning light, as for an analyser fixed to
@@ -59,7 +65,10 @@ colour channel nearest to the wavelength of the laser.
 
 ``sample_count`` of the sensor's sampler (or ``spp``) is the number of Monte Carlo samples per beam.
 The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
-the same number, at least two. Samples are independent; the random numbers of a sample depend only
+the same number, at least two. Of few samples a gate the standard error is itself uncertain: for
+normal ones, the value plus and minus 1.96 of it holds the truth in 70 % of the pixels with 2
+samples, 86 % with 4, 91 % with 8, 93 % with 16, instead of 95 % (Student's t). Samples are
+independent; the random numbers of a sample depend only
 on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
@@ -149,7 +158,7 @@ from .laser import channel_of
 from .parameters import choice, fail, whole
 from .passes import Batches, Progress, stored_passes
 from .path_gradients import gradients
-from .path_sampling import Lidar, Sample, add
+from .path_sampling import Lidar, Orders, Sample, add
 from .physical import Physical
 from .registration import register
 from .supported import check_air, check_supported
@@ -174,6 +183,10 @@ MAGNIFIED = 2.0**50
 # Fraction of the variance of S0 that comes from one sample from which on the standard error is
 # unreliable. A little less than one half: of two samples each has exactly that.
 HALF = 0.4999
+# Samples that are added up one by one.
+ROW = 1024
+# Fraction of samples lost to rounding from which on it is said: about that of the light.
+REJECTED = 1e-3
 
 
 def define() -> type:
@@ -189,9 +202,10 @@ def define() -> type:
             self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             self.candidates = whole(props, NAME, "candidates", 1, 1)
-            # pixels of the last image that receive light, and those of them whose standard error
-            # is unreliable
-            self.lit, self.untrusted = 0, 0
+            # pixels of the last image that receive light, those of them whose standard error is
+            # unreliable, and samples that were lost to rounding
+            self.lit, self.untrusted, self.rejected = 0, 0, 0
+            self.warned = False
             # of the orders that count, for comparing order by order
             self.lowest_order = 1
             self.physical = Physical(NAME)
@@ -238,7 +252,7 @@ def define() -> type:
             done, total = 0, _moments(arrays)
             # of the finished pixels that receive light: how many there are, and how many of them
             # have an unreliable standard error
-            counts = np.array(arrays.get("counts", (0, 0)))
+            counts = np.array(arrays.get("counts", (0, 0, 0)))
             with dr.suspend_grad(), _nothing_freed():
                 passes = enumerate(self._passes(sensor, samples), 1)
                 for number, (first, count, start, now, complete) in passes:
@@ -246,7 +260,7 @@ def define() -> type:
                     # random numbers depend on beam and number alone: stored passes are skipped
                     if number <= before:
                         continue
-                    part = trace(scene, sensor, seed, first, count, start, now)
+                    part, rejected = trace(scene, sensor, seed, first, count, start, now)
                     total = part if total is None else _merge(total, part)
                     if complete:
                         cells = self._places(first * gates, count * gates)
@@ -255,8 +269,9 @@ def define() -> type:
                             dr.scatter(image, value, place)
                         dr.eval(image)
                         lit, fraction = results[0].numpy() > 0, results[-1].numpy()
-                        counts += lit.sum(), (lit & (fraction >= HALF)).sum()
+                        counts += lit.sum(), (lit & (fraction >= HALF)).sum(), 0
                         total = None
+                    counts[2] += rejected[0]
                     # kernels run asynchronously: what is reported or stored must have been computed
                     if self.progress or self.batches:
                         dr.eval(image, total)
@@ -268,11 +283,29 @@ def define() -> type:
                         self.batches.store(number, made)
                     if self.progress:
                         self.progress(done, beams * samples)
-            self.lit, self.untrusted = (int(count) for count in counts)
-            if not self.shares:
-                _warn_of_unreliable(self.lit, self.untrusted)
+            self.lit, self.untrusted, self.rejected = (int(count) for count in counts)
+            self._warn(beams * samples)
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
+
+        def _warn(self, samples: int) -> None:
+            """Of an image that is not what it should be, at an integrator's first such image."""
+            said = []
+            if self.untrusted > 0.01 * self.lit and not self.shares:
+                said.append(
+                    f"in {self.untrusted} of {self.lit} pixels that receive light one sample "
+                    "carries half of the variance or more; their standard errors are unreliable; "
+                    "expected more samples"
+                )
+            if self.rejected > REJECTED * samples:
+                said.append(
+                    f"{self.rejected} of {samples} samples left the field of view by rounding, and "
+                    "as much light of order two and higher is lost; expected the scene nearer to "
+                    "the origin, or a wider field of view"
+                )
+            if said and not self.warned:
+                self.warned = True
+                warnings.warn(f"{NAME}: {'; '.join(said)}", stacklevel=3)
 
         def render_backward(
             self,
@@ -413,20 +446,21 @@ def define() -> type:
 
             Of light emitted later there is less before the gate: the sample's delay is taken off.
             """
-            gates = sensor.gate_count
-            lane = dr.arange(mi.UInt32, count * gates * rounds)
-            # opaque, so that neither the number of samples nor the pass is compiled into the kernel
+            lane = dr.arange(mi.UInt32, count * sensor.gate_count * rounds)
+            # opaque, so that numbers of gates, samples and passes are not compiled into the kernel
+            gates = dr.opaque(mi.UInt32, sensor.gate_count)
             rounds_ = dr.opaque(mi.UInt32, rounds)
             cell = lane // rounds_
-            beam, gate = cell // gates, cell % gates
+            beam = cell // gates
+            gate = cell - beam * gates
             number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, self.bounds, differentiable)
             sample = lidar.emit(seed, beam, number)
             low, high = sensor.ranges(sample.frame.n, sample.start)
             # whole paths, twice the ranges
-            width = 2 * (high - low) / gates
-            near = 2 * (low - sample.delay) + width * gate
+            width = 2 * (high - low) / mi.Float(gates)
+            near = 2 * (low - sample.delay) + width * mi.Float(gate)
             return lidar, sample, cell, near, near + width
 
         def _gated(
@@ -438,14 +472,16 @@ def define() -> type:
             count: int,
             start: int,
             rounds: int,
-        ) -> Moments:
+        ) -> tuple[Moments, UInt]:
             """Means and summed products of deviations, last collisions forced into the gates."""
-            gates = sensor.gate_count
             lidar, sample, cell, low, high = self._samples(
                 scene, sensor, seed, first, count, start, rounds
             )
             path = low, high, sample.rng.next_float32()
-            by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
+            parts, cells = -(-rounds // ROW), count * sensor.gate_count
+            number = dr.arange(mi.UInt32, cells * rounds) - cell * dr.opaque(mi.UInt32, rounds)
+            row = cell * dr.opaque(mi.UInt32, parts) + number // ROW
+            by_order = Orders(cells * parts, self.max_order) if self.orders else None
             if self.candidates == 1 or lidar.air.sheets:
                 stokes = lidar.single(sample, dr.lerp(*path), high - low)
             else:
@@ -457,12 +493,13 @@ def define() -> type:
                     dr.opaque(mi.UInt32, self.candidates),
                 )
                 stokes = lidar.single(chosen, place, weight * (high - low))
-            if self.orders:
-                add(by_order, stokes[0], cell * self.max_order)
+            if by_order:
+                by_order.add(stokes[0], mi.UInt32(1), row)
             if self.max_order > 1:
-                more = lidar.further(sample, *path, self.max_order, self.orders, by_order, cell)
+                last = dr.opaque(mi.UInt32, self.max_order)
+                more = lidar.further(sample, *path, last, by_order, row)
                 stokes = [a + b for a, b in zip(stokes, more, strict=True)]
-            dr.eval(stokes, by_order)
+            dr.eval(stokes, lidar.rejected, by_order.sums if by_order else None)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
             # deviations from the pass's own mean: a sum of squares less a square would cancel in
             # single precision
@@ -472,7 +509,9 @@ def define() -> type:
             ]
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
-            return rounds, means + self._per_order(by_order, rounds), deviations, largest
+            if by_order:
+                means += [one / _opaque(rounds) for one in by_order.totals(parts)]
+            return (rounds, means, deviations, largest), lidar.rejected
 
         def _analog(
             self,
@@ -483,33 +522,38 @@ def define() -> type:
             count: int,
             start: int,
             rounds: int,
-        ) -> Moments:
+        ) -> tuple[Moments, UInt]:
             """The same, with analog free flights."""
-            gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * rounds)
             rounds_ = dr.opaque(mi.UInt32, rounds)
             beam = lane // rounds_
-            number = lane - beam * rounds_ + dr.opaque(mi.UInt32, start)
+            within = lane - beam * rounds_
             lidar = Lidar(scene, sensor, self.bounds)
+            number = within + dr.opaque(mi.UInt32, start)
             sample = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
-
-            by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
-            sums = [dr.zeros(mi.Float, count * gates) for _ in STOKES]
-            products = {pair: dr.zeros(mi.Float, count * gates) for pair in self._products()}
-            largest = dr.zeros(mi.UInt32, count * gates)
+            parts, gates = -(-rounds // ROW), sensor.gate_count
+            parts_, gates_ = dr.opaque(mi.UInt32, parts), dr.opaque(mi.UInt32, gates)
+            rows = count * gates * parts
+            by_order = Orders(rows, self.max_order) if self.orders else None
+            sums = [dr.zeros(mi.Float, rows) for _ in STOKES]
+            products = {pair: dr.zeros(mi.Float, rows) for pair in self._products()}
+            largest = dr.zeros(mi.UInt32, rows)
             lidar.analog(
                 sample,
-                self.max_order,
-                beam * gates,
-                gates,
+                dr.opaque(mi.UInt32, self.max_order),
+                beam * gates_ * parts_ + within // ROW,
+                parts_,
+                gates_,
                 sums,
                 products,
                 largest,
                 MAGNIFIED,
-                self.orders,
                 by_order,
             )
-            dr.eval(sums, products, largest, by_order)
+            dr.eval(sums, products, largest, by_order.sums if by_order else None)
+            sums = [dr.block_sum(one, parts) for one in sums]
+            products = {pair: dr.block_sum(one, parts) for pair, one in products.items()}
+            largest = dr.block_reduce(dr.ReduceOp.Max, largest, parts)
             number = _opaque(rounds)
             means = [s / number for s in sums]
             large = [MAGNIFIED * mean for mean in means]
@@ -517,20 +561,13 @@ def define() -> type:
             # so that squares exceed the mean's by far and hardly cancel
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
-            return rounds, means + self._per_order(by_order, rounds), deviations, largest
+            if by_order:
+                means += [one / number for one in by_order.totals(parts)]
+            return (rounds, means, deviations, largest), lidar.rejected
 
         def _products(self) -> tuple[tuple[int, int], ...]:
             """The pairs of Stokes components whose products are summed."""
             return PRODUCTS if self.covariance else PRODUCTS[:1]
-
-        def _per_order(self, by_order: Float, rounds: int) -> list[Float]:
-            if not self.orders:
-                return []
-            cells = dr.arange(mi.UInt32, dr.width(by_order) // self.max_order)
-            return [
-                dr.gather(mi.Float, by_order, cells * self.max_order + order) / _opaque(rounds)
-                for order in range(self.max_order)
-            ]
 
         def to_string(self) -> str:
             return f"GatedVolpath[max_order={self.max_order}, estimator={self.estimator}]"
@@ -630,16 +667,6 @@ def _errors(number: Float, deviations: list[Float]) -> list[Float]:
     both = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
     errors[2] = dr.select(both > 0, dr.clip(mixed / both, -1, 1), 0)
     return errors
-
-
-def _warn_of_unreliable(lit: int, unreliable: int) -> None:
-    if unreliable > 0.01 * lit:
-        warnings.warn(
-            f"{NAME}: in {unreliable} of {lit} pixels that receive light one sample carries "
-            "half of the variance or more; their standard errors are unreliable; expected more "
-            "samples",
-            stacklevel=3,
-        )
 
 
 register(KIND, NAME, define)

@@ -93,6 +93,25 @@ class Sample:
         self.delay, self.stokes = delay, stokes
 
 
+class Orders:
+    """Sums of S0 by scattering order, in rows of few samples: one sum of millions loses digits."""
+
+    def __init__(self, rows: int, max_order: int) -> None:
+        self.sums = dr.zeros(mi.Float, rows * max_order)
+        dr.make_opaque(self.sums)
+        self.rows, self.max_order = dr.opaque(mi.UInt32, rows), max_order
+
+    def add(self, value: Float, order: UInt, row: UInt, active: Mask = True) -> None:
+        """Add values of samples, each to its row."""
+        add(self.sums, value, (order - 1) * self.rows + row, active)
+
+    def totals(self, parts: int) -> list[Float]:
+        """Of each order, the sums of so many rows each."""
+        row = dr.arange(mi.UInt32, dr.width(self.sums) // self.max_order)
+        first = (self.rows * dr.opaque(mi.UInt32, k) for k in range(self.max_order))
+        return [dr.block_sum(dr.gather(mi.Float, self.sums, row + k), parts) for k in first]
+
+
 class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
@@ -107,20 +126,29 @@ class Lidar:
         self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
         # of the delays, half the path: so ranges of a gate shift by as much
-        self.pulse_sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
+        self.pulse_sigma = None
+        if sensor.laser.pulse_duration > 0:
+            sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
+            self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
+        # of each sample's beam, once they are emitted
+        self.field_tan = sensor.field_tangent(mi.UInt32(0))
+        # last vertices that were drawn in the field of view and are not in it: rounding alone
+        self.rejected = dr.zeros(mi.UInt32, 1)
+        dr.make_opaque(self.rejected)
 
     def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
         """Samples of beams by their index, with independent random numbers."""
         rng = generator(seed, beam, number)
         sensor = self.sensor
+        self.field_tan = sensor.field_tangent(beam)
         to_world = sensor.world_transform()
         frame = sensor.beam_frame(beam)
         start, time = sensor.beam_origin(beam), sensor.beam_time(beam)
         origin, direction, aperture = self._ends(rng, frame, start)
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
-        if sensor.laser.pulse_duration > 0:
+        if self.pulse_sigma is not None:
             delay = self.pulse_sigma * mi.warp.square_to_std_normal(pair(rng)).x
         stokes = self._emitted(axes, direction)
         return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
@@ -129,8 +157,9 @@ class Lidar:
         """Origin and direction of a ray of the laser, and a point of the telescope."""
         sensor, to_world = self.sensor, self.sensor.world_transform()
         origin, direction = sensor.laser.sample_local(pair(rng), pair(rng))
-        origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(origin)))
-        direction = dr.normalize(to_world @ frame.to_world(direction))
+        pose = sensor.laser.m_pose
+        origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(pose @ origin)))
+        direction = dr.normalize(to_world @ frame.to_world(pose @ direction))
         aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
         return origin, direction, aperture
 
@@ -138,10 +167,11 @@ class Lidar:
         """The laser's Stokes vector about Mitsuba's axes of a direction."""
         if not mi.is_polarized:
             return [mi.Float(1)]
+        laser = self.sensor.laser
         return rotate_stokes(
-            [mi.Float(s) for s in self.sensor.laser.stokes],
+            laser.m_stokes,
             direction,
-            transverse(axes.s, direction),
+            transverse(axes.to_world(laser.m_pose @ mi.Vector3f(1, 0, 0)), direction),
             mi.mueller.stokes_basis(direction),
         )
 
@@ -183,14 +213,15 @@ class Lidar:
         origin, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
         aperture, path = mi.Point3f(sample.aperture), mi.Float(0)
         total, target, number = mi.Float(0), mi.Float(0), mi.UInt32(0)
+        pulse = None if self.pulse_sigma is None else 2 * self.pulse_sigma
         while dr.hint(number < candidates, label="candidates"):
             start, onward, end = self._ends(rng, sample.frame, sample.start)
             part = (mi.Float(number) + rng.next_float32()) / mi.Float(candidates)
-            length, weight = pulse_in_gate(part, low, high, 2 * self.pulse_sigma)
+            length, weight = pulse_in_gate(part, low, high, pulse)
             closure, volume = closed(start, onward, end, length)
             place = start + onward * closure
             active = (length > 0) & (closure > 0)
-            active &= self.sensor.in_field_of_view(axes, place - end)
+            active &= self._in_view(axes, place - end)
             crossings = self.air.crossings(start, onward)
             _, _, _, medium, _ = self.air.next_surface(
                 crossings, start, onward, closure, mi.Float(dr.inf), around, active
@@ -227,22 +258,19 @@ class Lidar:
         low: Float,
         high: Float,
         position: Float,
-        max_order: int,
-        split: bool,
-        by_order: Float,
-        cell: UInt,
+        max_order: UInt,
+        by_order: Orders | None,
+        row: UInt,
     ) -> Stokes:
         """The sum of all orders from the second up to ``max_order``, as `single` gives the first.
 
         ``low`` and ``high`` are twice the gate's ranges less the sample's delay, ``position`` (0
-        to 1) is the place of the sample's whole path between them. With ``split`` each order's S0
-        is also added to ``by_order``.
+        to 1) is the place of the sample's whole path between them. Each order's S0 is also added
+        to ``by_order``.
         """
         medium = mi.MediumPtr(self.sensor.get_medium())
         path = dr.lerp(low, high, position)
-        return self._further(
-            sample, medium, path, high - low, mi.UInt32(max_order), split, by_order, cell, max_order
-        )
+        return self._further(sample, medium, path, high - low, max_order, by_order, row)
 
     @dr.syntax
     def _further(
@@ -252,10 +280,8 @@ class Lidar:
         path: Float,
         width: Float,
         last: UInt,
-        split: bool,
-        by_order: Float,
-        cell: UInt,
-        max_order: int,
+        by_order: Orders | None,
+        row: UInt,
     ) -> Stokes:
         """Orders from two on: the path is closed once from every vertex but the last."""
         # local names, as the loop records local variables only
@@ -295,8 +321,7 @@ class Lidar:
             )
             gain = gains[0]
             total = _sum(total, gain)
-            if dr.hint(split, mode="scalar"):
-                add(by_order, gain[0], cell * max_order + order - 1, active)
+            _split(by_order, gain[0], order, row, active)
 
             order += 1
             active &= order <= last
@@ -343,10 +368,20 @@ class Lidar:
         if others:
             more, _ = self._scatter_all(medium, mei, others, closing, volume > 0)
             several += more
+        # once more by the coordinates that the connection uses
+        end = mei.p + closing * leg - sample.aperture
+        self._reject((volume > 0) & ~self._in_view(sample.axes, end))
         gains = self._connect(
             sample, rng, mei.p, closing, leg, medium, several, width * volume, volume > 0
         )
         return rest, gains, active
+
+    def _reject(self, lost: Mask) -> None:
+        """Count samples of which a sampler has left its own domain."""
+        one = mi.UInt32(1)
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, self.rejected, one, mi.UInt32(0), lost, mode=dr.ReduceMode.Local
+        )
 
     def _first_flight(
         self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
@@ -361,7 +396,7 @@ class Lidar:
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
         # half the field of view's radius at half the path: nearer vertices send most of what they
         # scatter through the field, farther ones past it
-        scale = 0.25 * path * self.sensor.m_fov_tan
+        scale = 0.25 * path * self.field_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
         # for phase functions with a stronger forward peak than the isotropic one
         steps = dr.log((most + scale) / (least + scale))
@@ -384,8 +419,11 @@ class Lidar:
         field = self._half_fov()
         return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
+    def _in_view(self, axes: Frame, to_source: Vector) -> Mask:
+        return self.sensor.in_field_of_view(axes, to_source, self.field_tan)
+
     def _half_fov(self) -> Float:
-        return self.sensor.m_fov_tan / (1 + dr.sqrt(1 + dr.square(self.sensor.m_fov_tan)))
+        return self.field_tan / (1 + dr.sqrt(1 + dr.square(self.field_tan)))
 
     def _last_flight(
         self,
@@ -405,7 +443,7 @@ class Lidar:
         phase, axes, path = medium.phase_function(), sample.axes, rest.distance + rest.excess
         # sampling from the telescope is best for last vertices far off, in radii of its field
         across = rest.field / self._half_fov() - 1
-        along = 0.5 * rest.excess / (rest.distance * self.sensor.m_fov_tan)
+        along = 0.5 * rest.excess / (rest.distance * self.field_tan)
         far = dr.square(across) + dr.square(along)
         backward = BACK_FRACTION * (1 - dr.rcp(1 + far))
         strategy = rng.next_float32(active)
@@ -426,7 +464,8 @@ class Lidar:
             end = mei.p + wo * leg
             # not from the end's coordinates, which are rounded to those of the world
             to_end = rest.away * rest.distance + wo * leg
-            in_view = active & self.sensor.in_field_of_view(axes, to_end)
+            in_view = active & self._in_view(axes, to_end)
+            self._reject(active & by_back & ~in_view)
             # both legs meet the ellipsoid at the same angle
             from_telescope = dr.square(leg / (path - leg)) / self._field_solid_angle()
             from_telescope = dr.select(in_view, from_telescope, 0)
@@ -438,8 +477,7 @@ class Lidar:
             # of all three strategies together (Veach & Guibas 1995, balance heuristic): none has a
             # large weight where another one would have drawn the direction
             density = PHASE_FRACTION * pdf + backward * from_telescope
-            aimed_density = rest.density(rest.excess, one_plus_cosine)
-            density += (1 - PHASE_FRACTION - backward) * aimed_density
+            density += (1 - PHASE_FRACTION - backward) * rest.density(rest.excess, wo)
             # never 0 where there may be light: the medium may be a different one there
             target = (0.95 * received[0] + 0.05 * scattered[0] * back_pdf) * volume
             target = dr.select(in_view & (density > 0), target, 0)
@@ -464,7 +502,7 @@ class Lidar:
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
         # transmittances to the gate differ little: any part of the excess length is about as likely
-        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.sensor.m_fov_tan
+        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.field_tan
         choice, near = pair(rng), sample_near(0, most, scale, pair(rng), rng.next_float32(active))
         gap = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
         gap_density = near_density(gap, 0, most, scale)
@@ -481,7 +519,7 @@ class Lidar:
             one_plus_cosine = rest.one_plus_cosine(wo)
             leg = rest.leg(used, one_plus_cosine)
             scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
-            density = dr.lerp(rest.density(used, one_plus_cosine), pdf, PHASE_FLIGHT_FRACTION)
+            density = dr.lerp(rest.density(used, wo), pdf, PHASE_FLIGHT_FRACTION)
             density *= rest.slope(used, one_plus_cosine, leg) * gap_density
             end = mei.p + wo * leg
             inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
@@ -494,8 +532,8 @@ class Lidar:
         return wo, _scaled(scattered, factor), leg, 2 * gap, weight
 
     def _field_solid_angle(self) -> Float:
-        cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
-        return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
+        cosine = dr.rsqrt(1 + dr.square(self.field_tan))
+        return dr.two_pi * dr.square(self.field_tan * cosine) / (1 + cosine)
 
     def _in_field(self, axes: Frame, rng: Generator) -> Vector:
         """A direction of the field of view, uniform in solid angle."""
@@ -523,7 +561,7 @@ class Lidar:
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
         """
         vertex = position + direction * distance
-        active = active & self.sensor.in_field_of_view(sample.axes, vertex - sample.aperture)
+        active = active & self._in_view(sample.axes, vertex - sample.aperture)
         out, medium = transmittance(
             self.air,
             self.bounds,
@@ -557,7 +595,7 @@ class Lidar:
         back = sample.aperture - mei.p
         distance = dr.norm(back)
         wo = back / distance
-        active = active & self.sensor.in_field_of_view(sample.axes, -back)
+        active = active & self._in_view(sample.axes, -back)
         out, _ = transmittance(
             self.air,
             self.bounds,
@@ -612,20 +650,21 @@ class Lidar:
     def analog(
         self,
         sample: Sample,
-        max_order: int,
-        base: UInt,
-        gates: int,
+        max_order: UInt,
+        row: UInt,
+        parts: UInt,
+        gates: UInt,
         sums: Sequence[Float],
         products: Products,
         largest: UInt,
         magnified: float,
-        split: bool,
-        by_order: Float,
+        by_order: Orders | None,
     ) -> None:
         """Analog free flights; every collision is connected to the telescope.
 
         Adds contributions to ``sums``, and their products, each factor ``magnified``, to
-        ``products``; ``largest`` becomes the bits of the largest square.
+        ``products``; ``largest`` becomes the bits of the largest square. ``row`` is a sample's
+        place in them for the first gate, ``parts`` the step from gate to gate.
 
         A sample's apparent range does not decrease from one order to the next (triangle
         inequality), so its contribution to a gate is complete when a later gate is reached: only
@@ -667,13 +706,13 @@ class Lidar:
             # the distance to the last vertex is drawn, not forced: it has no weight of its own
             gains = self._receive(sample, rng, medium, mei, [stokes], counts, mi.Float(1))
             gain = gains[0]
-            now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
+            now = dr.minimum(mi.UInt32(dr.select(counts, fraction * gates, 0)), gates - 1)
+            now = dr.select(counts, now, gate)
             done = now != gate
-            _deposit(sums, products, largest, magnified, base + gate, held, done)
+            _deposit(sums, products, largest, magnified, row + gate * parts, held, done)
             held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
             gate = now
-            if dr.hint(split, mode="scalar"):
-                add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
+            _split(by_order, gain[0], order, row + gate * parts, counts)
             order += 1
             # later orders arrive from farther away still
             active &= (order <= max_order) & (range_ < high)
@@ -683,7 +722,13 @@ class Lidar:
             stokes = apply_phase_function(value, stokes, self.channel)
             direction = mi.Vector3f(onward)
             active &= (density > 0) & (stokes[0] > 0)
-            _deposit(sums, products, largest, magnified, base + gate, held, began & ~active)
+            ended = began & ~active
+            _deposit(sums, products, largest, magnified, row + gate * parts, held, ended)
+
+
+def _split(by_order: Orders | None, value: Float, order: UInt, row: UInt, active: Mask) -> None:
+    if by_order is not None:
+        by_order.add(value, order, row, active)
 
 
 def add(total: Float, value: Float, cell: UInt, active: Mask = True) -> None:

@@ -189,6 +189,12 @@ def _surroundings(bodies: list[Body], sheets: list[Sheet], sensor: Sensor) -> Me
         inside = body.contains(places)
         outer[inside & (outer < 0)] = index
         inner[inside] = index
+    if dr.any(sensor.laser.m_pose.translation() != 0):
+        lasers = sensor.laser_places()
+        for body in bodies:
+            if (body.contains(lasers) != body.contains(places)).any():
+                expected = f"a place on the telescope's side of {name_of(body.shape)}"
+                fail("laser", "to_world", sensor.laser.m_pose.translation(), expected)
     for index in np.unique(inner[inner >= 0]):
         if stated is not None and stated != bodies[index].interior:
             fail(

@@ -21,6 +21,8 @@ coverage             standard errors of winds where air changes: its section, by
 instrument           winds by an etalon with defects; only by name
 flows                winds of families of flows that judge, and of those that build: its section
                      of the page; only by name
+defects              winds of images with defects, by families of which half only judge; only by
+                     name
 resolution           winds from fewer, larger pixels, against their bound; only by name
 line_vortices        vortices from slices of a Doppler lidar: errors, coverage, false alarms; only
                      by name
@@ -45,7 +47,7 @@ GROUPS = (
     "loads",
     "coverage",
 )
-OPEN = ("instrument", "flows", "resolution", "line_vortices")
+OPEN = ("instrument", "flows", "defects", "resolution", "line_vortices")
 """Run only by name: some of their rows fail."""
 SECTIONS = ("coverage", "flows")
 """Groups whose text is a section of the page, between marks, that short runs leave as it is."""

@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--purpose",
         choices=("build", "judge"),
-        help="of the families of `flows`: these alone, and nothing is written",
+        help="of the families of `flows` and `defects`: these alone, and nothing is written",
     )
     parser.add_argument(
         "-o", "--out", type=Path, default=PAGE, help="page to write when all groups run"

@@ -19,7 +19,15 @@ CASES = [
     (520.0, 80.0, 25e-3, 40e-3, 1e9),
     (30.0, 50.0, 100e-3, 0.0, 1e9),
     (520.0, 80.0, 25e-3, 0.0, 20.0),
+    (100.0, 60.0, 0.05e-3, 0.0, 1e9),
+    (100.0, 1e-6, 0.05e-3, 0.0, 1e9),
 ]
+
+
+def directions(half):
+    """With this tangent of half the angle to the direction of the telescope, -z."""
+    sine, cosine = 2 * half / (1 + half**2), (1 - half**2) / (1 + half**2)
+    return mi.Vector3f(mi.Float(sine), mi.Float(0), mi.Float(-cosine))
 
 
 def open_path(distance, excess, fov, offset, reach):
@@ -57,23 +65,24 @@ def test_flights_close_the_path(case):
 @pytest.mark.parametrize("case", CASES)
 def test_density_is_that_of_the_samples(case):
     one, excess = open_path(*case), mi.Float(case[1])
-    offset = case[1] / case[0]
-    # solid angle in 1 + cosine, finest where it is small
-    edges = np.geomspace(offset, 2 + offset, 200_001) - offset
-    middle = (edges[1:] + edges[:-1]) / 2
-    density = np.array(one.density(excess, mi.Float(middle)), float)
-    fraction = 2 * np.pi * density * np.diff(edges)
-    assert abs(fraction.sum() - 1) < 2e-3
+    # in tan(theta / 2), as densities may end within microradians of either pole
+    edges = np.geomspace(1e-7, 1e7, 400_001)
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    density = np.array(one.density(excess, directions(middle)), float)
+    fraction = 2 * np.pi * density * 4 * middle / (1 + middle**2) ** 2 * np.diff(edges)
+    assert abs(fraction.sum() - 1) < 4e-3
     number = 400_000
     rng = np.random.default_rng(1)
     drawn = one.sample(excess, mi.Point2f(rng.random((2, number)).astype(np.float32)))
     vectors = np.array(drawn, float)
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=0), 1, rtol=1e-5)
-    one_plus_cosine = np.sort(np.array(one.one_plus_cosine(drawn), float))
+    across, cosine = np.hypot(*vectors[:2]), -vectors[2]
+    near, far = across / (1 + np.maximum(cosine, 0)), (1 - np.minimum(cosine, 0)) / across
+    half = np.sort(np.where(cosine > 0, near, far))
     # Kolmogorov-Smirnov, 4 sigma and the quadrature's error
-    expected = np.interp(one_plus_cosine, edges[1:], np.cumsum(fraction))
+    expected = np.interp(half, edges[1:], np.cumsum(fraction))
     empirical = (np.arange(number) + 0.5) / number
-    assert np.abs(expected - empirical).max() < 2 / np.sqrt(number) + 2e-3
+    assert np.abs(expected - empirical).max() < 2 / np.sqrt(number) + 4e-3
     # uniform azimuth
     azimuth = np.arctan2(vectors[1], vectors[0])
     for order in (1, 2):
@@ -84,9 +93,10 @@ def test_density_is_that_of_the_samples(case):
 def test_all_directions_into_view_are_drawn(case):
     distance, excess, fov, offset, reach = case
     rng = np.random.default_rng(2)
-    # isotropic, and as many again close to the direction of the telescope
+    # isotropic, and as many again close to that of the telescope and to its opposite
     cosine = rng.uniform(-1, 1, 200_000)
-    cosine = np.concatenate([cosine, -1 + 10 ** rng.uniform(-6, 0, 200_000)])
+    cosine = np.concatenate([cosine, -1 + 10 ** rng.uniform(-9, 0, 200_000)])
+    cosine = np.concatenate([cosine, 1 - 10 ** rng.uniform(-9, 0, 200_000)])
     azimuth = rng.uniform(0, 2 * np.pi, cosine.size)
     sine = np.sqrt(1 - cosine**2)
     wo = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
@@ -99,5 +109,5 @@ def test_all_directions_into_view_are_drawn(case):
     angle = np.arccos(np.clip(axis @ end / np.linalg.norm(end, axis=0), -1, 1))
     in_view = (angle < fov * (1 - 1e-3)) & (end[2] > distance - reach)
     assert in_view.sum() > 100
-    density = np.array(open_path(*case).density(mi.Float(excess), mi.Float(1 + cosine)), float)
+    density = np.array(open_path(*case).density(mi.Float(excess), mi.Vector3f(*wo)), float)
     assert (density[in_view] > 0).all()

@@ -89,6 +89,13 @@ def test_orders_sum_to_the_total_and_the_first_is_single_scattering(world):
     np.testing.assert_allclose(found[:, 5], single[:, 0], rtol=1e-5)
 
 
+def test_orders_of_millions_of_samples_keep_their_digits(world):
+    """In one gate: a running sum of so many terms is off by 4e-6, or more with longer runs."""
+    case = Case(gates=(500.0, 510.0))
+    found = gates(dense(world, case, max_order=2), spp=4_000_000, seed=1)
+    np.testing.assert_allclose(found[:, 5:].sum(1), found[:, 0], rtol=2e-6)
+
+
 @pytest.mark.parametrize("factor", [1, 4, 20])
 def test_any_majorant_gives_the_same(world, truth, factor):
     """A grid equals the homogeneous slab, and one bright voxel far away only costs time."""
