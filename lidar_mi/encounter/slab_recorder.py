@@ -53,15 +53,13 @@ class SlabRecorder:
         """
         if not self._slabs:
             return None
-        grid = {}
-        for one in self._slabs[::-1]:
-            grid |= {name: one[name] for name in one.dims}
+        first = next((one for one in self._slabs if "v" in one), self._slabs[0])
+        grid = {name: first[name] for name in first.dims}
         # a slab whose wind the computer skipped has images alone
-        found = xr.concat(
-            [one.interp({n: grid[n] for n in one.dims}) for one in self._slabs],
-            "slab",
-            data_vars="all",
-            join="outer",
-        )
+        nothing = {name: np.nan * first[name] for name in "vw" if name in first}
+        slabs = [one if "v" in one else one.assign(nothing) for one in self._slabs]
+        found = xr.concat([one.interp(grid) for one in slabs], "slab")
         # interpolation gives double precision, which no figure needs
-        return found.assign({n: a.astype(np.float32) for n, a in found.items() if a.ndim > 1})
+        return found.assign(
+            {name: found[name].astype(np.float32) for name in first if first[name].ndim}
+        )
