@@ -298,8 +298,8 @@ class VirtualLidar:
         use_variant(experiment.render.variant)
         if self._renderer is None:
             self._renderer = self._renderer_of(air, plan, self._settings)
-        # seeds as of the images of an experiment
-        scan = with_products(self._renderer.render(air, plan, experiment.seed + (number << 16)))
+        seed = self._settings.scan_seed(experiment.seed, number)
+        scan = with_products(self._renderer.render(air, plan, seed))
         scan = self._detected(scan, plan, number)
         near, far = (self._image(scan, plan, gate, pose) for gate in (0, -1))
         return Scan(near[0], *far)
@@ -334,7 +334,8 @@ class VirtualLidar:
 
         The pilot is of the nominal pose, so that images do not depend on the first pose.
         """
-        experiment, settings = self.experiment, self.experiment.render
+        experiment = self.experiment
+        settings = experiment.render.for_winds()
         if settings.samples_per_beam != "auto":
             return settings
         plan = self.gates.plan()
