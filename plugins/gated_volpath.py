@@ -89,6 +89,13 @@ Gradients use other random samples than the image. Memory does not grow with the
 Gradients with respect to anything else raise an error of one line. Other channels, such as standard
 errors, are constants in a loss: they have no gradient.
 
+Ground, walls and calibration targets are surfaces with Mitsuba's ``diffuse`` BSDF, which is also
+that of a shape without any: reflectance rho, rho / pi per steradian, unpolarised. One that faces
+away is dark, unless it is ``twosided``. The light that the laser sends straight to a surface is
+received in the gate of its range, attenuated by the air before it, as scattered once (order 1).
+Light that is scattered in the air before or after it is reflected is not followed: for the part of
+it that stays in view, the air counts as if it absorbed.
+
 A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
 extinction coefficient, an albedo or a weight of a blend outside 0 to 1, if ``hg`` has a g beyond
 0.99 in magnitude, or if a shape or volume has a transform that is not finite. Values are checked
@@ -120,6 +127,8 @@ other emitters than the sensor's      refused: area, environment, point, a secon
 BSDF ``null``                         light passes: a surface between media
 BSDF that transmits otherwise         refused: ``mask``, ``blendbsdf``, ``thindielectric``,
                                       dielectrics, etalons
+BSDF ``diffuse``, ``twosided``        the surface blocks all light, and reflects what reaches it
+                                      from the laser to the telescope. Refused around a medium
 any other BSDF                        the surface blocks all light; what it reflects is not
                                       followed. Refused around a medium
 cube, sphere, closed mesh             honoured: the interior is what it encloses, whatever the
@@ -516,6 +525,10 @@ def define() -> type:
                     dr.opaque(mi.UInt32, self.candidates),
                 )
                 stokes = lidar.single(chosen, place, weight * (high - low))
+            if lidar.air.targets:
+                stokes = [
+                    a + b for a, b in zip(stokes, lidar.reflected(sample, low, high), strict=True)
+                ]
             if by_order:
                 by_order.add(stokes[0], mi.UInt32(1), row)
             if self.max_order > 1:
