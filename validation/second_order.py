@@ -55,10 +55,11 @@ def _contributions(case, first, second, third, fourth, fifth, sixth):
     """Contributions to I, Q and dI/d ln(extinction), (3, n)."""
     start, beam = np.array(case.origin), np.array([1.0, *np.tan(case.tilt)])
     beam /= np.linalg.norm(beam)
-    radius, turn = case.aperture * np.sqrt(first), 2 * np.pi * second
+    # evenly in radius: where the beam is out of view, the light falls as its inverse
+    radius, turn = case.aperture * first, 2 * np.pi * second
     telescope = np.stack([np.zeros_like(turn), radius * np.cos(turn), radius * np.sin(turn)], -1)
     path = 2 * (case.gate[0] + (case.gate[1] - case.gate[0]) * third)
-    weight = np.pi * case.aperture**2 * 2 * (case.gate[1] - case.gate[0])
+    weight = 2 * np.pi * case.aperture * radius * 2 * (case.gate[1] - case.gate[0])
     # the direction from the telescope, about that in which it sees the end of the beam
     offset = start - telescope
     reach = _closing(offset, beam, path)
@@ -77,14 +78,17 @@ def _contributions(case, first, second, third, fourth, fifth, sixth):
     nearest = case.slab[0] / view[:, 0]
     farthest = np.minimum(longest, case.slab[1] / view[:, 0])
     low, high = (np.arctan((longest - end) / half) for end in (farthest, nearest))
-    t = low + (high - low) * sixth
+    t, jacobian = _turned(case, low, np.maximum(low, high), sixth)
     back = longest - half * np.tan(t)
-    weight = weight * np.where(high > low, (high - low) * half / np.cos(t) ** 2, 0)
+    weight = weight * jacobian * half / np.cos(t) ** 2
     last = telescope + back[:, None] * view
-    # the first one
-    flight = _closing(start - last, beam, path - back)
-    vertex = start + flight[:, None] * beam
-    between = last - vertex
+    # the first one, from how much farther than the last it lies: it is often millimetres away
+    straight = np.linalg.norm(last - start, axis=1)
+    tilt = (last - start) / straight[:, None] - beam
+    excess, bent = path - back - straight, 0.5 * (tilt**2).sum(1)
+    beyond = (0.5 * excess**2 - straight**2 * bent) / (excess + straight * bent)
+    vertex = start + (straight + beyond)[:, None] * beam
+    between = straight[:, None] * tilt - beyond[:, None] * beam
     distance = np.linalg.norm(between, axis=1)
     between /= distance[:, None]
     inside = (vertex[:, 0] > case.slab[0]) & (vertex[:, 0] < case.slab[1]) & (back > nearest)
@@ -125,6 +129,28 @@ def _about(centre, radius, fourth, fifth):
     least, most = np.maximum(middle - chord, 0), middle + chord
     away = least + (most - least) * fifth
     return towards + angle, away, 2 * widest * (most - least) * away
+
+
+def _turned(case, low, high, number):
+    """The angle t between two limits, and the inverse of its density.
+
+    In narrow fields 2 t is the first scattering angle and the second one its supplement: t is drawn
+    with the density of forward peaks at both ends, (w^2 + (2 t)^2)^(-3/2) in the lower half.
+    """
+    width = 1 - abs(case.asymmetry or 0)
+    whole = 0.5 * np.pi / math.hypot(width, 0.5 * np.pi)
+
+    def below(t):
+        angle = 2 * np.minimum(t, 0.5 * np.pi - t)
+        part = 0.5 * angle / np.hypot(width, angle) / whole
+        return np.where(t < 0.25 * np.pi, part, 1 - part)
+
+    least, most = below(low), below(high)
+    place = least + (most - least) * number
+    sine = 2 * whole * np.minimum(place, 1 - place)
+    angle = width * sine / np.sqrt(1 - sine**2)
+    density = width**2 / np.hypot(width, angle) ** 3 / whole
+    return np.where(place < 0.5, angle, np.pi - angle) / 2, (most - least) / density
 
 
 def _scattered(case, beam, between, back):

@@ -50,7 +50,7 @@ class DopplerLidar(Description):
     ] = Field(354.7e-9, description="vacuum wavelength of the laser")
     pulse_energy: Annotated[
         Energy, Within(1e-15, 10000, "from thousands of photons to the lasers of fusion")
-    ] = Field(0.07, description="energy of a pulse")
+    ] = Field(quantity("70 mJ"), description="energy of a pulse")
     pulse_duration: Annotated[Time, Within(0, 0.001, "a millisecond is 150 km of air")] = Field(
         10e-9, description="full width at half maximum of a pulse"
     )

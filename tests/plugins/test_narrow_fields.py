@@ -4,6 +4,8 @@ Detects: 1 % of it lost or added, at any field of view, telescope and range; the
 polarisation and its gradients; single precision that cancels in a connection.
 """
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -24,12 +26,14 @@ CASES = [
 ]
 
 
-def pencil(world, case, **integrator):
+def pencil(world, case, place=None, **integrator):
     """One thin, collimated beam, and one gate of order two in a slab."""
     phase = {"type": "hg", "g": case.asymmetry}
     phase = "rayleigh_polarized" if case.asymmetry is None else phase
     air = world.homogeneous(case.extinction, phase, case.albedo)
     (near, far), wide = case.slab, 1000.0
+    slab = world.box((near, -wide, -wide), (far, wide, wide), air)
+    place = mi.ScalarTransform4f() if place is None else place
     return world.scene(
         world.lidar(
             (1, 1),
@@ -38,9 +42,10 @@ def pencil(world, case, **integrator):
             gate_kind="spherical",
             aperture_radius=case.aperture,
             fov_half_mrad=1e3 * case.fov_half,
+            to_world=place,
         ),
         {"max_order": 2, "orders": True, **integrator},
-        slab=world.box((near, -wide, -wide), (far, wide, wide), air),
+        slab=slab | {"to_world": place @ slab["to_world"]},
     )
 
 
@@ -55,6 +60,21 @@ def test_no_light_is_lost_in_a_narrow_field(world, case):
     error = found.std(0, ddof=1) / np.sqrt(len(found))
     assert error[0] < 0.01 * expected[0]
     np.testing.assert_array_less(abs(found.mean(0) - expected), 4 * error + 1e-3 * expected[0])
+    assert loaded.integrator().rejected < 1e-4 * 20_000
+
+
+def test_samples_lost_to_rounding_are_counted_and_said_once(world):
+    """Coordinates of 20 km are rounded to millimetres, as wide as a field of 0.05 mrad is here."""
+    case, place = CASES[0], mi.ScalarTransform4f().translate([0.0, 20_000.0, 20_000.0])
+    loaded = pencil(world, case, place)
+    with pytest.warns(UserWarning, match="samples left the field of view by rounding"):
+        found = np.array(mi.render(loaded, spp=400_000, seed=1))[0, 0]
+    rejected = loaded.integrator().rejected / 400_000
+    lost = 1 - found[6] / second_order(case, 16)[0]
+    assert 0.5 * lost < rejected < 2 * lost and lost > 0.03
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mi.render(loaded, spp=1000, seed=2)
 
 
 @pytest.mark.parametrize("case", CASES[:2])

@@ -132,7 +132,7 @@ def test_last_override_wins(write):
         ["lidar.beam_cut=.inf", "wake.second=40.1 s", "wake.time=40 s"],
         ["wake={vortex_pair: {model: burnham_hallock}}", "wake.texture.rms=0"],
         ["scattering={phase: table, table: spheroids.txt}", "scan.aim=angles"],
-        ["scattering={phase: mixture, parts: [{phase: molecules, share: 1}]}"],
+        ["scattering={phase: mixture, parts: [{phase: molecules, fraction: 1}]}"],
         ["wake.centre=[0.1 m, -1e-9 m]", "wake.names={v: V}", "wake.extinction.aerosol=null"],
     ],
 )
@@ -428,7 +428,7 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
         assert math.isfinite(within.high) and within.low not in (5e-324, -math.inf)
     unit = next((part.symbol for part in parts if isinstance(part, Unit)), "")
     for number in (1e308, -1e308, 2**63, math.nan, -math.inf):
-        value = f"{number!r} {unit}" if unit.startswith("rad") else number
+        value = f"{number!r} {unit}" if unit.startswith("rad") or unit == "J" else number
         *sections, key = name.split(".")
         data = {"name": "extreme", "wake": {"vortex_pair": {}}}
         innermost = data
