@@ -18,6 +18,7 @@ from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
+from lidar_mi.retrieval.flow.prior_check import prior_check
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, check_between
@@ -32,8 +33,18 @@ class Posterior(Protocol):
         """Of the splines, (components, knots ...)."""
 
     @property
+    def prior(self) -> Prior:
+        """Of the flow."""
+
+    @property
     def response(self) -> Response | None:
         """Change of the coefficients by a gradient of the log-likelihood, if it is affordable."""
+
+    def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
+        """The prior's precision times coefficients (n, components, knots ...)."""
+
+    def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
+        """Coefficients by gradients (n, ...), with the prior's precision times a strength."""
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow."""
@@ -204,6 +215,9 @@ def variational_and_flow(
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
+    check = prior_check(posterior, linear, mesh)
+    factor = check.factor(centres).to(covariance)
+    covariance, before = factor * covariance, min(check.ratio, 1.0) * before
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
     # what the splines do not resolve is not in the posterior
@@ -219,7 +233,7 @@ def variational_and_flow(
     result = result._replace(flag=flag)
     if bare.double().mean() > 0.5 or not (keep and isinstance(posterior, direct.Posterior)):
         return result, None
-    return result, flow_of(posterior, linear, images, before, additional, windows, settings)
+    return result, flow_of(posterior, linear, images, before, additional, factor, windows, settings)
 
 
 def _solver(axes: Sequence[Axis], settings: VariationalSettings) -> Solver:
