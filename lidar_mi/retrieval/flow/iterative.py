@@ -68,16 +68,6 @@ class Posterior(NamedTuple):
         after = interpolated(mean, self.prior.mesh.places, [p.to(mean) for p in places])
         return after, torch.full_like(after, torch.inf)
 
-    def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
-        """The prior's precision times coefficients (n, components, knots)."""
-        return _stiff(flows, self.prior, self.settings.ridge)
-
-    def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
-        """Coefficients by gradients (n, ...), with the prior's precision times a strength."""
-        # (H + s P) c = g is (H / s + P) (s c) = g
-        curvature = self.curvature.to(self.single.local) / strength
-        return self._flows(curvature, gradients.to(curvature)).to(gradients) / strength
-
     def _drawn(self, number: int, before: bool) -> list[torch.Tensor]:
         """Flows (number, components, knots) drawn from the prior, if wanted, and the posterior.
 

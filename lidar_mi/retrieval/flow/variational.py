@@ -33,18 +33,8 @@ class Posterior(Protocol):
         """Of the splines, (components, knots ...)."""
 
     @property
-    def prior(self) -> Prior:
-        """Of the flow."""
-
-    @property
     def response(self) -> Response | None:
         """Change of the coefficients by a gradient of the log-likelihood, if it is affordable."""
-
-    def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
-        """The prior's precision times coefficients (n, components, knots ...)."""
-
-    def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
-        """Coefficients by gradients (n, ...), with the prior's precision times a strength."""
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow."""
@@ -215,9 +205,13 @@ def variational_and_flow(
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
-    check = prior_check(posterior, linear, mesh)
-    factor = check.factor(centres).to(covariance)
-    covariance, before = factor * covariance, min(check.ratio, 1.0) * before
+    factor = torch.ones(windows.count).to(covariance)
+    if not isinstance(posterior, iterative.Posterior):
+        check = prior_check(posterior, linear, mesh)
+        factor = check.factor(centres).to(covariance)
+        # a weaker prior is one that images remove less of
+        before = min(check.ratio, 1.0) * before
+    covariance = factor * covariance
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
     # what the splines do not resolve is not in the posterior
