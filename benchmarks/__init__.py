@@ -9,9 +9,6 @@ estimators   the gated estimator against the analog one
 transient    the renderer against mitransient's volumetric integrator
 velocimetry  cross-correlation against OpenPIV
 methods      wind from exact images by all methods, and by public codes
-batch        winds of several pairs at once and one after the other
-threads      winds on one thread and on several, on a quiet and on a busy machine
-settings     wind after each setting of a method is halved and doubled
 rendered     wind from rendered images by all methods, and the fraction of every cause of error
 renderer     speed and memory of the renderer alone
 rings        wind from ring images, all rings at once, against a 2-D fit and scipy

@@ -18,10 +18,6 @@ COMPARISONS = (
     "transient",
     "velocimetry",
     "methods",
-    "settings",
-    "threads",
-    "batch",
-    "growth",
     "rendered",
     "renderer",
     "timed",
@@ -29,7 +25,6 @@ COMPARISONS = (
     "rings",
     "campaign",
     "realtime",
-    "imports",
     "gpu",
 )
 

@@ -19,8 +19,6 @@ MARK = "<!-- below: written by `make bench` -->"
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
     "velocimetry": {"columns": 110, "rows": 90},
-    "growth": {"sizes": ((110, 90), (219, 139))},
-    "batch": {"pairs": 4},
     "rings": {"width": 480, "height": 390},
     "fringes": {"width": 240, "height": 195},
     "transient": {"columns": 40, "rows": 30, "samples": 16},

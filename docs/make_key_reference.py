@@ -26,7 +26,7 @@ HEAD = f"""\
 
 Every key of an experiment file, section by section: unit, default, what is allowed, what it does.
 [Experiment files](../guide/keys.md) describes their syntax. A plain number is in the unit of the
-table, except that angles always need a unit. Limits have their reason in parentheses.
+table, except that angles and energies always need a unit. Limits have their reason in parentheses.
 `lidar-mi explain KEY` says the same on the command line.
 """
 # where a section is described in use

@@ -1,7 +1,6 @@
 """Write the table of docs/experiments/wake_changing.md from runs of the experiment.
 
-Usage: ``python docs/make_wake_changing.py``, about two minutes. The numbers of the page's other
-table are from ``python -m validation stored_state``.
+Usage: ``python docs/make_wake_changing.py``, about two minutes.
 """
 
 from pathlib import Path

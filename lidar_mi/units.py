@@ -2,7 +2,8 @@
 
 Each type here is a ``float`` for pydantic models that also reads text with a unit, such as
 ``"532 nm"``, ``"2 mrad"`` or ``"1.8 / km"``, and turns it into SI. Plain numbers are SI already,
-except angles, which must say their unit (degrees and radians are too easily confused). Quantities
+except angles and energies, which must say their unit (degrees and radians, joules and
+millijoules are too easily confused). Quantities
 are shown to people as they wrote them (`Given`).
 """
 
@@ -85,9 +86,10 @@ def to_si(value: object, unit: str, example: str) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError(f"{value!r} is not allowed; expected a quantity such as '{example}'")
-    kind = {"rad": "an angle", "": "a number"}.get(unit, f"a quantity in {unit}")
+    kind = {"rad": "an angle", "J": "an energy", "": "a number"}.get(unit, f"a quantity in {unit}")
+    asked = unit.startswith("rad") or unit == "J"
     if not isinstance(value, str):
-        if unit.startswith("rad") and value != 0:
+        if asked and value != 0:
             raise ValueError(f"{value!r} has no unit; expected {kind} such as '{example}'")
         try:
             return float(value)
@@ -99,7 +101,7 @@ def to_si(value: object, unit: str, example: str) -> float:
         raise wrong
     number, text = float(match[1]), match[2]
     if not text:
-        if unit.startswith("rad") and number != 0:
+        if asked and number != 0:
             raise ValueError(f"{value!r} has no unit; expected {kind} such as '{example}'")
         return number
     factor = _FACTORS.get(unit, {}).get(re.sub(r" */ *", "/", text))

@@ -17,7 +17,9 @@ import mitsuba as mi
 from .variant_types import Float, Point, Vector
 
 # of the components of the sum of two unit vectors in single precision
-ROUNDING = 1e-6
+ROUNDING = 4e-7
+# m, of what is divided by
+TINY = 1e-30
 
 
 class OpenPath:
@@ -52,42 +54,79 @@ class OpenPath:
         """Length of a flight that consumes ``used`` of the excess length."""
         return used * (0.5 * used + self.distance) / (used + self.distance * one_plus_cosine)
 
+    def left(self, direction: Vector, gap: Float, whole: Float) -> Float:
+        """Excess length that a flight leaves which ends ``gap`` before it would close the path.
+
+        ``whole`` is the length of the flight that closes it.
+        """
+        return shortened(self.away * self.distance + direction * whole, direction, gap)
+
+    def from_telescope(self, direction: Vector) -> Vector:
+        """Direction from the vertex to where one from the telescope closes the path."""
+        one_plus_cosine = 0.5 * dr.squared_norm(direction - self.away)
+        consumed = self.excess + self.distance * one_plus_cosine
+        # how much farther from the telescope the path closes than the vertex lies, as one fraction:
+        # a difference of both distances would cancel
+        beyond = 0.5 * dr.square(self.excess) - dr.square(self.distance) * one_plus_cosine
+        across = self.distance * (direction - self.away)
+        return dr.normalize(direction * (beyond / consumed) + across)
+
     def slope(self, used: Float, one_plus_cosine: Float, leg: Float) -> Float:
         """Derivative of the excess length consumed with respect to the length of the flight."""
         return (used + self.distance * one_plus_cosine) / (self.distance + used - leg)
 
     def sample(self, used: Float, sample: Point) -> Vector:
         """Direction of a flight that consumes ``used``; two numbers in [0, 1)."""
-        least, most, offset = self._limits(used)
-        # of the density 1 / (1 + cos(theta) + offset) per solid angle, by its inverse
-        one_plus_cosine = dr.clip(least * dr.exp(dr.log(most / least) * sample.x) - offset, 0, 2)
-        sine = dr.sqrt(one_plus_cosine * (2 - one_plus_cosine))
+        *_, logarithm = self._limits(used)
+        offset = used / self.distance
+        # of the density 1 / (1 + cos(theta) + offset) per solid angle, by its inverse. Whichever of
+        # 1 + cos and 1 - cos is the smaller one keeps its digits
+        x = logarithm * sample.x
+        one_plus = dr.clip((2 + offset) * dr.exp(-x) - offset, 0, 2)
+        one_minus = (2 + offset) * _one_minus_exp(x)
+        forward = one_minus < 1
+        one_plus = dr.select(forward, 2 - one_minus, one_plus)
+        one_minus = dr.select(forward, one_minus, 2 - one_plus)
+        sine = dr.sqrt(one_plus * one_minus)
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
-        local = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, one_plus_cosine - 1)
+        local = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, one_plus - 1)
         return mi.Frame3f(self.away).to_world(local)
 
-    def density(self, used: Float, one_plus_cosine: Float) -> Float:
+    def density(self, used: Float, direction: Vector) -> Float:
         """Of `sample`, per steradian."""
-        least, most, offset = self._limits(used)
-        place = one_plus_cosine + offset
+        least, width, logarithm = self._limits(used)
+        one_plus = self.one_plus_cosine(direction)
+        one_minus = 0.5 * dr.squared_norm(self.away - direction)
         # wherever a sample may lie, whose direction was rounded
-        slack = ROUNDING * (dr.sqrt(2 * one_plus_cosine) + ROUNDING)
-        inside = (place >= least - slack) & (place <= most + slack)
-        return dr.select(inside, dr.inv_two_pi / (dr.log(most / least) * place), 0)
+        inside = one_plus >= least - ROUNDING * (dr.sqrt(2 * one_plus) + ROUNDING)
+        inside &= one_minus <= width + ROUNDING * (dr.sqrt(2 * one_minus) + ROUNDING)
+        density = dr.inv_two_pi / (logarithm * (one_plus + used / self.distance))
+        return dr.select(inside, density, 0)
 
     def _limits(self, used: Float) -> tuple[Float, Float, Float]:
-        """Least and largest ``one_plus_cosine + offset`` of flights that end in view; ``offset``.
+        """Least 1 + cos(theta) of flights that end in view, 2 less that, and a logarithm.
 
-        On an ellipsoid of eccentricity e the angles psi and theta at its foci obey
+        It is that of the largest over the least `one_plus_cosine` + ``used`` / distance. On an
+        ellipsoid of eccentricity e the angles psi and theta at its foci obey
         tan(psi / 2) = (1 - e) / (1 + e) tan(theta / 2); here (1 - e) / (1 + e) is
         used / (used + 2 distance). Flights towards the telescope end where the air does; twice
         that far, as its boundary may be oblique.
         """
+        narrow = dr.square(used / (self.field * (2 * self.distance + used)))
+        towards = used / (used + 2 * self.reach)
+        least = dr.maximum(2 / (1 + dr.rcp(narrow)), towards)
+        width = dr.minimum(2 / (1 + narrow), 2 - towards)
         offset = used / self.distance
-        wide = dr.square(self.field * (2 * self.distance + used))
-        least = 2 * dr.square(used) / (dr.square(used) + wide)
-        least = dr.maximum(least, used / (used + 2 * self.reach))
-        return least + offset, 2 + offset, offset
+        most = 2 + offset
+        # ln(most / (least + offset)), whose digits a ratio near one would not have
+        near_one = 2 * dr.atanh(dr.minimum(width, 1) / (2 * most - dr.minimum(width, 1)))
+        return least, width, dr.select(width < 1, near_one, dr.log(most / (least + offset)))
+
+
+def _one_minus_exp(x: Float) -> Float:
+    """1 - exp(-x), without cancellation."""
+    half = dr.tanh(0.5 * x)
+    return 2 * half / (1 + half)
 
 
 def quarter_turn(axis: Vector, direction: Vector) -> Vector:
@@ -103,9 +142,21 @@ def closing_distance(offset: Vector, direction: Vector, path: Float) -> Float:
     -1 where the path is shorter than the straight line.
     """
     length = dr.norm(offset)
-    # not path^2 - length^2: a path little longer than the straight line would have no digits
-    end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
-    return dr.select(path > length, end, -1)
+    excess = path - length
+    # path + offset.direction, without the cancellation of a flight towards the goal
+    consumed = excess + 0.5 * dr.squared_norm(offset + direction * length) / dr.maximum(
+        length, TINY
+    )
+    return dr.select(excess > 0, 0.5 * excess * (path + length) / consumed, -1)
+
+
+def shortened(end: Vector, direction: Vector, gap: Float) -> Float:
+    """By how much a path is shortened by ending a flight earlier: gap + |end| - |end - gap d|.
+
+    ``end`` is the flight's end less the goal; without the difference of both distances.
+    """
+    both = dr.norm(end) + dr.norm(end - direction * gap)
+    return gap * (1 + (2 * dr.dot(direction, end) - gap) / both)
 
 
 def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[Float, Float]:
@@ -114,6 +165,25 @@ def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[
     back = dr.normalize(goal - (origin + direction * distance))
     # a vertex farther by ds lengthens the path by ds less its component along the way back
     return distance, dr.rcp(1 - dr.dot(direction, back))
+
+
+def sample_ahead(most: Float, scale: Float, sample: Float) -> Float:
+    """A distance from 0 to ``most``, of a density proportional to 1 / (distance + scale)."""
+    x = _steps(most, scale) * sample
+    # exp(x) - 1, without cancellation
+    half = dr.tanh(0.5 * dr.minimum(x, 1))
+    return scale * dr.select(x < 1, 2 * half / (1 - half), dr.exp(x) - 1)
+
+
+def ahead_density(distance: Float, most: Float, scale: Float) -> Float:
+    """Of `sample_ahead`, per metre."""
+    return dr.rcp((distance + scale) * _steps(most, scale))
+
+
+def _steps(most: Float, scale: Float) -> Float:
+    """ln(1 + most / scale), without cancellation."""
+    ratio = most / scale
+    return dr.select(ratio < 1, 2 * dr.atanh(dr.minimum(ratio, 1) / (2 + ratio)), dr.log(1 + ratio))
 
 
 def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: Float) -> Float:

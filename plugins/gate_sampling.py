@@ -12,7 +12,7 @@ LOGISTIC = 0.64
 SHARPEST = 100.0
 
 
-def pulse_in_gate(part: Float, low: Float, high: Float, sigma: float) -> tuple[Float, Float]:
+def pulse_in_gate(part: Float, low: Float, high: Float, sigma: Float | None) -> tuple[Float, Float]:
     """A uniform number from ``low`` to ``high`` plus a Gaussian one, from one, and its weight.
 
     Drawn with a logistic number for the Gaussian one, as that distribution has an inverse: with
@@ -25,11 +25,11 @@ def pulse_in_gate(part: Float, low: Float, high: Float, sigma: float) -> tuple[F
     part : Float
         u, 0 to 1.
     low, high : Float
-    sigma : float
-        Standard deviation of the Gaussian number; 0: there is none.
+    sigma : Float, optional
+        Standard deviation of the Gaussian number; None: there is none.
     """
     width, middle = high - low, 0.5 * (low + high)
-    if sigma == 0:
+    if sigma is None:
         return dr.lerp(low, high, part), mi.Float(1)
     # hyperbolic sines do not overflow
     scale = dr.maximum(LOGISTIC * sigma, width / SHARPEST)

@@ -20,7 +20,8 @@ Parameter                 Type       Meaning                                    
 ``pulse_energy``          float      energy of a pulse, J                                 1
 ``pulse_duration``        float      full width at half maximum of the pulse, s;          0
                                      Gaussian in time; 0 = instantaneous
-``to_world``              transform  light leaves along local +z, e_h is local +x         identity
+``to_world``              transform  light leaves along local +z, e_h is local +x. In a   identity
+                                     lidar, the pose in the frame of each of its beams
 ========================= ========== ==================================================== =======
 
 .. code-block:: xml
@@ -83,6 +84,8 @@ def define() -> type:
             self.wavelength = positive(props, NAME, "wavelength", 532e-9)
             self.pulse_duration = at_least(props, NAME, "pulse_duration", 0.0, 0.0)
             self.stokes = _stokes(props.get("stokes", "1, 1, 0, 0"))
+            # opaque: kernels of other polarisations and pulses are the same
+            self.m_stokes = [dr.opaque(mi.Float, value) for value in self.stokes]
             self.m_energy = mi.Float(positive(props, NAME, "pulse_energy", 1.0))
             self.m_radius, self.m_cut = mi.Float(radius), mi.Float(cut)
             self.m_divergence = mi.Float(divergence)
@@ -135,7 +138,7 @@ def define() -> type:
             if not mi.is_polarized:
                 return mi.Spectrum(value)
             stokes = rotate_stokes(
-                [mi.Float(s) for s in self.stokes],
+                self.m_stokes,
                 direction,
                 transverse(self.m_pose @ mi.Vector3f(1, 0, 0), direction),
                 mi.mueller.stokes_basis(direction),

@@ -17,6 +17,8 @@ def fail(plugin: str, field: str, value: object, allowed: str) -> NoReturn:
 
 # single precision holds numbers of this size, and their squares
 TINY, HUGE = 1e-18, 1e18
+# tables of the package
+SHIPPED = Path(__file__).resolve().parents[1] / "scenes"
 
 
 def number(props: Properties, plugin: str, field: str, default: float) -> float:
@@ -87,11 +89,14 @@ def check_pose(placed: Transform, plugin: str, field: str = "to_world") -> None:
 def table(plugin: str, field: str, source: Table, columns: int) -> np.ndarray:
     """Numbers given as a tensor, or by the name of a ``.npy`` or text file.
 
+    A file is searched where Mitsuba searches, beside the scene, then among those of the package.
     Text has a line per row, blanks or commas between its numbers, and ``#`` before comments.
     """
     if not isinstance(source, str):
         return np.array(source)
     path = Path(str(mi.file_resolver().resolve(source)))
+    if not path.is_file():
+        path = SHIPPED / source
     if not path.is_file():
         fail(plugin, field, source, "a readable file")
     try:

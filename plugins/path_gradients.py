@@ -68,7 +68,10 @@ def gradients(
     if first == 1:
         # Mitsuba's derivatives call this with gradients suspended
         with dr.resume_grad():
-            slopes = _propagated(lidar.single(sample, path, width), weights)
+            light = lidar.single(sample, path, width)
+            if lidar.air.targets:
+                light = _plus(light, lidar.reflected(sample, low, high))
+            slopes = _propagated(light, weights)
     if last == 1:
         return slopes
     least, most = (dr.opaque(mi.UInt32, order) for order in orders)
@@ -113,7 +116,7 @@ def _traced(
     light, veiled = (_copied(s or [0] * 4) for s in (coming, hidden))
     slopes = _copied([0] * 4)
     order, missing = mi.UInt32(2), mi.UInt32(0)
-    path, medium = mi.Float(path), mi.MediumPtr(lidar.sensor.get_medium())
+    medium = mi.MediumPtr(lidar.sensor.get_medium())
     position, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
     stokes = _copied(sample.stokes)
     # of the vertex `bend`, and the components of light from there on
@@ -123,7 +126,7 @@ def _traced(
     onward = [_copied([0] * 4) for _ in range(components)]
     there, place, before = mi.MediumPtr(medium), mi.Point3f(position), mi.Vector3f(direction)
     after, arriving = mi.Vector3f(direction), _copied([0] * len(stokes))
-    flight, weight = lidar._first_flight(rng, position, direction, sample.aperture, path)
+    flight, excess, weight = lidar._first_flight(rng, position, direction, sample.aperture, path)
     active = flight > 0
     while dr.hint(active, label="path replay"):
         # what is drawn stays where it is
@@ -160,11 +163,10 @@ def _traced(
         active &= (weight > 0) & (missing < 2) & (rng.next_float32(active) < survival)
         weight = dr.select(active, weight / survival, 0)
         stokes, parts = _times(stokes, weight), _each_times(parts, weight)
-        path -= flight
         clear &= active
         with dr.resume_grad(when=replays):
             rest, gains, active = lidar._close(
-                sample, rng, medium, mei, stokes, path, width, active, parts
+                sample, rng, medium, mei, stokes, excess, width, active, parts
             )
             counts = active & (order >= first)
             gain = _where(counts, gains[0])
@@ -185,7 +187,7 @@ def _traced(
         arrived = stokes
         order += 1
         active &= order <= last
-        direction, stokes, flight, weight = lidar._next_flight(
+        direction, stokes, flight, excess, weight = lidar._next_flight(
             rng, medium, mei, stokes, rest, active
         )
         active &= weight > 0

@@ -11,22 +11,25 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
-from .bodies import slabs
+from .bodies import first_hit, slabs
 from .bounds import Bounds
 from .closed_paths import (
     OpenPath,
+    ahead_density,
     closed,
     closing_distance,
     near_density,
     quarter_turn,
+    sample_ahead,
     sample_near,
+    shortened,
 )
 from .gate_sampling import pulse_in_gate
 from .laser import channel_of
-from .media import coefficients, collision, interaction, transmittance
+from .media import coefficients, collision, interaction, narrowest_peak, transmittance
 from .mitsuba_tables import has_tables, off_the_poles
 from .polarization import apply_phase_function, rotate_stokes, transverse
-from .random_numbers import generator, pair
+from .random_numbers import pair
 from .resampling import choose
 from .surfaces import Air, media_of
 from .variant_types import (
@@ -50,20 +53,27 @@ Products: TypeAlias = Mapping[tuple[int, int], Float]
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
-# Fraction of first vertices sampled where isotropic scattering closes paths most often.
+# Of first vertices, the fraction sampled anywhere in front of the gate, and of the others that
+# sampled where isotropic scattering closes paths most often.
+EVEN_FRACTION = 0.3
 NEAR_FRACTION = 0.35
-# Of last flights, the fraction with directions sampled from the phase function, and the largest
-# fraction with directions sampled from the telescope.
-PHASE_FRACTION = 0.2
-BACK_FRACTION = 0.5
 # Of intermediate flights, the fraction with directions sampled from the phase function; the others
 # mostly stay in a field of view that is wider than the telescope's by this factor.
-PHASE_FLIGHT_FRACTION = 0.3
-WIDER = 1.6
-# Of intermediate flights, the fraction whose remaining path is sampled as that of first vertices.
-NEAR_FLIGHT_FRACTION = 0.3
+PHASE_FLIGHT_FRACTION = 0.4
+WIDER = 2.5
+# Of intermediate flights, the fraction that ends anywhere on the way to the gate, as likely in each
+# part of it; the others end in front of where the path would close.
+EVEN_FLIGHT_FRACTION = 0.6
+# Distances in front of that place are sampled evenly in their logarithm, beyond half the radius of
+# the field of view or, if that is less, this fraction of the width of the forward peak times the
+# way back through air: light scattered back is scattered forwards again on that way.
+NEAREST = 0.03
+# Least of them, over half the field's radius.
+LEAST_NEAREST = 1e-6
 # Russian roulette: probability of survival over the weight.
 ROULETTE_FACTOR = 30.0
+# Of the way to a surface, what is left out in front of it.
+SKIN = 1e-6
 
 
 class Sample:
@@ -93,6 +103,25 @@ class Sample:
         self.delay, self.stokes = delay, stokes
 
 
+class Orders:
+    """Sums of S0 by scattering order, in rows of few samples: one sum of millions loses digits."""
+
+    def __init__(self, rows: int, max_order: int) -> None:
+        self.sums = dr.zeros(mi.Float, rows * max_order)
+        dr.make_opaque(self.sums)
+        self.rows, self.max_order = dr.opaque(mi.UInt32, rows), max_order
+
+    def add(self, value: Float, order: UInt, row: UInt, active: Mask = True) -> None:
+        """Add values of samples, each to its row."""
+        add(self.sums, value, (order - 1) * self.rows + row, active)
+
+    def totals(self, parts: int) -> list[Float]:
+        """Of each order, the sums of so many rows each."""
+        row = dr.arange(mi.UInt32, dr.width(self.sums) // self.max_order)
+        first = (self.rows * dr.opaque(mi.UInt32, k) for k in range(self.max_order))
+        return [dr.block_sum(dr.gather(mi.Float, self.sums, row + k), parts) for k in first]
+
+
 class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
@@ -107,20 +136,29 @@ class Lidar:
         self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
         # of the delays, half the path: so ranges of a gate shift by as much
-        self.pulse_sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
+        self.pulse_sigma = None
+        if sensor.laser.pulse_duration > 0:
+            sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
+            self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
+        self.peak = narrowest_peak(media_of(scene, sensor), self.wavelengths)
+        # of each sample's beam, once they are emitted
+        self.field_tan = sensor.field_tangent(mi.UInt32(0))
+        # last vertices that were drawn in the field of view and are not in it: rounding alone
+        self.rejected = dr.zeros(mi.UInt32, 1)
+        dr.make_opaque(self.rejected)
 
-    def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
-        """Samples of beams by their index, with independent random numbers."""
-        rng = generator(seed, beam, number)
+    def emit(self, rng: Generator, beam: UInt) -> Sample:
+        """Samples of beams by their index."""
         sensor = self.sensor
+        self.field_tan = sensor.field_tangent(beam)
         to_world = sensor.world_transform()
         frame = sensor.beam_frame(beam)
         start, time = sensor.beam_origin(beam), sensor.beam_time(beam)
         origin, direction, aperture = self._ends(rng, frame, start)
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
-        if sensor.laser.pulse_duration > 0:
+        if self.pulse_sigma is not None:
             delay = self.pulse_sigma * mi.warp.square_to_std_normal(pair(rng)).x
         stokes = self._emitted(axes, direction)
         return Sample(rng, frame, start, time, axes, origin, direction, aperture, delay, stokes)
@@ -129,8 +167,9 @@ class Lidar:
         """Origin and direction of a ray of the laser, and a point of the telescope."""
         sensor, to_world = self.sensor, self.sensor.world_transform()
         origin, direction = sensor.laser.sample_local(pair(rng), pair(rng))
-        origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(origin)))
-        direction = dr.normalize(to_world @ frame.to_world(direction))
+        pose = sensor.laser.m_pose
+        origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(pose @ origin)))
+        direction = dr.normalize(to_world @ frame.to_world(pose @ direction))
         aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
         return origin, direction, aperture
 
@@ -138,10 +177,11 @@ class Lidar:
         """The laser's Stokes vector about Mitsuba's axes of a direction."""
         if not mi.is_polarized:
             return [mi.Float(1)]
+        laser = self.sensor.laser
         return rotate_stokes(
-            [mi.Float(s) for s in self.sensor.laser.stokes],
+            laser.m_stokes,
             direction,
-            transverse(axes.s, direction),
+            transverse(axes.to_world(laser.m_pose @ mi.Vector3f(1, 0, 0)), direction),
             mi.mueller.stokes_basis(direction),
         )
 
@@ -166,6 +206,74 @@ class Lidar:
         )
         return received
 
+    def reflected(self, sample: Sample, low: Float, high: Float) -> Stokes:
+        """Stokes vector (about e_h) of the light that a diffuse surface reflects to the telescope.
+
+        ``low`` and ``high`` are twice the gate's ranges less the sample's delay.
+        """
+        si, back, path = self._target(sample)
+        active = (path >= low) & (path < high)
+        medium = mi.MediumPtr(self.sensor.get_medium())
+        # as far as in front of the surface, which would hide itself
+        out, medium = transmittance(
+            self.air,
+            self.bounds,
+            medium,
+            sample.origin,
+            sample.direction,
+            si.t * (1 - SKIN),
+            self.channel,
+            self.wavelengths,
+            sample.time,
+            sample.rng,
+            active,
+            self.differentiable,
+        )
+        return self._from_target(sample, sample.rng, si, back, medium, out, active)
+
+    def _target(self, sample: Sample) -> tuple[Interaction, Vector, Float]:
+        """Where a sample meets a diffuse surface, the way back, and the length of the path."""
+        ray = mi.Ray3f(sample.origin, sample.direction, sample.time, self.wavelengths)
+        si = self.air.targets.ray_intersect(ray)
+        back = sample.aperture - si.p
+        return si, back, si.t + dr.norm(back)
+
+    def _from_target(
+        self,
+        sample: Sample,
+        rng: Generator,
+        si: Interaction,
+        back: Vector,
+        medium: MediumPtr,
+        weight: Float,
+        active: Mask,
+    ) -> Stokes:
+        """Light from a diffuse surface at the telescope, unpolarised, of light of that weight."""
+        distance = dr.norm(back)
+        wo = back / distance
+        active = active & si.is_valid() & self._in_view(sample.axes, -back)
+        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(wo), active)
+        value = (value[0, 0] if mi.is_polarized else value)[self.channel]
+        active = active & (value > 0)
+        place = si.spawn_ray(wo).o
+        out, _ = transmittance(
+            self.air,
+            self.bounds,
+            medium,
+            place,
+            wo,
+            distance,
+            self.channel,
+            self.wavelengths,
+            sample.time,
+            rng,
+            active,
+            self.differentiable,
+        )
+        cosine = -dr.dot(wo, sample.axes.n)
+        light = weight * out * value * self.area * cosine / dr.square(distance)
+        return [dr.select(active, light, 0), mi.Float(0), mi.Float(0), mi.Float(0)]
+
     @dr.syntax
     def by_contribution(
         self, sample: Sample, low: Float, high: Float, candidates: UInt
@@ -183,14 +291,15 @@ class Lidar:
         origin, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
         aperture, path = mi.Point3f(sample.aperture), mi.Float(0)
         total, target, number = mi.Float(0), mi.Float(0), mi.UInt32(0)
+        pulse = None if self.pulse_sigma is None else 2 * self.pulse_sigma
         while dr.hint(number < candidates, label="candidates"):
             start, onward, end = self._ends(rng, sample.frame, sample.start)
             part = (mi.Float(number) + rng.next_float32()) / mi.Float(candidates)
-            length, weight = pulse_in_gate(part, low, high, 2 * self.pulse_sigma)
+            length, weight = pulse_in_gate(part, low, high, pulse)
             closure, volume = closed(start, onward, end, length)
             place = start + onward * closure
             active = (length > 0) & (closure > 0)
-            active &= self.sensor.in_field_of_view(axes, place - end)
+            active &= self._in_view(axes, place - end)
             crossings = self.air.crossings(start, onward)
             _, _, _, medium, _ = self.air.next_surface(
                 crossings, start, onward, closure, mi.Float(dr.inf), around, active
@@ -227,22 +336,19 @@ class Lidar:
         low: Float,
         high: Float,
         position: Float,
-        max_order: int,
-        split: bool,
-        by_order: Float,
-        cell: UInt,
+        max_order: UInt,
+        by_order: Orders | None,
+        row: UInt,
     ) -> Stokes:
         """The sum of all orders from the second up to ``max_order``, as `single` gives the first.
 
         ``low`` and ``high`` are twice the gate's ranges less the sample's delay, ``position`` (0
-        to 1) is the place of the sample's whole path between them. With ``split`` each order's S0
-        is also added to ``by_order``.
+        to 1) is the place of the sample's whole path between them. Each order's S0 is also added
+        to ``by_order``.
         """
         medium = mi.MediumPtr(self.sensor.get_medium())
         path = dr.lerp(low, high, position)
-        return self._further(
-            sample, medium, path, high - low, mi.UInt32(max_order), split, by_order, cell, max_order
-        )
+        return self._further(sample, medium, path, high - low, max_order, by_order, row)
 
     @dr.syntax
     def _further(
@@ -252,19 +358,17 @@ class Lidar:
         path: Float,
         width: Float,
         last: UInt,
-        split: bool,
-        by_order: Float,
-        cell: UInt,
-        max_order: int,
+        by_order: Orders | None,
+        row: UInt,
     ) -> Stokes:
         """Orders from two on: the path is closed once from every vertex but the last."""
         # local names, as the loop records local variables only
         aperture, rng = sample.aperture, sample.rng
         total, order = _copied([0, 0, 0, 0]), mi.UInt32(2)
-        path, medium = mi.Float(path), mi.MediumPtr(medium)
+        medium = mi.MediumPtr(medium)
         position, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
         stokes = _copied(sample.stokes)
-        flight, weight = self._first_flight(rng, position, direction, aperture, path)
+        flight, excess, weight = self._first_flight(rng, position, direction, aperture, path)
         active = flight > 0
         while dr.hint(active, label="scattering orders"):
             out, medium = transmittance(
@@ -290,16 +394,16 @@ class Lidar:
             survival = dr.select(order == 2, 1, dr.minimum(ROULETTE_FACTOR * weight, 1))
             active &= (weight > 0) & (rng.next_float32(active) < survival)
             stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
-            path -= flight
-            rest, gains, active = self._close(sample, rng, medium, mei, stokes, path, width, active)
+            rest, gains, active = self._close(
+                sample, rng, medium, mei, stokes, excess, width, active
+            )
             gain = gains[0]
             total = _sum(total, gain)
-            if dr.hint(split, mode="scalar"):
-                add(by_order, gain[0], cell * max_order + order - 1, active)
+            _split(by_order, gain[0], order, row, active)
 
             order += 1
             active &= order <= last
-            direction, stokes, flight, weight = self._next_flight(
+            direction, stokes, flight, excess, weight = self._next_flight(
                 rng, medium, mei, stokes, rest, active
             )
             active &= weight > 0
@@ -312,19 +416,21 @@ class Lidar:
         medium: MediumPtr,
         mei: Interaction,
         stokes: Stokes,
-        path: Float,
+        excess: Float,
         width: Float,
         active: Mask,
         others: Sequence[Stokes] = (),
     ) -> tuple[OpenPath, list[Stokes], Mask]:
         """The path closed by one more vertex.
 
-        Returns what remains of it at the vertex, the Stokes vectors of the light about e_h of
-        ``stokes`` and of ``others``, and where the path is still open.
+        ``excess`` is that of the remaining path, handed on from flight to flight: as the difference
+        of path and distance it would have few digits. Returns the open path at the vertex, the
+        Stokes vectors of the light about e_h of ``stokes`` and of ``others``, and where the path is
+        still open.
         """
         away = mei.p - sample.aperture
         distance = dr.norm(away)
-        away, excess = away / distance, path - distance
+        away = away / distance
         active = active & (excess > 0)
         _, reach = slabs(self.low, self.high, mei.p, -away)
         # as long as the path is open, its remainder exceeds the straight way back
@@ -340,30 +446,55 @@ class Lidar:
         if others:
             more, _ = self._scatter_all(medium, mei, others, closing, volume > 0)
             several += more
+        # once more by the coordinates that the connection uses
+        end = mei.p + closing * leg - sample.aperture
+        self._reject((volume > 0) & ~self._in_view(sample.axes, end))
         gains = self._connect(
             sample, rng, mei.p, closing, leg, medium, several, width * volume, volume > 0
         )
         return rest, gains, active
 
+    def _reject(self, lost: Mask) -> None:
+        """Count samples of which a sampler has left its own domain."""
+        one = mi.UInt32(1)
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, self.rejected, one, mi.UInt32(0), lost, mode=dr.ReduceMode.Local
+        )
+
     def _first_flight(
         self, rng: Generator, origin: Point, direction: Vector, aperture: Point, path: Float
-    ) -> tuple[Float, Float]:
-        """Length of a first flight and the inverse of its density; -1 where there is no air."""
-        reach = closing_distance(origin - aperture, direction, path)
+    ) -> tuple[Float, Float, Float]:
+        """Length of a first flight, the excess length that it leaves, the inverse of its density.
+
+        The length is -1 where there is no air.
+        """
+        offset = origin - aperture
+        reach = closing_distance(offset, direction, path)
         enters, leaves = slabs(self.low, self.high, origin, direction)
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
         # half the field of view's radius at half the path: nearer vertices send most of what they
         # scatter through the field, farther ones past it
-        scale = 0.25 * path * self.sensor.m_fov_tan
+        scale = 0.25 * path * self.field_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
-        # for phase functions with a stronger forward peak than the isotropic one
-        steps = dr.log((most + scale) / (least + scale))
-        far = (least + scale) * dr.exp(steps * choice.y) - scale
-        gap = dr.select(choice.x < NEAR_FRACTION, near, far)
+        # for phase functions with a stronger forward peak than the isotropic one, and for paths
+        # that go on
+        depth, nearest = most - least, least + self._nearest(scale, most)
+        ahead = least + sample_ahead(depth, nearest, choice.y)
+        gap = dr.select(choice.x < NEAR_FRACTION * (1 - EVEN_FRACTION), near, ahead)
+        gap = dr.select(choice.x > 1 - EVEN_FRACTION, dr.lerp(least, most, choice.y), gap)
         density = dr.lerp(
-            dr.rcp((gap + scale) * steps), near_density(gap, least, most, scale), NEAR_FRACTION
+            ahead_density(gap - least, depth, nearest),
+            near_density(gap, least, most, scale),
+            NEAR_FRACTION,
         )
-        return dr.select((path > 0) & (most > least), reach - gap, -1), dr.rcp(density)
+        density = dr.lerp(density, dr.rcp(depth), EVEN_FRACTION)
+        excess = shortened(offset + direction * reach, direction, gap)
+        flight = dr.select((path > 0) & (most > least), reach - gap, -1)
+        return flight, excess, dr.rcp(density)
+
+    def _nearest(self, scale: Float, way: Float) -> Float:
+        """Distance from which on places in front of the one that closes a path are sampled."""
+        return dr.clip(NEAREST * self.peak * way, LEAST_NEAREST * scale, scale)
 
     def _half_field(self, axes: Frame, away: Vector) -> Float:
         """Tangent of half the widest angle between a direction and one of the field of view."""
@@ -372,8 +503,11 @@ class Lidar:
         field = self._half_fov()
         return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
+    def _in_view(self, axes: Frame, to_source: Vector) -> Mask:
+        return self.sensor.in_field_of_view(axes, to_source, self.field_tan)
+
     def _half_fov(self) -> Float:
-        return self.sensor.m_fov_tan / (1 + dr.sqrt(1 + dr.square(self.sensor.m_fov_tan)))
+        return self.field_tan / (1 + dr.sqrt(1 + dr.square(self.field_tan)))
 
     def _last_flight(
         self,
@@ -387,34 +521,25 @@ class Lidar:
     ) -> tuple[Vector, Stokes, Float, Float]:
         """Direction, Stokes vector and length of the flight to the last vertex; its weight.
 
-        One of two candidates, selected by its contribution if there is no obstacle and the medium
-        is the same. The weight includes d(length)/d(path).
+        Of three candidates, one from the phase function, one towards the field of view and one from
+        the telescope, selected by its contribution if there is no obstacle and the medium is the
+        same. The weight includes d(length)/d(path).
         """
         phase, axes, path = medium.phase_function(), sample.axes, rest.distance + rest.excess
-        # sampling from the telescope is best for last vertices far off, in radii of its field
-        across = rest.field / self._half_fov() - 1
-        along = 0.5 * rest.excess / (rest.distance * self.sensor.m_fov_tan)
-        far = dr.square(across) + dr.square(along)
-        backward = BACK_FRACTION * (1 - dr.rcp(1 + far))
-        strategy = rng.next_float32(active)
-        by_phase, by_back = strategy < PHASE_FRACTION, strategy > 1 - backward
-
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
         aimed = rest.sample(rest.excess, pair(rng))
-        inward = self._in_field(axes, rng)
-        first = dr.select(by_phase, drawn, dr.select(by_back, inward, aimed))
-        axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, rest.away))
-        # a quarter turn about the axis has the angle to it for which the first one was drawn
+        inward = rest.from_telescope(self._in_field(axes, rng))
         tried = []
-        for wo in (first, quarter_turn(axis, first)):
-            # towards the vertex that a direction from the telescope stands for, where drawn so
-            end = sample.aperture + wo * closing_distance(sample.aperture - mei.p, wo, path)
-            wo = dr.select(by_back, dr.normalize(end - mei.p), wo)
+        for wo in (drawn, aimed, inward):
             one_plus_cosine = rest.one_plus_cosine(wo)
             leg = rest.leg(rest.excess, one_plus_cosine)
             volume = dr.rcp(rest.slope(rest.excess, one_plus_cosine, leg))
             end = mei.p + wo * leg
-            in_view = active & self.sensor.in_field_of_view(axes, end - sample.aperture)
+            # not from the end's coordinates, which are rounded to those of the world
+            to_end = rest.away * rest.distance + wo * leg
+            in_view = active & self._in_view(axes, to_end)
+            if wo is inward:
+                self._reject(active & ~in_view)
             # both legs meet the ellipsoid at the same angle
             from_telescope = dr.square(leg / (path - leg)) / self._field_solid_angle()
             from_telescope = dr.select(in_view, from_telescope, 0)
@@ -423,11 +548,7 @@ class Lidar:
             there = interaction(medium, end, wo, self.wavelengths, sample.time)
             back = dr.normalize(sample.aperture - end)
             received, back_pdf = self._scatter(medium, there, scattered, back, in_view)
-            # of all three strategies together (Veach & Guibas 1995, balance heuristic): none has a
-            # large weight where another one would have drawn the direction
-            density = PHASE_FRACTION * pdf + backward * from_telescope
-            aimed_density = rest.density(rest.excess, one_plus_cosine)
-            density += (1 - PHASE_FRACTION - backward) * aimed_density
+            density = pdf + rest.density(rest.excess, wo) + from_telescope
             # never 0 where there may be light: the medium may be a different one there
             target = (0.95 * received[0] + 0.05 * scattered[0] * back_pdf) * volume
             target = dr.select(in_view & (density > 0), target, 0)
@@ -443,43 +564,57 @@ class Lidar:
         stokes: Stokes,
         rest: OpenPath,
         active: Mask,
-    ) -> tuple[Vector, Stokes, Float, Float]:
-        """Direction, Stokes vector (of unchanged S0), length and weight of a further flight."""
+    ) -> tuple[Vector, Stokes, Float, Float, Float]:
+        """A further flight: direction, Stokes vector (of unchanged S0), length, excess, weight.
+
+        The excess length is what the flight leaves.
+        """
         phase, rest = medium.phase_function(), rest.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        # transmittances to the gate differ little: any part of the excess length is about as likely
-        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.sensor.m_fov_tan
-        choice, near = pair(rng), sample_near(0, most, scale, pair(rng), rng.next_float32(active))
-        gap = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
-        gap_density = near_density(gap, 0, most, scale)
-        gap_density = 0.5 * dr.lerp(dr.rcp(most), gap_density, NEAR_FLIGHT_FRACTION)
-        used = rest.excess - 2 * gap
-        sample = pair(rng)
+        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.field_tan
+        nearest = self._nearest(scale, rest.reach)
+        # transmittances to the gate differ little: any part of the way is about as likely
+        choice, sample = pair(rng), pair(rng)
+        even = choice.x < EVEN_FLIGHT_FRACTION
+        gap = dr.select(even, most * choice.y, sample_ahead(most, nearest, choice.y))
         mirrored = mi.Point2f(1 - sample.x, sample.y + 0.25)
-        # two candidates again, with opposite azimuth and complementary polar sample
+        used = rest.excess - 2 * gap
+        # two candidates, with opposite azimuth and complementary polar sample
         tried = []
         for wo in (
             dr.select(by_phase, drawn, rest.sample(used, sample)),
             dr.select(by_phase, quarter_turn(-mei.wi, drawn), rest.sample(used, mirrored)),
         ):
             one_plus_cosine = rest.one_plus_cosine(wo)
-            leg = rest.leg(used, one_plus_cosine)
+            # what is drawn after its direction is a length, so that it ends in the air
+            _, leaves = slabs(self.low, self.high, mei.p, wo)
+            whole = rest.leg(rest.excess, one_plus_cosine)
+            longest = dr.minimum(whole, leaves)
+            short = sample_ahead(longest, nearest, choice.y)
+            short = dr.select(even, longest * choice.y, short)
+            leg = dr.select(by_phase, longest - short, rest.leg(used, one_plus_cosine))
+            left = 0.5 * dr.select(by_phase, rest.left(wo, whole - longest + short, whole), 2 * gap)
             scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
-            density = dr.lerp(rest.density(used, one_plus_cosine), pdf, PHASE_FLIGHT_FRACTION)
-            density *= rest.slope(used, one_plus_cosine, leg) * gap_density
+            consumed = rest.excess - 2 * left
+            density = rest.density(consumed, wo)
+            density *= 0.5 * rest.slope(consumed, one_plus_cosine, leg)
+            density *= _even_or_ahead(left, most, nearest)
+            pdf *= _even_or_ahead(dr.select(by_phase, short, longest - leg), longest, nearest)
+            density = 2 * dr.lerp(density, pdf, PHASE_FLIGHT_FRACTION)
             end = mei.p + wo * leg
-            inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
+            inside = active & (leg > 0) & (left > 0) & dr.all((end > self.low) & (end < self.high))
             target = dr.select(inside & (density > 0), scattered[0], 0)
-            tried.append((target, density, (wo, scattered, leg)))
-        (wo, scattered, leg), weight = choose(rng, *tried)
+            tried.append((target, density, (wo, scattered, leg, 2 * left)))
+        (wo, scattered, leg, excess), weight = choose(rng, *tried)
         # the change of S0 goes into the weight, on which roulette is played
         factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
-        return wo, _scaled(scattered, factor), leg, dr.select(factor > 0, weight / factor, 0)
+        weight = dr.select(factor > 0, weight / factor, 0)
+        return wo, _scaled(scattered, factor), leg, excess, weight
 
     def _field_solid_angle(self) -> Float:
-        cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
-        return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
+        cosine = dr.rsqrt(1 + dr.square(self.field_tan))
+        return dr.two_pi * dr.square(self.field_tan * cosine) / (1 + cosine)
 
     def _in_field(self, axes: Frame, rng: Generator) -> Vector:
         """A direction of the field of view, uniform in solid angle."""
@@ -507,7 +642,7 @@ class Lidar:
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
         """
         vertex = position + direction * distance
-        active = active & self.sensor.in_field_of_view(sample.axes, vertex - sample.aperture)
+        active = active & self._in_view(sample.axes, vertex - sample.aperture)
         out, medium = transmittance(
             self.air,
             self.bounds,
@@ -541,7 +676,7 @@ class Lidar:
         back = sample.aperture - mei.p
         distance = dr.norm(back)
         wo = back / distance
-        active = active & self.sensor.in_field_of_view(sample.axes, -back)
+        active = active & self._in_view(sample.axes, -back)
         out, _ = transmittance(
             self.air,
             self.bounds,
@@ -592,24 +727,54 @@ class Lidar:
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return [apply_phase_function(value, stokes, self.channel) for stokes in several], pdf
 
+    def unscattered(self, sample: Sample, low: Float, high: Float) -> tuple[Stokes, Float, Mask]:
+        """Light that meets a diffuse surface and no air on its way, of an analog free flight.
+
+        It is the first one of `analog`, with the same random numbers. ``low`` and ``high`` are
+        ranges. Returns the Stokes vector (about e_h), the range, and where there is light.
+        """
+        rng, active = mi.PCG32(sample.rng), mi.Bool(True)
+        medium = mi.MediumPtr(self.sensor.get_medium())
+        si, back, path = self._target(sample)
+        range_ = 0.5 * path + sample.delay
+        near = si.t * (1 - SKIN)
+        _, medium, found = collision(
+            self.air,
+            self.bounds,
+            medium,
+            sample.origin,
+            sample.direction,
+            2 * (high - sample.delay),
+            self.channel,
+            self.wavelengths,
+            sample.time,
+            rng,
+            active,
+        )
+        first, _ = first_hit(self.air.opaque, sample.origin, sample.direction, active)
+        active = ~found & (first >= near) & (range_ >= low) & (range_ < high)
+        light = self._from_target(sample, rng, si, back, medium, mi.Float(1), active)
+        return light, range_, active & (light[0] > 0)
+
     @dr.syntax
     def analog(
         self,
         sample: Sample,
-        max_order: int,
-        base: UInt,
-        gates: int,
+        max_order: UInt,
+        row: UInt,
+        parts: UInt,
+        gates: UInt,
         sums: Sequence[Float],
         products: Products,
         largest: UInt,
         magnified: float,
-        split: bool,
-        by_order: Float,
+        by_order: Orders | None,
     ) -> None:
         """Analog free flights; every collision is connected to the telescope.
 
         Adds contributions to ``sums``, and their products, each factor ``magnified``, to
-        ``products``; ``largest`` becomes the bits of the largest square.
+        ``products``; ``largest`` becomes the bits of the largest square. ``row`` is a sample's
+        place in them for the first gate, ``parts`` the step from gate to gate.
 
         A sample's apparent range does not decrease from one order to the next (triangle
         inequality), so its contribution to a gate is complete when a later gate is reached: only
@@ -623,6 +788,13 @@ class Lidar:
         travelled, order = mi.Float(2 * sample.delay), mi.UInt32(1)
         gate, held = mi.UInt32(0), _copied([0, 0, 0, 0])
         active = mi.Bool(True)
+        if dr.hint(self.air.targets is not None, mode="scalar"):
+            # a sample of whose light none is scattered in the air: it adds to no other
+            light, place, lit = self.unscattered(sample, low, high)
+            at = mi.UInt32(dr.select(lit, (place - low) / (high - low) * gates, 0))
+            at = row + dr.minimum(at, gates - 1) * parts
+            _deposit(sums, products, largest, magnified, at, light, lit)
+            _split(by_order, light[0], order, at, lit)
         while dr.hint(active, label="scattering orders"):
             began = mi.Bool(active)
             flight, medium, active = collision(
@@ -651,13 +823,13 @@ class Lidar:
             # the distance to the last vertex is drawn, not forced: it has no weight of its own
             gains = self._receive(sample, rng, medium, mei, [stokes], counts, mi.Float(1))
             gain = gains[0]
-            now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
+            now = dr.minimum(mi.UInt32(dr.select(counts, fraction * gates, 0)), gates - 1)
+            now = dr.select(counts, now, gate)
             done = now != gate
-            _deposit(sums, products, largest, magnified, base + gate, held, done)
+            _deposit(sums, products, largest, magnified, row + gate * parts, held, done)
             held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
             gate = now
-            if dr.hint(split, mode="scalar"):
-                add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
+            _split(by_order, gain[0], order, row + gate * parts, counts)
             order += 1
             # later orders arrive from farther away still
             active &= (order <= max_order) & (range_ < high)
@@ -667,7 +839,19 @@ class Lidar:
             stokes = apply_phase_function(value, stokes, self.channel)
             direction = mi.Vector3f(onward)
             active &= (density > 0) & (stokes[0] > 0)
-            _deposit(sums, products, largest, magnified, base + gate, held, began & ~active)
+            ended = began & ~active
+            _deposit(sums, products, largest, magnified, row + gate * parts, held, ended)
+
+
+def _split(by_order: Orders | None, value: Float, order: UInt, row: UInt, active: Mask) -> None:
+    if by_order is not None:
+        by_order.add(value, order, row, active)
+
+
+def _even_or_ahead(distance: Float, most: Float, nearest: Float) -> Float:
+    """Density of where intermediate flights end in front of the place where paths close."""
+    ahead = ahead_density(distance, most, nearest)
+    return dr.lerp(ahead, dr.rcp(most), EVEN_FLIGHT_FRACTION)
 
 
 def add(total: Float, value: Float, cell: UInt, active: Mask = True) -> None:

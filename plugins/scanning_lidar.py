@@ -1,8 +1,8 @@
 """
 .. _sensor-scanning_lidar:
 
-Scanning monostatic lidar (``scanning_lidar``)
-----------------------------------------------
+Scanning lidar (``scanning_lidar``)
+-----------------------------------
 
 A telescope that points along many beams, one per pixel of its film, and receives the light of a
 nested :ref:`laser <emitter-laser>` that is scattered back from range gates. The telescope of each
@@ -15,7 +15,8 @@ own, as those of a scanner on an aircraft.
 Parameter                    Type      Meaning                                              Default
 ============================ ========= ==================================================== =======
 ``aperture_radius``          float     telescope radius, m                                  0.5
-``fov_half_mrad``            float     field of view, half angle, mrad                      5
+``fov_half_mrad``            float,    field of view, half angle, mrad; or as many of them  5
+                             string    as beams, film row by row from the top left
 ``gate_kind``                string    ``planar``: between planes perpendicular to the      planar
                                        scan's axis; ``spherical``: equal two-way time
 ``gate_start, gate_stop``    float     start of the first and end of the last gate, m       required
@@ -44,7 +45,17 @@ the ranges from X0 to X1 over the cosine of the angle between beam axis and x. A
 is at x reaches these planes at ranges that are shorter by x over that cosine. ``spherical`` gates
 are ranges from each beam's own origin, shorter by x: the gates follow the air, not the lidar.
 
+The laser's ``to_world`` is its pose in the frame of each beam (e_h, e_v, beam axis), from the
+middle of the telescope; light leaves along its z. With an offset or a tilt, laser and telescope are
+bistatic: the range of a path is half its length from laser to telescope, and light scattered once
+is received only where the beam is in the field of view. The laser must be in the telescope's
+medium. Turned about its axis, it emits its Stokes vector about a turned e_h.
+
+A telescope of several fields of view (MFOV) is a film with one pixel for each: beams of the same
+direction, each with a field of its own, in one rendering.
+
 Files of tables are ``.npy``, or text with numbers separated by blanks or commas and ``#`` comments.
+They are searched beside the scene, in Mitsuba's other folders and among those of the package.
 Integrators other than :ref:`gated_volpath <integrator-gated_volpath>` use this sensor as a camera
 along the beams, without laser and gates, and a warning says so.
 
@@ -74,7 +85,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .parameters import check_pose, choice, fail, number, pose, positive, whole
+from .parameters import check_pose, choice, fail, number, numbers, pose, positive, whole
 from .parameters import table as read_table
 from .polarization import horizontal_axis
 from .registration import register
@@ -117,7 +128,11 @@ def define() -> type:
             self.gate_kind = choice(props, NAME, "gate_kind", "planar", ("planar", "spherical"))
             self.gate_count = whole(props, NAME, "gate_count", 1, 1)
             self.m_aperture = dr.opaque(mi.Float, positive(props, NAME, "aperture_radius", 0.5))
-            self.m_fov = mi.Float(positive(props, NAME, "fov_half_mrad", 5.0))
+            self.m_fov = mi.Float(
+                numbers(props, NAME, "fov_half_mrad", "")
+                if isinstance(props.get("fov_half_mrad", 5.0), str)
+                else positive(props, NAME, "fov_half_mrad", 5.0)
+            )
             for field in ("gate_start", "gate_stop"):
                 if field not in props:
                     fail(NAME, field, "nothing", "a range in m")
@@ -173,10 +188,14 @@ def define() -> type:
             """Area of the telescope, m^2."""
             return dr.pi * self.m_aperture * self.m_aperture
 
-        def in_field_of_view(self, frame: Frame, to_source: Vector) -> Mask:
-            """Whether the direction ``to_source`` (any length) is in a beam's field of view."""
+        def field_tangent(self, beam: UInt) -> Float:
+            """Tangent of the field of view of beams, half angle."""
+            return dr.gather(mi.Float, self.m_fov_tan, dr.minimum(beam, self.m_fov_last))
+
+        def in_field_of_view(self, frame: Frame, to_source: Vector, tangent: Float) -> Mask:
+            """Whether the direction ``to_source`` (any length) is in a field of view about z."""
             local = frame.to_local(to_source)
-            limit = self.m_fov_tan * local.z
+            limit = tangent * local.z
             return (local.z > 0) & (dr.squared_norm(local.xy) <= limit * limit)
 
         def beam_axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -193,6 +212,12 @@ def define() -> type:
             ranges = self.ranges(dr.gather(mi.Vector3f, self.m_directions, beam), origin)
             places = np.array(self.world_transform() @ origin, float).T
             return places, np.array([np.array(end, float) for end in ranges])
+
+        def laser_places(self) -> np.ndarray:
+            """Of all beams: where the laser is, in the world, (n, 3)."""
+            beam = dr.arange(mi.UInt32, self.beam_count)
+            offset = self.beam_frame(beam).to_world(self.laser.m_pose.translation())
+            return np.array(self.world_transform() @ (self.beam_origin(beam) + offset), float).T
 
         def world_transform(self) -> Transform:
             return self.m_pose
@@ -241,11 +266,17 @@ def define() -> type:
             start, stop = self.m_gate_start[0], self.m_gate_stop[0]
             if not 0 < self.m_aperture[0] < np.inf:
                 fail(NAME, "aperture_radius", self.m_aperture[0], "a finite radius above 0 m")
-            fov = self.m_fov[0] * 1e-3
-            if not 0 < fov < np.pi / 2:
+            fov = np.array(self.m_fov, float) * 1e-3
+            if fov.size not in (1, self.beam_count):
+                expected = f"one, or {self.beam_count}, one per film pixel"
+                fail(NAME, "fov_half_mrad", f"{fov.size} numbers", expected)
+            wrong = np.flatnonzero(~((fov > 0) & (fov < np.pi / 2)))
+            if wrong.size:
                 expected = "an angle above 0 and less than a half space, 1570.8 mrad"
-                fail(NAME, "fov_half_mrad", self.m_fov[0], expected)
-            self.m_fov_tan = dr.opaque(mi.Float, np.tan(fov))
+                fail(NAME, "fov_half_mrad", self.m_fov[int(wrong[0])], expected)
+            self.m_fov_tan = mi.Float(np.tan(fov))
+            self.m_fov_last = dr.opaque(mi.UInt32, fov.size - 1)
+            dr.make_opaque(self.m_fov_tan)
             check_pose(self.m_pose, NAME)
             if not 0 < start < np.inf:
                 fail(NAME, "gate_start", start, "a range above 0 m")

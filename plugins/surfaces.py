@@ -25,6 +25,7 @@ from .bodies import (
     name_of,
     parts_of_shape,
     passes_light,
+    reflects,
     scene_of,
 )
 from .parameters import fail
@@ -68,6 +69,8 @@ class Air:
         # the last body that a place is in is the smallest: its medium holds
         self.bodies.sort(key=lambda body: -body.volume)
         self.opaque = scene_of(opaque) if opaque else None
+        targets = [shape for shape in opaque if reflects(shape)]
+        self.targets: Scene = scene_of(targets) if targets else None
         around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
         self.around = mi.MediumPtr(around)
         for body in self.bodies:
@@ -189,6 +192,12 @@ def _surroundings(bodies: list[Body], sheets: list[Sheet], sensor: Sensor) -> Me
         inside = body.contains(places)
         outer[inside & (outer < 0)] = index
         inner[inside] = index
+    if dr.any(sensor.laser.m_pose.translation() != 0):
+        lasers = sensor.laser_places()
+        for body in bodies:
+            if (body.contains(lasers) != body.contains(places)).any():
+                expected = f"a place on the telescope's side of {name_of(body.shape)}"
+                fail("laser", "to_world", sensor.laser.m_pose.translation(), expected)
     for index in np.unique(inner[inner >= 0]):
         if stated is not None and stated != bodies[index].interior:
             fail(

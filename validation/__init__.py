@@ -5,6 +5,7 @@ writes ``docs/validation.md`` with its figures; it ends with an error if any row
 
 lidar_equation       single scattering: closed forms
 multiple_scattering  all orders in a dense slab: an independent simulation in numpy
+narrow_fields        light scattered twice in 0.05 to 20 mrad: a quadrature in double precision
 steady_state         all ranges together: an integral equation, conservation of energy, Eradiate
 scattering_matrices  particles: published tables, other solvers, inequalities of matrices
 molecules            air: published numbers
@@ -17,12 +18,12 @@ timing               winds of beams with times and poses: closed forms
 air                  turbulence, gusts and a microburst: theory, regulations
 filaments            bent vortices, rings, decay: theory, published numbers
 loads                an aircraft that rises in gusts: closed forms, its frequency response
-stored_state         stored state of the shipped simulation: how much is wind, how much numerics
 coverage             standard errors of winds where air changes: its section, by name or --slow
 instrument           winds by an etalon with defects; only by name
 flows                winds of families of flows that judge, and of those that build: its section
                      of the page; only by name
-several_gates        motion through the image plane, explained by gates beside; only by name
+defects              winds of images with defects, by families of which half only judge; only by
+                     name
 resolution           winds from fewer, larger pixels, against their bound; only by name
 line_vortices        vortices from slices of a Doppler lidar: errors, coverage, false alarms; only
                      by name
@@ -33,6 +34,7 @@ import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here i
 GROUPS = (
     "lidar_equation",
     "multiple_scattering",
+    "narrow_fields",
     "steady_state",
     "scattering_matrices",
     "molecules",
@@ -45,12 +47,9 @@ GROUPS = (
     "air",
     "filaments",
     "loads",
-    "stored_state",
     "coverage",
 )
-OPEN = ("instrument", "flows", "resolution", "several_gates", "line_vortices", "wind_of_counts")
+OPEN = ("instrument", "flows", "defects", "resolution", "line_vortices")
 """Run only by name: some of their rows fail."""
 SECTIONS = ("coverage", "flows")
 """Groups whose text is a section of the page, between marks, that short runs leave as it is."""
-FORMER_NAMES = {"error_bars": "standard_errors"}
-"""Groups by the names of earlier versions, which the command line still accepts."""

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from benchmarks.measure import fresh_process
 
-from . import FORMER_NAMES, GROUPS, OPEN, SECTIONS, report
+from . import GROUPS, OPEN, SECTIONS, report
 from . import __doc__ as description
 from .eradiate import provenance
 from .group import run
@@ -35,13 +35,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--purpose",
         choices=("build", "judge"),
-        help="of the families of `flows`: these alone, and nothing is written",
+        help="of the families of `flows` and `defects`: these alone, and nothing is written",
     )
     parser.add_argument(
         "-o", "--out", type=Path, default=PAGE, help="page to write when all groups run"
     )
     options = parser.parse_args(arguments)
-    options.groups = [FORMER_NAMES.get(name, name) for name in options.groups]
     unknown = [name for name in options.groups if name not in (*GROUPS, *OPEN)]
     if unknown:
         parser.error(f"NAME: {unknown[0]!r} is none of {', '.join((*GROUPS, *OPEN))}")

@@ -22,7 +22,7 @@ class Effort:
     eradiate: str | None = None
     """Interpreter with eradiate-mitsuba; None: its stored numbers."""
     purpose: Literal["build", "judge"] | None = None
-    """Of the families of flows that are measured; None: all."""
+    """Of the families of flows and defects that are measured; None: all."""
 
 
 def medium(extinction: float, phase="rayleigh_polarized", albedo: float = 1.0) -> dict:

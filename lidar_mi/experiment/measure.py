@@ -3,9 +3,17 @@
 import math
 from collections.abc import Mapping
 
+import xarray as xr
+
 from lidar_mi.assessment.metrics.coherent import lines_metrics, profile_metrics, vortex_scan_metrics
 from lidar_mi.assessment.metrics.images import light_metrics, noise_metrics
-from lidar_mi.assessment.metrics.names import budget_key, timing_key
+from lidar_mi.assessment.metrics.names import (
+    Source,
+    budget_key,
+    far_from_cores,
+    timing_key,
+    wind_key,
+)
 from lidar_mi.assessment.metrics.pointing import pointing_metrics
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
 from lidar_mi.assessment.metrics.rings import ring_budget_metrics
@@ -18,6 +26,7 @@ from lidar_mi.assessment.metrics.sensor import (
     line_metrics,
     margin_metrics,
     vector_metrics,
+    without_skill,
 )
 from lidar_mi.assessment.metrics.simulation import sample_metrics, simulation_metrics
 from lidar_mi.assessment.metrics.velocities import velocity_metrics
@@ -26,6 +35,8 @@ from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
 from lidar_mi.assessment.metrics.winds import cross_flow_metrics, sweep_metrics, true_wind_metrics
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.schema.experiment import Experiment
+
+_NO_SKILL = "{} has no skill: its error equals the spread of the wind"
 
 
 def measure(
@@ -63,10 +74,10 @@ def measure(
         metrics |= vortex_scan_metrics(results["line_vortices"])
     if "lines" in results:
         metrics |= _sensor(results)
-        metrics |= margin_metrics(judged(experiment, results, metrics), experiment.platform.speed)
     if "vortices" in results:
         truth, pairs = results["truth"].wind, results["vortices"].pairs
         metrics |= vortex_metrics(pairs, truth, results["cores"])
+    metrics |= margin_metrics(judged(experiment, results, metrics), experiment.platform.speed)
     return metrics | {timing_key(step): round(value, 3) for step, value in seconds.items()}
 
 
@@ -106,28 +117,40 @@ def _sensor(results: Results) -> dict[str, float]:
 def judged(
     experiment: Experiment, results: Results, metrics: Mapping[str, float]
 ) -> list[tuple[RequirementTable, list[Finding]]]:
-    """The sensor compared with every requirement table; empty where there are none."""
-    return [
-        (table, judge(table, measured(experiment, metrics, table)))
-        for table in results.get("requirements", {}).values()
-    ]
+    """The lidars compared with every requirement table; empty where there are none.
+
+    Errors are those beyond two core radii. Rows of what the lidars do not measure, and errors of a
+    component without skill, are not judged; nor are images by tables of velocities along lines of
+    sight.
+    """
+    found = []
+    for table in results.get("requirements", {}).values():
+        along = any(row.quantity == "error_v_los" for row in table.rows)
+        if experiment.sensor is not None:
+            measured = _of_both_lidars(experiment, metrics, along)
+            reasons = {f"error_{name}": _NO_SKILL.format(name) for name in without_skill(metrics)}
+            if "u" not in results["truth"].wind:
+                reasons["error_u"] = "the flow has no u"
+        elif along:
+            continue
+        else:
+            measured, reasons = _of_images(experiment, results["wind"], metrics)
+        found.append((table, judge(table, measured, reasons)))
+    return found
 
 
-def measured(
-    experiment: Experiment, metrics: Mapping[str, float], table: RequirementTable
+def _of_both_lidars(
+    experiment: Experiment, metrics: Mapping[str, float], along: bool
 ) -> dict[str, float | None]:
-    """The sensor's properties for `requirements.judge`; errors beyond two core radii.
+    """Properties of both lidars, SI, by rows of a table.
 
-    Points are lines of sight where velocities along them are required, else valid vectors whose
+    Points are lines of sight where velocities ``along`` them are required, else valid vectors whose
     windows do not overlap.
     """
     doppler, sensor = experiment.fringes, experiment.sensor
-    # requirements are read for the sensor alone, which has both lidars
     assert doppler is not None and sensor is not None
-    retrieval, depth = experiment.retrieval, doppler.lidar.range_bin
-    overlap = min(1.0, retrieval.stride / retrieval.template) ** 2
-    along = any(row.quantity == "error_v_los" for row in table.rows)
-    vectors = math.floor(overlap * metrics["sensor.vectors"])
+    depth = doppler.lidar.range_bin
+    vectors = math.floor(_apart(experiment) * metrics["sensor.vectors"])
     return {
         "range": experiment.scan.range + experiment.scan.thickness / 2,
         "points_per_slab": metrics["sensor.lines_retrieved"] if along else vectors,
@@ -136,3 +159,37 @@ def measured(
         "error_v_los": metrics.get("sensor.rmse_v_los"),
         **{f"error_{n}": metrics.get(f"sensor.outside_cores.rmse_{n}") for n in COMPONENTS},
     }
+
+
+def _of_images(
+    experiment: Experiment, wind: xr.Dataset, metrics: Mapping[str, float]
+) -> tuple[dict[str, float | None], dict[str, str]]:
+    """Properties of the backscatter lidar alone, SI, and why rows are not judged.
+
+    They are those of the first method with a valid vector. Every image completes a pair with the
+    one before it.
+    """
+    source = Source.NOISY if experiment.detector else Source.BACKSCATTER
+    methods, scan = experiment.retrieval.methods, experiment.scan
+    valid = {m: metrics.get(wind_key(source, m, "valid_fraction"), 0.0) for m in methods}
+    method = next((m for m in methods if valid[m]), methods[0])
+    vectors = valid[method] * wind.sizes["z"] * wind.sizes["y"]
+    measured: dict[str, float | None] = {
+        "range": scan.range + scan.thickness / 2,
+        "slab_depth": scan.thickness,
+        "slabs_per_second": 1 / experiment.platform.dt,
+        "points_per_slab": math.floor(_apart(experiment) * vectors),
+    }
+    reasons = {"error_u": "needs a Doppler lidar"}
+    far = far_from_cores(metrics, "true_wind.", "rms_")
+    for name in ("v", "w"):
+        error = metrics.get(wind_key(source, method, f"{far}rmse_{name}"))
+        measured[f"error_{name}"] = error
+        if error is not None and error >= metrics[f"true_wind.{far}rms_{name}"]:
+            reasons[f"error_{name}"] = _NO_SKILL.format(name)
+    return measured, reasons
+
+
+def _apart(experiment: Experiment) -> float:
+    """Fraction of the vectors whose windows do not overlap."""
+    return min(1.0, experiment.retrieval.stride / experiment.retrieval.template) ** 2

@@ -103,6 +103,11 @@ def has_sensor(experiment: Experiment) -> bool:
     return experiment.sensor is not None
 
 
+def has_images(experiment: Experiment) -> bool:
+    """Whether a backscatter lidar observes a slab of a wake."""
+    return has_wake(experiment) and not has_volume(experiment)
+
+
 def is_without_volume(experiment: Experiment) -> bool:
     """Whether cross-flow winds are retrieved from two images, not winds from two volumes."""
     return not has_volume(experiment)
@@ -184,7 +189,7 @@ STAGES = (
     Stage("line_winds", line_winds, has_profiles, timing="retrieve"),
     Stage("line_vortices", line_vortices, has_slices, timing="retrieve"),
     # both as one sensor
-    Stage("requirements", requirement_tables, preflight=True),
+    Stage("requirements", requirement_tables, has_images, preflight=True),
     Stage("slab_wind", slab_wind, has_sensor, preflight=True),
     Stage("states", states_of_wind, preflight=True),
     Stage("line_beams", line_beams, preflight=True),

@@ -83,7 +83,8 @@ def _backscatter(
     # the first method with a valid vector: the others have nothing to look at
     valid = (wind["flag"] == 0).any(("z", "y")).transpose("algorithm").values
     vectors = map_data(wind.isel(algorithm=int(valid.argmax())), ("v", "w"), cores)
-    return backscatter_chapter(experiment, metrics, cores, drawn, vectors)
+    alone = () if experiment.sensor else judged(experiment, results, metrics)
+    return backscatter_chapter(experiment, metrics, cores, drawn, alone, vectors)
 
 
 def _volume(

@@ -18,6 +18,7 @@ from lidar_mi.experiment.device import devices_in_words, on_its_device
 from lidar_mi.experiment.folder.run_folder import RunFolder
 from lidar_mi.experiment.graph import Graph, Stage, Store
 from lidar_mi.experiment.log import Log, silent
+from lidar_mi.experiment.magnitudes import unusual
 from lidar_mi.experiment.pipeline import Results, stages_of
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.schema.experiment import Experiment
@@ -118,6 +119,8 @@ def prepare(
     experiment = on_its_device(experiment)
     graph, log = stages_of(experiment), Log(notice)
     prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
+    for text in unusual(experiment):
+        log.remark(text)
     # results first: a check may take those of any stage of the preflight
     for stage in graph:
         if stage.preflight and stage.name not in prepared.results:

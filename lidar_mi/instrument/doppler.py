@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import AliasChoices, Field, model_validator
+from pydantic import Field, model_validator
 
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.description import Description
@@ -50,7 +50,7 @@ class DopplerLidar(Description):
     ] = Field(354.7e-9, description="vacuum wavelength of the laser")
     pulse_energy: Annotated[
         Energy, Within(1e-15, 10000, "from thousands of photons to the lasers of fusion")
-    ] = Field(0.07, description="energy of a pulse")
+    ] = Field(quantity("70 mJ"), description="energy of a pulse")
     pulse_duration: Annotated[Time, Within(0, 0.001, "a millisecond is 150 km of air")] = Field(
         10e-9, description="full width at half maximum of a pulse"
     )
@@ -97,9 +97,7 @@ class DopplerLidar(Description):
         Field(2.70e-5, description="extinction coefficient")
     )
     aerosol_fraction: Annotated[Number, Within(0, 1, "definition of a fraction")] = Field(
-        0.0,
-        description="fraction of the backscattered photons that aerosol scatters",
-        validation_alias=AliasChoices("aerosol_fraction", "aerosol_share"),  # its former name
+        0.0, description="fraction of the backscattered photons that aerosol scatters"
     )
     line_shape: Literal["rayleigh", "rayleigh_brillouin"] = Field(
         "rayleigh_brillouin", description="spectral line of the molecular backscatter"

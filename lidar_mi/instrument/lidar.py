@@ -40,7 +40,7 @@ class BackscatterLidar(Description):
     pulse_energy: Annotated[
         Energy, Within(1e-15, 10000, "from thousands of photons to the lasers of fusion")
     ] = Field(
-        1e-3,
+        quantity("1 mJ"),
         description="energy of a pulse in one beam; images are normalised by it, the detector's "
         "noise depends on it",
     )

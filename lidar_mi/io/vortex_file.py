@@ -21,8 +21,6 @@ _FRAME = (
     "wind at mid-time of the two images"
 )
 _NUMBERS = ("chi2", "correlation", "model_error", "model_error_length")
-# names in older files, by today's names
-_FORMER = {"model_error": "flow_error", "model_error_length": "flow_error_length"}
 
 
 @checked_arguments
@@ -130,9 +128,7 @@ def _from_data(data: dict[str, Any], where: str) -> VortexPairFit:
     try:
         parameters = np.array(data["parameters"], dtype=float)
         covariance = np.array(data["covariance"], dtype=float)
-        stored = {
-            name: data[_FORMER.get(name, name) if name not in data else name] for name in _NUMBERS
-        }
+        stored = {name: data[name] for name in _NUMBERS}
         numbers = {n: math.nan if x is None else float(x) for n, x in stored.items()}
         profile, reasons = data["profile"], tuple(map(str, data["reasons"]))
     except (KeyError, TypeError, ValueError) as error:

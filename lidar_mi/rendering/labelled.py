@@ -93,6 +93,7 @@ def scan_dataset(image: np.ndarray, names: list[str], sensor: Any) -> xr.Dataset
         variables["beam_time"] = ("z", "y"), times.astype(np.float32)
     area = np.pi * sensor.m_aperture[0] ** 2
     variables["Y"] = (("z", "y"), variables["S0"][1][0] * middle**2 / (area * length))
+    fields = np.arctan(np.array(sensor.m_fov_tan, float)).tolist()
     attributes = {
         "grid": int(grid),
         "gate_kind": sensor.gate_kind,
@@ -106,7 +107,7 @@ def scan_dataset(image: np.ndarray, names: list[str], sensor: Any) -> xr.Dataset
         "beam_radius": sensor.laser.m_radius[0],
         "divergence_full": 2 * sensor.laser.m_divergence_half[0],
         "aperture_radius": sensor.m_aperture[0],
-        "fov_half": float(np.arctan(sensor.m_fov_tan[0])),
+        "fov_half": fields[0] if len(fields) == 1 else fields,
     }
     return label_scan(
         xr.Dataset(variables, coords={"gate": np.arange(gates), "y": y, "z": z}, attrs=attributes)

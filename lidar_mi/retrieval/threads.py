@@ -19,7 +19,7 @@ import torch
 from threadpoolctl import ThreadpoolController
 
 SMALL = 1 << 18
-"""Pixels up to which one thread is as fast as two on a quiet machine (`benchmarks threads`)."""
+"""Pixels up to which one thread is as fast as two on a quiet machine."""
 
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")

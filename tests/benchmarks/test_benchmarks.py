@@ -31,30 +31,23 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import __main__ as command
 from benchmarks import (
-    batch,
     candidates,
     cases,
     estimators,
     fringes,
     gpu,
     gradients,
-    growth,
     measure,
     methods,
     page,
     rendered,
     renderer,
     report,
-    settings,
-    threads,
     timed,
     transient,
     velocimetry,
 )
 from lidar_mi.atmosphere.vortex import velocity
-from lidar_mi.retrieval import threads as thread_choice
-from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS
-from lidar_mi.retrieval.flow.settings import VariationalSettings
 
 
 def lines(comparison):
@@ -171,7 +164,7 @@ def test_all_comparisons_make_the_page_and_those_named_do_not(monkeypatch, tmp_p
     """Ratios, absent peers, device and versions below the mark; what is above it stays."""
     made = (report.row("a | b", "time", "s", [2.0, 2.0], [3.0, 5.0], "lower", "remark"),)
     found = {
-        "growth": report.Comparison("Growth", "we", "they", made, ("A note.",)),
+        "rings": report.Comparison("Rings", "we", "they", made, ("A note.",)),
         "gpu": report.Comparison("GPU", "we", "they", reason="skipped: none"),
     }
 
@@ -185,13 +178,13 @@ def test_all_comparisons_make_the_page_and_those_named_do_not(monkeypatch, tmp_p
     monkeypatch.setattr(command, "import_module", compare)
     monkeypatch.setattr(command, "fresh_process", lambda: ThreadPoolExecutor(1))
     out = ["-o", str(tmp_path / "benchmarks.json")]
-    assert command.main(["growth", "--quick", *out]) == 0
+    assert command.main(["rings", "--quick", *out]) == 0
     assert written.read_text().endswith("old\n")
     assert command.main(["--quick", *out]) == 0
     text = written.read_text()
     assert text.startswith(f"# By hand\n\n{page.MARK}\n") and "old" not in text
     assert "| a / b | time, s | 2 | 4 | 2 | 1.5 to 2.5 | remark |" in text
-    for part in ("### Growth", "A note.", "Skipped: none.", "make bench ARGS=--quick", "torch 2"):
+    for part in ("### Rings", "A note.", "Skipped: none.", "make bench ARGS=--quick", "torch 2"):
         assert part in text, part
     assert f"{os.cpu_count()} cores" in text and "- GPU: " in text
 
@@ -200,13 +193,6 @@ def test_every_comparison_of_a_quick_page_takes_its_arguments():
     for name, options in page.QUICK.items():
         inspect.signature(import_module(f"benchmarks.{name}").compare).bind(2, **options)
     assert set(page.QUICK) <= set(command.COMPARISONS)
-
-
-@pytest.mark.slow
-def test_pairs_at_once_have_the_same_winds():
-    found = batch.compare(1, 48, 40, 2)
-    assert [line.case for line in found.rows] == list(batch.METHODS)
-    assert all(line.ratio > 0 and "at most 0e+00 m/s" in line.note for line in found.rows)
 
 
 @pytest.mark.parametrize(
@@ -460,59 +446,6 @@ def test_rendered_pictures_have_a_row_for_every_energy_and_method(monkeypatch):
         assert max(everywhere, key=everywhere.get) == "detector" and everywhere["detector"] > 50
         assert {"simulation", "beam", "window", "method"} < set(fractions)
     assert "paths" in dark[0].note and "paths" not in dark[1].note
-
-
-@pytest.mark.slow
-def test_threads_are_compared_quiet_and_busy():
-    before = torch.get_num_threads(), thread_choice.SMALL
-    found = threads.compare(1, ((40, 32),))
-    assert [row.case for row in found.rows[::3]] == [
-        "40 x 32 px, quiet machine",
-        "40 x 32 px, busy machine",
-    ]
-    assert len(found.rows) == 6 and all(row.ours > 0 and row.ratio > 0 for row in found.rows)
-    assert (torch.get_num_threads(), thread_choice.SMALL) == before
-
-
-def test_power_of_growth_is_the_slope_of_the_logarithms():
-    sizes = (20, 10), (40, 20), (100, 60)
-    costs = [[growth.Cost(1.0, (a * b) ** 1.25, 1.0)] * 3 for a, b in sizes]
-    assert growth.power(sizes, costs) == pytest.approx(1.25)
-
-
-@pytest.mark.slow
-def test_growth_has_a_row_for_every_size_and_a_power(monkeypatch):
-    monkeypatch.setattr(growth, "PEER_OF", {"multipass": "OpenCV DIS"})
-    found = growth.compare(1, ((48, 40), (64, 48)))
-    assert [line.quantity for line in found.rows] == [
-        *("wall time", "time of all cores", "peak memory") * 2,
-        "p",
-    ]
-    assert all(line.ours > 0 for line in found.rows[:-1])
-
-
-def test_settings_are_halved_and_doubled_in_turn():
-    """A tiny case: every field once, its neighbours on either side, and what a change costs."""
-    paths = [path for path, *_ in settings.varied(VariationalSettings())]
-    assert "filter.nodes" in paths and "solver.draws" in paths and len(set(paths)) == len(paths)
-    found = {path: rest for path, *rest in settings.varied(VOLUME_MULTIPASS)}
-    assert found["widths"] == [(1.8, 1.4, 1.0), (0.9, 0.7, 0.5), (3.6, 2.8, 2.0)]
-    assert found["filter.nodes"] == [2, 1, 4] and found["rebalanced"] == [True, True, False]
-    other = settings.changed(VOLUME_MULTIPASS, "filter.nodes", 1)
-    assert other.filter.nodes == 1 and other.spacing == VOLUME_MULTIPASS.spacing
-
-    def errors(_, seed):
-        return seed * np.array([[3.0, 4.0], [1.0, 1.0]])
-
-    assert settings.mean_errors(errors, None, [1]) == pytest.approx((12.5**0.5, 1.0))
-
-
-def test_errors_of_settings_are_those_of_the_truth():
-    """Images and volumes of the default case: errors far below the winds of 10 m/s."""
-    for case, method, defaults, errors in settings.cases(90, 70, (12, 24, 44)):
-        if method != "variational":
-            rms, normalised = settings.mean_errors(errors, defaults, [1])
-            assert 0.05 < rms < 2 and 0.5 < normalised < 2, case
 
 
 # --- a GPU

@@ -8,7 +8,8 @@ sees the vortices, scans of slabs that nobody meets, an upset that is an error.
 import numpy as np
 import pytest
 
-from lidar_mi.assessment.metrics.encounter import encounter_metrics
+from lidar_mi.assessment.metrics.encounter import MET, encounter_metrics
+from lidar_mi.assessment.report.encounter import encounter_answer
 from lidar_mi.encounter.aircraft import Commands
 from lidar_mi.encounter.flight import aircraft_of, simulate_flights
 from lidar_mi.encounter.wake import wake_along_path
@@ -50,7 +51,7 @@ def test_help_lessens_the_roll(flights):
     )
     assert perfect < blind < off
     assert perfect < 0.7 * off
-    assert found["encounter.removed_of_perfect.largest_roll"] > 0.9
+    assert found["encounter.removed_beyond_autopilot.largest_roll"] > 0.9
     assert found["encounter.prediction_error"] < 0.1
     assert ours < 0.7 * off
 
@@ -111,6 +112,32 @@ def test_a_track_that_is_lost_in_the_wake():
         assert change < limits.rate[0] * step
         banks = [float(np.abs(flight["roll"]).max()) for flight in (ours, autopilot)]
         assert banks[0] <= banks[1]
+
+
+@pytest.mark.parametrize(
+    ("how", "first"),
+    [
+        ("blind", "The lidar never had a preview: 0 fits"),
+        ("late", "The lidar's first preview came too late by"),
+        ("no wake", "The lidar never had a preview: 0 fits"),
+    ],
+)
+def test_the_work_of_the_autopilot_is_not_the_lidars(experiment, how, first):
+    """A lidar that sees nothing, one that sees the wake when it is past, air without a wake."""
+    if how == "no wake":
+        turbulence = {"level": "moderate", "seed": 3}
+        experiment = check(encounter_keys(air={"wake": False, "turbulence": turbulence}), "test")
+    # the late one has a track after 2.8 of 3 s, when the largest roll is past
+    lidar = SyntheticLidar(
+        wake_along_path(experiment), blind=lambda n: how != "late" or n < 14, latency=1.2
+    )
+    flights = simulate_flights(experiment, silent, lidar=lidar)
+    found = encounter_metrics(flights.series, flights.track)
+    rolls = [found[f"encounter.{mode}.largest_roll"] for mode in ("feedforward", "autopilot")]
+    assert rolls[0] == pytest.approx(rolls[1], rel=1e-9)
+    met = flights.series.attrs.get(MET, "wake")
+    verdict, *_ = encounter_answer(found, met=met)
+    assert verdict.startswith(first) and "it meets" not in verdict
 
 
 def test_only_what_a_mode_needs_is_flown(experiment):

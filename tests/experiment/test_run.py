@@ -51,6 +51,17 @@ def test_it_shows_its_numbers(done):
     assert f">{done.metrics['backscatter.cc.rmse_v']:.2f}</td>" in page
 
 
+def test_images_alone_are_judged_in_v_and_w(done):
+    """A wind that does not vary leaves no skill to show; u needs a second lidar."""
+    (verdict,) = [line for line in done.answer if "flight control" in line]
+    assert "not judged: error of u (needs a Doppler lidar)" in verdict
+    skills = [
+        done.metrics[f"backscatter.cc.rmse_{n}"] < done.metrics[f"true_wind.rms_{n}"] for n in "vw"
+    ]
+    assert [f"error of {n} (" in verdict for n in "vw"] == [not skill for skill in skills]
+    assert not any("line-of-sight" in line for line in done.answer)
+
+
 def test_show_prints_and_opens_the_report(done, monkeypatch, capsys, tmp_path):
     opened = []
     monkeypatch.setattr(webbrowser, "open_new_tab", opened.append)

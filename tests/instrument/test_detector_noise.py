@@ -265,7 +265,10 @@ def test_noise_budget_of_a_homogeneous_scan():
         ({"polarization": 1.1}, "polarization: 1.1 is not allowed; expected 0 to 1"),
         ({"seed": -1}, "seed: -1 is"),
         ({"seed": "one"}, "seed: 'one' is"),
-        ({"s0": 1.0, "lidar": BackscatterLidar(pulse_energy=1e4)}, "lidar.pulse_energy: 10000 J"),
+        (
+            {"s0": 1.0, "lidar": BackscatterLidar(pulse_energy="1e4 J")},
+            "lidar.pulse_energy: 10000 J",
+        ),
     ],
 )
 def test_bad_light_is_refused(changes, message):

@@ -55,19 +55,6 @@ def changed(path, **changes):
     path.write_text(json.dumps(data))
 
 
-def test_names_of_older_files_are_read(tmp_path):
-    path, pair = tmp_path / "vortex.json", some_pair()
-    write_vortices(path, {"mine": pair})
-    text = path.read_text()
-    assert '"model_error"' in text and '"model_error_length"' in text
-    path.write_text(text.replace('"model_error', '"flow_error'))
-    read = read_vortices(path)["mine"]
-    assert (read.model_error, read.model_error_length) == (
-        pair.model_error,
-        pair.model_error_length,
-    )
-
-
 def test_a_file_without_pairs_is_named(tmp_path):
     path = tmp_path / "vortex.json"
     matrix = some_pair().covariance.tolist()

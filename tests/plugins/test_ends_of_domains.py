@@ -350,7 +350,7 @@ def test_directions_of_the_field_of_view(world, fov):
     x, y, z = np.array(local, float)
     below = (x**2 + y**2) / (1 + z)
     assert kstest(below, lambda b: b / (1 - math.cos(fov * 1e-3))).pvalue > 1e-3
-    inside = np.array(sensor.in_field_of_view(axes, axes.to_world(local)))
+    inside = np.array(sensor.in_field_of_view(axes, axes.to_world(local), sensor.m_fov_tan))
     assert (~inside).mean() < 1e-4
     disc = np.array(sensor.sample_aperture(axes, pairs(7)), float)
     r2 = (disc**2).sum(0) / np.array(sensor.aperture_area())[0] * math.pi
@@ -365,6 +365,8 @@ PATHS = [
     (520.0, 80.0, 25e-3, 20.0),
     (30.0, 50.0, 0.1, 1e9),
     (2.0, 1e3, 0.5, 1e9),
+    (100.0, 60.0, 0.05e-3, 1e9),
+    (100.0, 1e-6, 0.05e-3, 1e9),
 ]
 
 
@@ -379,9 +381,12 @@ def test_directions_of_closed_paths_have_a_density(optics, path):
     )
     for sample in (pairs(8), mi.Point2f(0, 0.3), mi.Point2f(LAST, 0.3)):
         direction = one.sample(mi.Float(excess), sample)
-        density = np.array(one.density(mi.Float(excess), one.one_plus_cosine(direction)))
-        least, most, _ = (np.array(v)[0] for v in one._limits(mi.Float(excess)))
-        law = 1 / (2 * math.pi * math.log(most / least))
+        density = np.array(one.density(mi.Float(excess), direction))
+        least, width, _ = (np.array(v, float)[0] for v in one._limits(mi.Float(excess)))
+        offset = excess / distance
+        least, most = least + offset, 2 + offset
+        logarithm = math.log(most / least) if width > 1 else -math.log1p(-width / most)
+        law = 1 / (2 * math.pi * logarithm)
         assert np.isfinite(density).all()
         assert (density >= law / most * (1 - 1e-4)).all()
         assert (density <= law / least * (1 + 1e-2)).all()

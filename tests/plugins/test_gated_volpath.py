@@ -4,6 +4,7 @@ Detects: 3 % between the two estimators, a standard error wrong by 5 %, rounding
 between ways to do the same thing, a kernel compiled twice.
 """
 
+import functools
 import gc
 import math
 import subprocess
@@ -266,13 +267,14 @@ print(image.shape, image[..., 0].mean(dtype=float) / truth, peak, sep=";")
 """
 
 
-def kernels(render):
-    """Hashes of the kernels that a function launches."""
+def kernels(render, least=0):
+    """Hashes of the kernels that a function launches, of those of so many operations."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         render()
         history = dr.kernel_history()
-    return {entry["hash"] for entry in history if "hash" in entry}
+    large = (entry for entry in history if entry.get("operation_count", 0) >= least)
+    return {entry["hash"] for entry in large if "hash" in entry}
 
 
 class TestKernels:
@@ -296,6 +298,40 @@ class TestKernels:
         parameters["slab.interior_medium.sigma_t.data"] = mi.TensorXf(1.7 * air)
         assert kernels(parameters.update) & first == set()  # the update's own, small ones
         assert kernels(lambda: dr.eval(mi.render(scene, seed=4, spp=64))) <= first
+
+    @pytest.mark.parametrize(
+        "integrator", [{}, {"orders": True}, {"estimator": "analog"}, {"candidates": 4}], ids=str
+    )
+    def test_scenes_of_other_gates_orders_pulses_and_polarisations(self, world, integrator):
+        """The kernel that traces is the first scene's."""
+
+        def traced(gates=2, order=3, **laser):
+            sensor = world.lidar(
+                (1, 1),
+                (499.0, 505.0),
+                laser={"pulse_duration": 1e-8, **laser},
+                environment=world.ENVIRONMENT,
+                gate_count=gates,
+            )
+            scene = world.scene(
+                sensor,
+                {"max_order": order, **integrator},
+                environment=world.homogeneous(1e-4),
+                slab=textured(world),
+            )
+            found = kernels(functools.partial(mi.render, scene, spp=64), least=500)
+            # a scene that lives is in the kernels of others
+            del scene, sensor
+            gc.collect()
+            gc.collect()
+            return found
+
+        first = traced()
+        assert len(first) == 1
+        assert traced(gates=5) == first
+        assert traced(order=4) == first
+        assert traced(pulse_duration=3e-8) == first
+        assert traced(stokes="1, 0.3, -0.5, 0.1") == first
 
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     def test_samples_are_traced_once(self, world, estimator):

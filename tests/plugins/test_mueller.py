@@ -196,6 +196,11 @@ def test_table_from_a_file(optics, tmp_path, suffix):
     assert np.abs(found - given).max() < 1e-6
 
 
+def test_tables_of_the_package_are_found_from_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert mi.load_dict({"type": "mueller", "table": "aerosol_dust_532nm.txt"})
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb"], indirect=True)
 def test_unpolarised_variants_give_a1(optics, variant):
     rng = np.random.default_rng(5)

@@ -186,7 +186,7 @@ class TestTelescope:
     @pytest.mark.parametrize("half_mrad", [0.6, 5.0, 1400.0])
     def test_field_of_view_ends_at_its_half_angle(self, world, half_mrad):
         sensor = mi.load_dict(world.lidar((1, 1), GATE, fov_half_mrad=half_mrad))
-        frame = sensor.beam_frame(mi.UInt32(0))
+        frame, tangent = sensor.beam_frame(mi.UInt32(0)), sensor.field_tangent(mi.UInt32(0))
         for fraction, observed in [(0.0, True), (0.999, True), (1.001, False)]:
             angle = fraction * half_mrad * 1e-3
             for azimuth in np.linspace(0, 2 * np.pi, 5):
@@ -196,8 +196,10 @@ class TestTelescope:
                     math.sin(angle) * math.sin(azimuth),
                 )
                 # of any length
-                assert np.array(sensor.in_field_of_view(frame, source * 500))[0] == observed
-        assert not np.array(sensor.in_field_of_view(frame, mi.Vector3f(-1, 0, 0)))[0]
+                assert (
+                    np.array(sensor.in_field_of_view(frame, source * 500, tangent))[0] == observed
+                )
+        assert not np.array(sensor.in_field_of_view(frame, mi.Vector3f(-1, 0, 0), tangent))[0]
 
 
 class TestUpdates:

@@ -29,7 +29,7 @@ RINGS = {
         "v_los": ["70 m/s"],
         "ccd": {"full_well": 1e6},
         "retrieval": {"methods": ["annular"], "averaged": [1], "images": 1, "slow_images": 0},
-        "photon_samples": 0,
+        "path_samples": 0,
         "render": {"samples_per_pixel": 4},
     },
 }

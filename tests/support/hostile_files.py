@@ -292,8 +292,8 @@ def text_cases() -> st.SearchStrategy:
         "covariance": np.eye(number).tolist(),
         "chi2": 1.0,
         "correlation": 1.0,
-        "flow_error": 0.0,
-        "flow_error_length": 0.0,
+        "model_error": 0.0,
+        "model_error_length": 0.0,
     }
     pairs = {"format": "lidar-mi vortex pairs 1", "fits": {"a": fit}}
     broken = st.tuples(st.sampled_from(sorted(fit)), ANYTHING).map(

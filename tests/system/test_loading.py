@@ -21,7 +21,6 @@ COMPUTING = {
     "jsbsim",
     "distributed",
     "loky",
-    "SALib",
     "scipy.stats",
     "scipy.signal",
     "lidar_mi.plugins",

@@ -223,7 +223,7 @@ def test_no_valid_vector_is_reported_and_the_rest_is_shown(whole, tmp_path, monk
     for text in (
         "The scan of the Doppler lidar",
         "at most 2.5 m/s",
-        "undetermined",
+        "not judged: not measured",
         "From the images, the errors of the circulations are",
     ):
         assert text in report, text

@@ -110,7 +110,6 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
             f"encounter.{mode}.largest_roll"
             for mode in ("off", "autopilot", "feedforward", "perfect")
         ),
-        "encounter.removed_of_perfect.largest_roll",
         "encounter.removed_beyond_autopilot.largest_roll",
         "encounter.lead_time",
         "encounter.normalised_innovation",

@@ -5,13 +5,16 @@ feedforward and perfect; ``track``, dims (source, slab), with the sources estima
 Angles in rad, times in s.
 """
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
+from scipy.constants import g
 
 from lidar_mi.assessment.metrics.encounter_hazard import is_hazardous, roll_control_ratio
-from lidar_mi.assessment.metrics.load_increments import INCREMENTS, load_increments
+from lidar_mi.assessment.metrics.load_increments import load_increments
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
 from lidar_mi.assessment.metrics.wind_ahead import wind_ahead_metrics
 
@@ -29,6 +32,12 @@ _NAMES = {
 }
 MODES = tuple(_NAMES)
 """Flights, as files name them, in the order in which they are shown."""
+
+LEAST_REMOVED = {"largest_roll": math.radians(0.5), "largest_load_increment": 0.315 / g}
+"""Least reduction by perfect preview, beyond the autopilot, of which a lidar can be judged.
+
+0.5 degrees of bank is the project's own limit; an acceleration below 0.315 m/s^2 is not
+uncomfortable (ISO 2631-1:1997, annex C)."""
 
 AFTER = 5
 """Slabs after which the track is compared with the truth."""
@@ -72,12 +81,33 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
         found |= {f"{key}.{name}": value for name, value in load_increments(one).items()}
         found[f"{key}.departed"] = float(one["departed"].max())
         found[f"{key}.hazardous"] = float(is_hazardous(roll) or one["departed"].max() > 0)
-    for quantity in ("largest_roll", "largest_roll_rate", *INCREMENTS):
-        found |= _removed(found, quantity)
+    for quantity, least in LEAST_REMOVED.items():
+        keys = [f"encounter.{mode}.{quantity}" for mode in ("autopilot", "feedforward", "perfect")]
+        if all(key in found for key in keys):
+            before, ours, best = (found[key] for key in keys)
+            added = float(fraction_added(before, ours, best, least))
+            found[f"encounter.removed_beyond_autopilot.{quantity}"] = added
     if track is not None:
         more = _tracking(series, track) | wind_ahead_metrics(track)
         found |= {f"encounter.{k}": v for k, v in more.items()}
     return {key: value for key, value in found.items() if np.isfinite(value)}
+
+
+def fraction_added(
+    autopilot: ArrayLike, lidar: ArrayLike, perfect: ArrayLike, least: float
+) -> np.ndarray:
+    """What the lidar removes beyond the autopilot over what perfect preview removes beyond it.
+
+    Parameters
+    ----------
+    autopilot, lidar, perfect : array_like
+        Largest roll, say, of the flights.
+    least : float
+        NaN where perfect preview removes less: there is nothing that a lidar could add.
+    """
+    before, ours, best = (np.asarray(one, dtype=float) for one in (autopilot, lidar, perfect))
+    room = before - best
+    return np.divide(before - ours, room, out=np.full(room.shape, np.nan), where=room >= least)
 
 
 def residual_moment(one: xr.Dataset) -> float:
@@ -104,9 +134,11 @@ def prediction_error(one: xr.Dataset) -> float:
 def felt_from(series: xr.Dataset) -> float:
     """Time (s) at which the wake's rolling moment is first felt without control; NaN: never.
 
-    In other air that of the wake alone, on the nominal path.
+    In other air that of the wake alone, on the nominal path; NaN without a wake.
     """
     alone = "wake_roll_moment" in series
+    if series.attrs.get(MET) == "air" and not alone:
+        return float("nan")
     moment = series["wake_roll_moment"] if alone else series["roll_moment"].sel(flight="off")
     moment = np.abs(moment.values)
     felt = np.flatnonzero(moment > _FELT * moment.max())
@@ -128,7 +160,7 @@ def measured_in_flight(
     look_ahead = _look_ahead(series, track)
     found = {
         "range": float(np.median(look_ahead) * speed) if look_ahead.size else float("nan"),
-        "slabs_per_second": _rate(track["delivered"].values),
+        "slabs_per_second": _rate(track),
         "slab_depth": slab_depth,
         "points_per_slab": float(measured["vectors"].median()) if measured.sizes["slab"] else 0.0,
     }
@@ -151,9 +183,13 @@ def judged_in_flight(
     ]
 
 
-def _rate(times: np.ndarray) -> float:
-    """Estimates a second (Hz), without the rounding of their times."""
-    return round(float(1 / np.median(np.diff(times))), 9) if times.size > 1 else 0.0
+def _rate(track: xr.Dataset) -> float:
+    """Estimates a second (Hz), less those that the computer skipped."""
+    if track.sizes["slab"] < 2:
+        return 0.0
+    taken = 1 - float(track["skipped"].mean()) if "skipped" in track else 1.0
+    # without the rounding of times
+    return round(taken / float(np.median(np.diff(track["time"].values))), 9)
 
 
 def _look_ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
@@ -175,6 +211,14 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
     look_ahead = _look_ahead(series, track)
     if look_ahead.size:
         found["look_ahead"] = float(np.median(look_ahead))
+    steered = np.flatnonzero(np.isfinite(one["predicted_roll_moment"].values))
+    if steered.size:
+        found["preview_from"] = float(one["time"][steered[0]])
+        found["lead_time"] = felt_from(series) - found["preview_from"]
+    if "preview_withdrawn" in one:
+        step = float(one["time"][1] - one["time"][0])
+        found["withdrawn"] = step * float(one["preview_withdrawn"].sum())
+    found |= _latencies(track)
     usable = np.flatnonzero(track["usable"].values > 0)
     found["usable_slabs"] = float(usable.size)
     accepted = track["accepted"].values > 0
@@ -184,7 +228,6 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
         first = int(usable[0])
         used = np.flatnonzero(accepted)
         found["slabs_to_track"] = float((used <= first).sum())
-        found["lead_time"] = felt_from(series) - float(track["delivered"][first])
     after = np.flatnonzero((track["updates"].values >= AFTER) & (track["usable"].values > 0))
     if after.size:
         found |= {f"after_{AFTER}_slabs.{k}": v for k, v in _errors(track, after[:1]).items()}
@@ -196,6 +239,26 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
         found["normalised_innovation"] = float(
             track["innovation"].values[known].sum() / dof[known].sum()
         )
+    return found
+
+
+def _latencies(track: xr.Dataset) -> dict[str, float]:
+    """Times from the second scan to the delivery, and what a busy computer skipped."""
+    scanned = track["time"].values + np.median(np.diff(track["time"].values)) / 2
+    found = {}
+    for name, delivered, skipped in (
+        ("latency", "delivered", "skipped"),
+        ("wind_latency", "wind_delivered", "wind_skipped"),
+    ):
+        if delivered not in track or skipped not in track:
+            continue
+        found[skipped + "_slabs"] = float(track[skipped].sum())
+        there = np.isfinite(track[delivered].values) & (track[skipped].values == 0)
+        if name == "latency":
+            there &= track["estimated"].values > 0
+        if there.any():
+            late = track[delivered].values[there] - scanned[there]
+            found[name], found[f"{name}_99"] = map(float, np.quantile(late, [0.5, 0.99]))
     return found
 
 
@@ -221,20 +284,3 @@ def _errors(track: xr.Dataset, slabs: np.ndarray) -> dict[str, float]:
 
 def _largest(values: xr.DataArray) -> float:
     return float(np.abs(values).max())
-
-
-def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
-    """Fractions of what perfect preview removes that the lidar removes.
-
-    Of what no control leaves, and of what the autopilot leaves, which has no preview.
-    """
-    removed = {}
-    for name, baseline in (("of_perfect", "off"), ("beyond_autopilot", "autopilot")):
-        keys = [f"encounter.{mode}.{quantity}" for mode in (baseline, "feedforward", "perfect")]
-        if not all(key in found for key in keys):
-            continue
-        before, ours, perfect = (found[key] for key in keys)
-        # nothing is removed: the fraction would be one of rounding
-        if abs(before - perfect) > _ROUNDING:
-            removed[f"encounter.removed_{name}.{quantity}"] = (before - ours) / (before - perfect)
-    return removed

@@ -1,6 +1,5 @@
 """Names of metrics, defined only here: ``source.method.quantity`` and so on."""
 
-import re
 from collections.abc import Mapping
 from enum import StrEnum
 
@@ -108,25 +107,6 @@ def vortex_key(origin: str, quantity: str) -> str:
 def timing_key(step: str) -> str:
     """Of the duration of a step, s."""
     return f"timing.{step}_s"
-
-
-# Former names as patterns, and their replacements, for metrics.json of older runs.
-_RENAMED = (
-    (r"\.reduced_variance_(u|v|w|v_los)$", r".normalised_error_variance_\1"),
-    (r"\.found_fraction$", ".retrieved_fraction"),
-    (r"\bsensor\.good_fraction$", "sensor.valid_fraction"),
-    (r"\bsensor\.lines_read$", "sensor.lines_retrieved"),
-    (r"\bsensor\.error_budget\.between_lines\.", "sensor.error_budget.sampling."),
-    (r"(\berror_budget\..+)\.share(_[uvw])?$", r"\1.fraction\2"),
-    (r"(\bvortex\..+)\.flow_error$", r"\1.model_error"),
-)
-
-
-def current_name(key: str) -> str:
-    """Today's name of a metric, from any former one."""
-    for former, current in _RENAMED:
-        key = re.sub(former, current, key)
-    return key
 
 
 def has_no_skill(metrics: Mapping[str, float], source: Source, method: str) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from types import MappingProxyType
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.yaml import read_yaml
@@ -72,10 +73,12 @@ class Finding:
     measured : float
         NaN: not known.
     passed : bool or None
-        None: undetermined, as a value is not known.
+        None: not judged.
     margin : float
         Distance from the nearer limit as a fraction of it: 0.2 is 20 % better than required, -0.2
-        20 % worse; NaN where undetermined.
+        20 % worse; NaN where not judged.
+    reason : str
+        Why it is not judged; empty where it is.
     """
 
     quantity: str
@@ -84,6 +87,7 @@ class Finding:
     measured: float
     passed: bool | None
     margin: float
+    reason: str = ""
 
 
 def read_requirements(
@@ -108,7 +112,11 @@ def read_requirements(
     return tables
 
 
-def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list[Finding]:
+def judge(
+    table: RequirementTable,
+    measured: Mapping[str, float | None],
+    not_judged: Mapping[str, str] = MappingProxyType({}),
+) -> list[Finding]:
     """A sensor against a table, row by row.
 
     Parameters
@@ -117,6 +125,8 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
     measured : mapping
         The sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known. Names
         without a row in the table are ignored.
+    not_judged : mapping
+        Reasons why rows are not judged, by names of `QUANTITIES`, whatever was measured.
 
     Raises
     ------
@@ -132,11 +142,14 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
             )
     values = {name: math.nan if value is None else float(value) for name, value in measured.items()}
     distance = values.get("range", math.nan)
-    return [_judged(row, values.get(row.quantity, math.nan), distance) for row in table.rows]
+    return [
+        _judged(row, values.get(row.quantity, math.nan), distance, not_judged.get(row.quantity, ""))
+        for row in table.rows
+    ]
 
 
 def fulfilled(findings: Sequence[Finding]) -> bool | None:
-    """Whether all rows pass; None if none fails but some are undetermined."""
+    """Whether all rows pass; None if none fails but some are not judged."""
     results = {finding.passed for finding in findings}
     # a row that fails decides, whatever is unknown of others
     if False in results:
@@ -163,7 +176,8 @@ def as_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str, str]]
     rows = []
     for finding in findings:
         name, unit = QUANTITIES[finding.quantity]
-        verdict = {True: "pass", False: "fail", None: "undetermined"}[finding.passed]
+        reason = f": {finding.reason}" if finding.reason else ""
+        verdict = {True: "pass", False: "fail", None: f"not judged{reason}"}[finding.passed]
         margin = "" if math.isnan(finding.margin) else f"{100 * finding.margin:+.0f} %"
         # none has no sign
         margin = "0 %" if margin in ("+0 %", "-0 %") else margin
@@ -228,7 +242,7 @@ def _limits(place: str, limits: object, unit: str = "m/s") -> dict[str, float]:
     return found
 
 
-def _judged(row: Requirement, measured: float, distance: float) -> Finding:
+def _judged(row: Requirement, measured: float, distance: float, reason: str) -> Finding:
     of_range = (
         row.fraction_of_range * distance if math.isfinite(row.fraction_of_range) else math.inf
     )
@@ -239,11 +253,12 @@ def _judged(row: Requirement, measured: float, distance: float) -> Finding:
         margins.append(measured / row.minimum - 1)
     if not math.isinf(maximum):
         margins.append(1 - measured / maximum)
-    unknown = math.isnan(measured) or math.isnan(maximum)
+    if not reason and (math.isnan(measured) or math.isnan(maximum)):
+        reason = "not measured" if math.isnan(measured) else "the range is not known"
     # the nearer limit decides
-    margin = math.nan if unknown else min(margins, default=math.inf)
-    passed = None if unknown else row.minimum <= measured <= maximum
-    return Finding(row.quantity, row.minimum, maximum, measured, passed, margin)
+    margin = math.nan if reason else min(margins, default=math.inf)
+    passed = None if reason else row.minimum <= measured <= maximum
+    return Finding(row.quantity, row.minimum, maximum, measured, passed, margin, reason)
 
 
 def _required(finding: Finding, unit: str) -> str:

@@ -1,7 +1,7 @@
 """Which knob matters: Sobol' indices of a metric over a sample of a design space.
 
-The sample may be of any design. A Gaussian process is fitted to it; SALib's sampling and estimators
-are applied to draws of functions that agree with the sample, hence the confidence intervals.
+The sample may be of any design. A Gaussian process is fitted to it; the estimators of Saltelli and
+Jansen are applied to draws of functions that agree with the sample, hence the confidence intervals.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from SALib.analyze.sobol import first_order, total_order
-from SALib.sample import sobol
+from scipy.stats import qmc
+from scipy.stats import sobol_indices as scipy_indices
 
 from lidar_mi.assessment.metrics.surrogate import Array, Process, processes
 from lidar_mi.errors import InputError
@@ -188,17 +188,16 @@ def _index_draws(drawn: Sequence[Process], rng: np.random.Generator) -> tuple[Ar
     """First-order and total indices (knob, draw) of functions that agree with the sample."""
     first, total = [], []
     knobs = drawn[0].points.shape[1]
-    names = [f"x{k}" for k in range(knobs)]
-    space = {"num_vars": knobs, "names": names, "bounds": [[0.0, 1.0]] * knobs}
     for process in drawn:
-        places = sobol.sample(
-            space, _SALTELLI, calc_second_order=False, seed=int(rng.integers(2**31))
-        )
-        functions = process.functions(places, _FUNCTIONS, rng)
-        functions -= functions.mean(axis=0)
-        # rows of SALib: A, A with one column of B for each knob, B
-        rows = functions.reshape(_SALTELLI, knobs + 2, _FUNCTIONS)
-        a, b = rows[:, 0], rows[:, -1]
-        first.append([first_order(a, rows[:, 1 + k], b) for k in range(knobs)])
-        total.append([total_order(a, rows[:, 1 + k], b) for k in range(knobs)])
+        pairs = qmc.Sobol(2 * knobs, seed=rng).random(_SALTELLI)
+        a, b = pairs[:, :knobs], pairs[:, knobs:]
+        # one column of A at a time is that of B
+        mixed = np.where(np.eye(knobs, dtype=bool)[:, None], b, a)
+        places = np.concatenate([a, b, *mixed])
+        functions = process.functions(places, _FUNCTIONS, rng).T
+        f_a, f_b, f_ab = np.split(functions, (_SALTELLI, 2 * _SALTELLI), axis=1)
+        f_ab = f_ab.reshape(_FUNCTIONS, knobs, _SALTELLI).swapaxes(0, 1)
+        indices = scipy_indices(func={"f_A": f_a, "f_B": f_b, "f_AB": f_ab}, n=_SALTELLI)
+        first.append(indices.first_order.T)
+        total.append(indices.total_order.T)
     return np.concatenate(first, axis=1), np.concatenate(total, axis=1)

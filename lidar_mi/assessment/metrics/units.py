@@ -23,7 +23,13 @@ _ENCOUNTER = {
     "largest_roll": "rad",
     "largest_roll_rate": "rad/s",
     "largest_lift": "N",
+    "preview_from": "s",
     "lead_time": "s",
+    "withdrawn": "s",
+    "latency": "s",
+    "latency_99": "s",
+    "wind_latency": "s",
+    "wind_latency_99": "s",
     "look_ahead": "s",
     "core_error": "m",
 }

@@ -22,7 +22,6 @@ from lidar_mi.assessment.metrics.requirements import (
     as_rows,
     look_ahead,
 )
-from lidar_mi.assessment.metrics.sensor import without_skill
 from lidar_mi.assessment.metrics.velocities import READERS
 from lidar_mi.assessment.report.coherent_lidar import coherent_answer
 from lidar_mi.assessment.report.simulation import simulation_sentence
@@ -61,41 +60,29 @@ def answer(
     lines = [simulated] if simulated else []
     lines += [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
     speed = experiment.platform.speed if experiment.imaged_wake else 0.0
-    unskilled = without_skill(metrics)
-    lines += [
-        verdict(table, findings, unskilled) for table, findings in judged if table.applies_at(speed)
-    ]
+    lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
     others = [table for table, _ in judged if not table.applies_at(speed)]
     phases = dict.fromkeys(f"{table.phase} ({_speeds(table)})" for table in others)
     lines += [f"{_capital(phase)}: not assessed at {shown(speed, 'm/s')}." for phase in phases]
     return lines
 
 
-def verdict(
-    table: RequirementTable, findings: Sequence[Finding], unskilled: Sequence[str] = ()
-) -> str:
-    """Compliance with one table: rows fulfilled, and those that are not with their numbers.
-
-    An error of a component that is ``unskilled``, as large as the component varies, is within its
-    limit because the wind is: its row does not count.
-    """
+def verdict(table: RequirementTable, findings: Sequence[Finding]) -> str:
+    """Compliance with one table: rows fulfilled, those that are not, and those not judged."""
     rows = as_rows(list(findings))
-    errors = [f"error_{name}" for name in unskilled]
-    vain = [f.quantity for f in findings if f.passed and f.quantity in errors]
-    fulfilled = sum(bool(f.passed) and f.quantity not in vain for f in findings)
+    fulfilled = sum(bool(f.passed) for f in findings)
     count = f"all {len(findings)}" if fulfilled == len(findings) else f"{fulfilled} of {len(rows)}"
     reasons = [f"{count} rows fulfilled"]
     for name, required, measured, _, state in rows:
         if state == "fail":
             reasons.append(f"{name} {measured} against {required}")
-    reasons += [
-        f"{quantity.removeprefix('error_')} has no skill: its error is as large as the true wind "
-        "varies"
-        for quantity in vain
+    unknown = [
+        f"{row[0]} ({finding.reason})"
+        for row, finding in zip(rows, findings, strict=True)
+        if finding.reason
     ]
-    unknown = [name for name, *_, state in rows if state == "undetermined"]
     if unknown:
-        reasons.append(f"undetermined: {', '.join(unknown)}")
+        reasons.append(f"not judged: {', '.join(unknown)}")
     return f"{_capital(table.phase)}, {table.title}: {'; '.join(reasons)}."
 
 

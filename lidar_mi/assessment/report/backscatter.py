@@ -9,6 +9,8 @@ from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.names import Source, has_no_skill, wind_key
+from lidar_mi.assessment.metrics.requirements import Judged
+from lidar_mi.assessment.report.compliance import compliance
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.assessment.report.simulation import samples_of
 
@@ -35,6 +37,7 @@ def backscatter_chapter(
     metrics: Mapping[str, float],
     cores: Sequence[Core],
     drawn: Sequence[Drawn],
+    judged: Judged = (),
     vectors: dict[str, Any] | None = None,
 ) -> Chapter:
     """Images and cross-flow winds of the backscatter lidar.
@@ -44,6 +47,8 @@ def backscatter_chapter(
     experiment : lidar_mi.experiment.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
+    judged : sequence of (RequirementTable, list of Finding)
+        Of this lidar alone; empty: no requirements, or it is one of two.
     vectors : dict, optional
         From `vector_map.map_data`.
     """
@@ -75,6 +80,12 @@ def backscatter_chapter(
         [*lead, _noise(experiment, metrics)],
         drawn,
         numbers,
+        compliance(
+            judged,
+            experiment.platform.speed,
+            "Errors of v and w are rms errors of valid vectors beyond two core radii, by the first "
+            "method that has valid vectors.",
+        ),
         vectors=vectors,
     )
 

@@ -211,7 +211,7 @@ def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Margins) -> st
     if not margins and any(str(name).startswith("encounter.") for name in dataset):
         return text
     if not margins:
-        return text + " No requirement was judged: that needs both lidars as one sensor."
+        return text + " No requirement was judged."
     found, missed = [], []
     for (application, phase), rows in margins.items():
         each = [numbers.met(one) for one in rows.values()]

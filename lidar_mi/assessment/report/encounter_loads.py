@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from lidar_mi.assessment.digits import percent, three
+from lidar_mi.assessment.digits import three
 from lidar_mi.assessment.metrics.encounter import MODES
 
 _ADVERBS = {
@@ -14,7 +14,7 @@ _ADVERBS = {
 
 
 def loads_answer(metrics: Mapping[str, float]) -> list[str]:
-    """Largest changes of the load factor, and what is removed of that without control.
+    """Largest changes of the load factor.
 
     Parameters
     ----------
@@ -25,9 +25,5 @@ def loads_answer(metrics: Mapping[str, float]) -> list[str]:
     found = {mode: metrics[key.format(mode)] for mode in MODES if key.format(mode) in metrics}
     if not found:
         return []
-    parts = []
-    for mode, value in found.items():
-        below = 1 - value / found["off"] if found.get("off") else 0.0
-        side = f" ({percent(abs(below))} {'less' if below >= 0 else 'more'})"
-        parts.append(f"{three(value)} {_ADVERBS[mode]}{side if mode != 'off' else ''}")
+    parts = [f"{three(value)} {_ADVERBS[mode]}" for mode, value in found.items()]
     return [f"The load factor changes by up to {', '.join(parts)}."]

@@ -6,8 +6,8 @@ from typing import Any
 from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
-from lidar_mi.assessment.metrics.requirements import Finding, Judged, as_rows, fulfilled, look_ahead
-from lidar_mi.assessment.metrics.sensor import without_skill
+from lidar_mi.assessment.metrics.requirements import Judged, look_ahead
+from lidar_mi.assessment.report.compliance import compliance
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.instrument.doppler_scan import PlatformErrors
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
@@ -44,21 +44,6 @@ def sensor_chapter(
     else:
         warning = "The platform is at rest: there is no look-ahead time"
         warning += "." if judged else ", and requirements for flight control do not apply."
-    verdicts = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
-    unskilled = without_skill(metrics)
-    tables = [
-        (
-            f"{table.title}, {table.phase}: {verdicts[fulfilled(findings)]}"
-            + _but(findings, unskilled),
-            ["verdict", "measured", "required", "margin"],
-            [
-                (name, "", (verdict, measured, required, margin))
-                for name, required, measured, margin, verdict in as_rows(findings)
-            ],
-        )
-        for table, findings in judged
-        if table.applies_at(speed)
-    ]
     if vectors:
         vectors = {"title": "The wind from both lidars, vector by vector"} | vectors
     return Chapter(
@@ -71,17 +56,12 @@ def sensor_chapter(
             *_costs(metrics),
         ],
         drawn=drawn,
-        verdict=Tables(
-            "Compliance with the requirements of flight control"
-            if speed
-            else "Compliance with the requirements",
+        verdict=compliance(
+            judged,
+            speed,
             "Errors of u, v, w are rms errors of valid vectors beyond two core radii, those of "
-            "v_LOS rms errors of lines of sight. A margin is the distance from the limit, as a "
-            "fraction of it. Phases of flight at another air speed are not assessed.",
-            tables,
-        )
-        if tables
-        else None,
+            "v_LOS rms errors of lines of sight.",
+        ),
         numbers=Tables(
             "Accuracy of the wind from both lidars",
             f"{metrics['sensor.lines_retrieved']} of {metrics['sensor.lines']} lines of sight were "
@@ -104,12 +84,6 @@ _CAUSES = {
     "crossflow": "errors of v and w",
     "pointing": "errors of attitude and pointing",
 }
-
-
-def _but(findings: Sequence[Finding], unskilled: Sequence[str]) -> str:
-    """Components of a table whose error is as large as they vary."""
-    found = [name for name in unskilled if any(f.quantity == f"error_{name}" for f in findings)]
-    return f", but {', '.join(found)} without skill" if found else ""
 
 
 def _limit_of_u(metrics: Mapping[str, float]) -> list[str]:

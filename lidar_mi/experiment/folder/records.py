@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from lidar_mi.assessment.metrics.names import current_name
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import log
 from lidar_mi.experiment.schema.experiment import NAME
@@ -64,7 +63,7 @@ def read_metrics(folder: str | Path) -> dict[str, float] | None:
         # older versions wrote no checksum
         if checksum and checksum != file_checksum(path):
             raise InputError(f"{path}: was changed or copied here; expected the metrics of its run")
-    return {current_name(key): value for key, value in metrics.items()}
+    return metrics
 
 
 def read_answer(folder: str | Path) -> list[str]:

@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, Literal, Self
 
-from pydantic import AliasChoices, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from lidar_mi.experiment.schema.rings import Assumed, Reference, RingCalibration
 from lidar_mi.experiment.schema.section import Section, each_once
@@ -101,7 +101,6 @@ class Doppler(Section):
         16,
         description="light paths per pixel of an additional image of the laser's light through a "
         "real lens; 0: no such image",
-        validation_alias=AliasChoices("path_samples", "photon_samples"),  # its former name
     )
     reference: Reference = Reference()
     assumed: Assumed = Assumed()

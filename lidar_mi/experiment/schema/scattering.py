@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AliasChoices, Field, model_validator
+from pydantic import Field, model_validator
 
 from lidar_mi.experiment.schema.section import Section
 from lidar_mi.units import Number, Within
@@ -54,8 +54,7 @@ class Part(_Scatterer):
         description="kind of scatterer"
     )
     fraction: Annotated[Number, Within(1e-9, 1e9, "only ratios count")] = Field(
-        description="of the extinction, relative to the other parts",
-        validation_alias=AliasChoices("fraction", "share"),  # its former name
+        description="of the extinction, relative to the other parts"
     )
 
 

@@ -14,6 +14,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.sensor import Sensor
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings
 from lidar_mi.experiment.stages.ring_instrument import pixel_noise
@@ -43,16 +44,16 @@ _DRIFTS = 1 << 24
 
 
 def requirement_tables(
-    sensor: Sensor, platform: Platform, search_path: Path
+    sensor: Sensor | None, wake: Wake, platform: Platform, search_path: Path
 ) -> Mapping[tuple[str, str], RequirementTable]:
-    """The tables that the sensor is compared with, as `read_requirements` gives them.
+    """The tables that the lidars are compared with, as `read_requirements` gives them.
 
     Raises
     ------
     InputError
         A requirement table that is missing or not one.
     """
-    path = sensor.requirements
+    path = sensor.requirements if sensor else None
     if path:
         return read_requirements(find_file(path, search_path, "sensor.requirements"))
     # the paper's are those of flight control: they do not apply to a platform at rest

@@ -1,7 +1,6 @@
 """Settings of the variational retrieval, frozen: each field with its unit and its source or effect.
 
-How much the errors change where a field is halved or doubled is in ``docs/settings.md``, measured
-by ``python -m benchmarks settings``.
+How much the errors change where a field is halved or doubled is in ``docs/settings.md``.
 """
 
 from dataclasses import dataclass, field

@@ -1,7 +1,6 @@
 """Settings of the band limit of images and volumes, frozen.
 
-How much the errors change where a field is halved or doubled is in ``docs/settings.md``, measured
-by ``python -m benchmarks settings``.
+How much the errors change where a field is halved or doubled is in ``docs/settings.md``.
 """
 
 from dataclasses import dataclass

@@ -15,14 +15,12 @@ from lidar_mi.retrieval.device import device_of
 from lidar_mi.retrieval.images.common_grid import all_on_one_grid
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.threads import SMALL, in_turn, threads_for
-from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 _PER_PAIR = "identical_images", "fixed_pattern", "illumination"
 """Attributes of a wind that are remarks on its images."""
 
 
-@with_old_keywords
 @checked_arguments
 def retrieve_winds(
     images: Sequence[xr.DataArray] | xr.DataArray,

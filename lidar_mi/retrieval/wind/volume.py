@@ -24,7 +24,6 @@ from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, of_fit
 from lidar_mi.retrieval.images.windows import Windows, working
 from lidar_mi.retrieval.wind.dataset import centres, dataset, field, flags, spacing, winds
-from lidar_mi.retrieval.wind.old_keywords import with_old_keywords
 from lidar_mi.retrieval.wind.options import (
     VALIDATION,
     VOLUME_WINDOWS,
@@ -41,7 +40,6 @@ METHODS: Mapping[str, Callable[..., Displacement]] = {
 """Methods by name."""
 
 
-@with_old_keywords
 @checked_arguments
 def retrieve_wind_volume(
     volume1: xr.DataArray,

@@ -12,6 +12,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.encounter import (
     encounter_metrics,
     felt_from,
+    fraction_added,
     measured_in_flight,
     prediction_error,
     residual_moment,
@@ -86,7 +87,6 @@ def test_roll_and_moments(series):
     assert found["encounter.off.largest_roll"] == pytest.approx(0.5)
     assert found["encounter.feedforward.largest_roll"] == pytest.approx(0.14)
     assert found["encounter.perfect.largest_roll_rate"] == pytest.approx(0.1)
-    assert found["encounter.removed_of_perfect.largest_roll"] == pytest.approx(0.36 / 0.45)
     assert found["encounter.removed_beyond_autopilot.largest_roll"] == pytest.approx(0.06 / 0.15)
     assert found["encounter.perfect.largest_lift"] == pytest.approx(2e4)
     assert found["encounter.feedforward.residual_moment"] == pytest.approx(0.25)
@@ -94,6 +94,12 @@ def test_roll_and_moments(series):
     # 0.14 rad are 8 degrees, 0.05 rad are 3
     assert [found[f"encounter.{m}.hazardous"] for m in series["flight"].values] == [1, 1, 0, 1]
     assert not any("track" in key for key in found)
+
+
+def test_no_fraction_of_nothing():
+    """A lidar is judged only where perfect preview removes something beyond the autopilot."""
+    found = fraction_added([5.0, 5.0, 1.0], [2.0, 6.0, 0.5], [1.0, 1.0, 0.6], 0.5)
+    assert np.array_equal(found, [0.75, -0.25, np.nan], equal_nan=True)
 
 
 def test_still_air_has_no_fraction(series):
@@ -116,8 +122,8 @@ def test_the_lidar_in_flight(series, track):
     found = encounter_metrics(series, track)
     assert prediction_error(series.isel(flight=1)) == pytest.approx(0.1)
     assert found["encounter.slabs_to_track"] == 3 and found["encounter.usable_slabs"] == 7
-    # felt from 2 s on; the fourth slab was delivered at 0.42 s
-    assert found["encounter.lead_time"] == pytest.approx(1.58)
+    # felt from 2 s on; a preview from the start
+    assert found["encounter.lead_time"] == pytest.approx(2.0, abs=0.011)
     # 75 m are 1 s, less the delivery 0.12 s after the first slab's scan
     assert found["encounter.look_ahead"] == pytest.approx(0.88)
     assert found["encounter.after_5_slabs.circulation_error"] == pytest.approx(0.02)
@@ -156,6 +162,6 @@ def test_load_increments(series):
     for mode, peak in (("off", 0.8), ("feedforward", 0.5), ("perfect", 0.3), ("autopilot", 0.7)):
         assert found[f"encounter.{mode}.largest_load_increment"] == pytest.approx(peak)
         assert found[f"encounter.{mode}.largest_bending_increment"] == pytest.approx(2e5 * peak)
-    share = found["encounter.removed_of_perfect.largest_load_increment"]
-    assert share == pytest.approx(0.3 / 0.5)
+    share = found["encounter.removed_beyond_autopilot.largest_load_increment"]
+    assert share == pytest.approx(0.2 / 0.4)
     assert not any("increment" in name for name in encounter_metrics(series, None))

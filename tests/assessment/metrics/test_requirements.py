@@ -155,7 +155,7 @@ def test_as_rows():
     assert rows["range"] == ("30 to 150 m", "76 m", "+49 %", "pass")
     assert rows["points per slab"] == ("at least 20", "63", "+215 %", "pass")
     assert rows["slab depth"] == ("at most 7.6 m", "7 m", "+8 %", "pass")
-    assert rows["error of v"] == ("at most 2.5 m/s", "", "", "undetermined")
+    assert rows["error of v"] == ("at most 2.5 m/s", "", "", "not judged: not measured")
     assert rows["error of w"] == ("at most 2.5 m/s", "3 m/s", "-20 %", "fail")
 
 

@@ -14,6 +14,7 @@ from lidar_mi.assessment.metrics.requirements import (
     judge,
     read_requirements,
 )
+from lidar_mi.assessment.metrics.sensor import without_skill
 from lidar_mi.assessment.report.answer import answer, verdict
 from lidar_mi.assessment.report.simulation import simulation_remark
 from lidar_mi.assessment.report.summary import summary
@@ -94,7 +95,7 @@ def test_a_verdict_gives_its_reasons():
     assert "all 5 rows fulfilled." in verdict(table, better)
     unknown = judge(table, MEASURED | {"slab_depth": 4.0, "error_v_los": math.nan})
     assert verdict(table, unknown).endswith(
-        "4 of 5 rows fulfilled; undetermined: error of line-of-sight velocity."
+        "4 of 5 rows fulfilled; not judged: error of line-of-sight velocity (not measured)."
     )
 
 
@@ -111,10 +112,11 @@ def test_a_component_as_uncertain_as_it_varies_fulfils_nothing(error, skill):
             f"sensor.outside_cores.std_{n}": v for n, v in zip("uvw", (0.24, 2.8, 3.7), strict=True)
         },
     }
-    found = judge(table, {f"error_{n}": metrics[f"sensor.outside_cores.rmse_{n}"] for n in "uvw"})
+    errors = {f"error_{n}": metrics[f"sensor.outside_cores.rmse_{n}"] for n in "uvw"}
+    found = judge(table, errors, {f"error_{n}": "no skill" for n in without_skill(metrics)})
     *_, line = answer(an_experiment(), metrics, [(table, found)])
     assert ("all 3 rows fulfilled." in line) == skill
-    words = "2 of 3 rows fulfilled; u has no skill: its error is as large as the true wind varies."
+    words = "2 of 3 rows fulfilled; not judged: error of u (no skill)."
     assert (words in line) != skill
 
 

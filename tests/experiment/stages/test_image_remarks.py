@@ -50,7 +50,13 @@ def prepared(**changes):
             "lidar.fov_half: 0.2 deg sees",
         ),
         (
-            {"wake": {"vortex_pair": {"circulation": "9e3 m^2/s"}, "file": None, "time": None}},
+            {
+                "wake": {
+                    "vortex_pair": {"circulation": "1100 m^2/s", "core_radius": "0.3 m"},
+                    "file": None,
+                    "time": None,
+                }
+            },
             "are circulation and core radius right?",
         ),
         ({"platform": {"dt": "0.5 s"}}, "windows of cc follow"),

@@ -1,0 +1,39 @@
+"""The part of a report that compares a sensor with the requirements of flight control."""
+
+from lidar_mi.assessment.metrics.requirements import Judged, as_rows, fulfilled
+from lidar_mi.assessment.report.page import Tables
+
+_VERDICTS = {True: "fulfilled", False: "not fulfilled", None: "not judged in all rows"}
+
+
+def compliance(judged: Judged, speed: float, legend: str) -> Tables | None:
+    """Tables of the phases that are flown at an air speed (m/s), row by row; None: there are none.
+
+    Parameters
+    ----------
+    judged : sequence of (RequirementTable, list of Finding)
+    speed : float
+    legend : str
+        How the sensor's properties were measured.
+    """
+    tables = [
+        (
+            f"{table.title}, {table.phase}: {_VERDICTS[fulfilled(findings)]}",
+            ["verdict", "measured", "required", "margin"],
+            [
+                (name, "", (verdict, measured, required, margin))
+                for name, required, measured, margin, verdict in as_rows(findings)
+            ],
+        )
+        for table, findings in judged
+        if table.applies_at(speed)
+    ]
+    if not tables:
+        return None
+    of_flight = " of flight control" if speed else ""
+    return Tables(
+        f"Compliance with the requirements{of_flight}",
+        f"{legend} A margin is the distance from the limit, as a fraction of it. Phases of flight "
+        "at another air speed are not assessed.",
+        tables,
+    )
