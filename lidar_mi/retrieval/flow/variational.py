@@ -208,7 +208,7 @@ def variational_and_flow(
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     factor = torch.ones(windows.count).to(covariance)
-    if not isinstance(posterior, iterative.Posterior):
+    if isinstance(posterior, direct.Posterior | strips.Posterior):
         check = prior_check(posterior, linear, mesh)
         factor = check.factor(centres).to(covariance)
         # a weaker prior is one that images remove less of
