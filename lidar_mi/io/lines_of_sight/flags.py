@@ -60,6 +60,7 @@ EXCESS = 4.0
 LEAST_REPEATED = 40
 """Cells that a repeated number has at least."""
 
+_LEAST_NOISE = 500  # gates: a tenth of uniform velocities is above 90 % of the largest, to 1.5 %
 _LEAST_GATES = 8  # whose velocities are not equal by chance
 
 
@@ -91,6 +92,7 @@ def flags(
         found[snr <= -1.0] |= LineFlag.MISSING.value
         overlap = overlapping(scan, snr, limit)[0]
         found[np.isfinite(velocity) & ~(snr >= 10 ** (limit / 10))] |= LineFlag.LOW_CNR.value
+        _nyquist_of_noise(scan, velocity[found == LineFlag.LOW_CNR.value])
     near = np.broadcast_to(scan.range < blind, velocity.shape).copy()
     if not given:
         near |= reflection(scan, overlap)
@@ -108,6 +110,13 @@ def flags(
     if scan.rejected is not None:
         found[scan.rejected] |= LineFlag.REJECTED.value
     return found, {"min_cnr": limit, "blind_range": blind}
+
+
+def _nyquist_of_noise(scan: Scan, noise: np.ndarray) -> None:
+    """Velocity beyond which those of the file fold: gates without a signal fill what is below."""
+    top = float(np.abs(noise).max()) if noise.size >= _LEAST_NOISE else 0.0
+    if top > 0 and 0.05 < np.mean(np.abs(noise) > 0.9 * top) < 0.2:
+        scan.about.setdefault("nyquist_velocity", top * (1 + 1 / noise.size))
 
 
 def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
