@@ -16,7 +16,7 @@ COPY plugins /source/plugins
 COPY scenes /source/scenes
 RUN python3 -m venv /opt/lidar-mi \
     && /opt/lidar-mi/bin/pip install --no-cache-dir \
-        --extra-index-url https://download.pytorch.org/whl/cpu "torch<2.16" /source \
+        --extra-index-url https://download.pytorch.org/whl/cpu /source \
     && rm -rf /source
 
 RUN useradd --create-home lidar

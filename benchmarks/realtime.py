@@ -14,6 +14,7 @@ import numpy as np
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.combination import Completion
+from lidar_mi.encounter.computer import Cores
 from lidar_mi.encounter.doppler import DopplerScans, LineFrames, Midway, doppler_scans
 from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.line_speeds import LineSpeeds
@@ -80,11 +81,11 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
     estimator = Estimator(experiment, processes=2, speeds=LineSpeeds(scans))
     without_old_garbage()
     warm, scratch = [], []
-    last = None
+    last, cores = None, Cores()
     for k in range(number + UNTIMED):
         images = slab(k, number, columns, rows)
         given = Slab(images, scans.frames(_still(images), k, DISTANCE, 0.0, MIDWAY))
-        found = timed(estimator, given, last and expected(last))
+        found, cores = timed(estimator, given, last and expected(last), cores)
         last = found.pair if found.pair.success else None
         if k < UNTIMED:
             continue
@@ -92,7 +93,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
         if k % COLD == 0:
             # one that has learnt nothing
             cold = Estimator(experiment, speeds=LineSpeeds(scans))
-            scratch.append((images, timed(cold, given, None), found))
+            scratch.append((images, timed(cold, given, None, Cores())[0], found))
     case = f"{columns} x {rows} px"
     lines = []
     for part in PARTS:
@@ -148,13 +149,19 @@ def expected(last: VortexPairFit) -> VortexPairFit:
     return replace(last, covariance=last.covariance + np.diag(UNFORESEEN**2))
 
 
-def timed(estimator: Estimator, slab: Slab, start: VortexPairFit | None) -> Timed:
+def timed(
+    estimator: Estimator, slab: Slab, start: VortexPairFit | None, cores: Cores
+) -> tuple[Timed, Cores]:
+    """A slab's estimates, and how long the cores still work after its second image."""
     first, second = slab.images.first, slab.images.second
     complete = Completion(0.0, 0.0, "known", MIDWAY.place, (0.0, 0.0), DISTANCE, None)
     found = estimator.pair_of(
         first, second, DT, NOISE, start, frames=slab.frames, complete=complete
     )
-    return Timed(found.wind, found.pair, found.lines, found.seconds)
+    after = cores.after(0.0, DT, found.seconds)
+    seconds = {**found.seconds, "total": max(after)}
+    # the next second image comes a period later
+    return Timed(found.wind, found.pair, found.lines, seconds), Cores(*(t - DT for t in after))
 
 
 def _latency(case: str, part: str, warm: Sequence[float], cold: Sequence[float]) -> list[Row]:

@@ -194,6 +194,12 @@ def passes_light(shape: Shape) -> bool:
     return bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
 
 
+def reflects(shape: Shape) -> bool:
+    """Whether light that meets a shape is reflected diffusely, and in no other way."""
+    bsdf, kinds = shape.bsdf(), mi.BSDFFlags
+    return bsdf is not None and bsdf.flags() & +kinds.All == +kinds.DiffuseReflection
+
+
 def name_of(thing: Shape | Medium) -> str:
     """What a message calls a shape or medium: those that Mitsuba has merged have no name."""
     return thing.id() or thing.class_name()

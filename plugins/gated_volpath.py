@@ -26,6 +26,8 @@ Parameter                    Type    Meaning                                    
                                      the depolarisation ratio)
 ``shares``                   bool    also give the largest fraction of the variance of S0     false
                                      that is due to one sample
+``random_numbers``           string  ``independent``, the default: every beam and gate has
+                                     its own; ``common``: all have the same (``gated`` only)
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
                                      memory, does not change the result
 ============================ ======= ======================================================= =======
@@ -67,9 +69,15 @@ colour channel nearest to the wavelength of the laser.
 The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
 the same number, at least two. Of few samples a gate the standard error is itself uncertain: for
 normal ones, the value plus and minus 1.96 of it holds the truth in 70 % of the pixels with 2
-samples, 86 % with 4, 91 % with 8, 93 % with 16, instead of 95 % (Student's t). Samples are
-independent; the random numbers of a sample depend only
-on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
+samples, 86 % with 4, 91 % with 8, 93 % with 16, instead of 95 % (Student's t). Samples of a beam
+are independent; the random numbers of a sample depend only on the seed, its beam, its gate and its
+number. With ``random_numbers`` ``common`` they depend on the seed and the number alone: every beam
+and gate, and every image of the same seed, is sampled by the same rays of the laser, points of the
+telescope and places in the gate, and their errors are nearly the same where the air is the same.
+The standard error of a pixel is unchanged. ``gateNNN.S0_mc_error``, behind the orders, is then one
+realisation of the Monte Carlo error of S0: half the difference of the means of samples of even and
+of odd number, which is correlated among pixels, gates and images as the errors themselves are.
+Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
 S0 to S3 of all orders are differentiable, in reverse and forward mode (``dr.backward`` and
@@ -79,6 +87,13 @@ of :ref:`mueller <phase-mueller>`, and the flow of a :ref:`moving_volume <volume
 Gradients use other random samples than the image. Memory does not grow with the number of orders.
 Gradients with respect to anything else raise an error of one line. Other channels, such as standard
 errors, are constants in a loss: they have no gradient.
+
+Ground, walls and calibration targets are surfaces with Mitsuba's ``diffuse`` BSDF, which is also
+that of a shape without any: reflectance rho, rho / pi per steradian, unpolarised. One that faces
+away is dark, unless it is ``twosided``. The light that the laser sends straight to a surface is
+received in the gate of its range, attenuated by the air before it, as scattered once (order 1).
+Light that is scattered in the air before or after it is reflected is not followed: for the part of
+it that stays in view, the air counts as if it absorbed.
 
 A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
 extinction coefficient, an albedo or a weight of a blend outside 0 to 1, if ``hg`` has a g beyond
@@ -111,6 +126,8 @@ other emitters than the sensor's      refused: area, environment, point, a secon
 BSDF ``null``                         light passes: a surface between media
 BSDF that transmits otherwise         refused: ``mask``, ``blendbsdf``, ``thindielectric``,
                                       dielectrics, etalons
+BSDF ``diffuse``, ``twosided``        the surface blocks all light, and reflects what reaches it
+                                      from the laser to the telescope. Refused around a medium
 any other BSDF                        the surface blocks all light; what it reflects is not
                                       followed. Refused around a medium
 cube, sphere, closed mesh             honoured: the interior is what it encloses, whatever the
@@ -160,6 +177,7 @@ from .passes import Batches, Progress, stored_passes
 from .path_gradients import gradients
 from .path_sampling import Lidar, Orders, Sample, add
 from .physical import Physical
+from .random_numbers import generator
 from .registration import register
 from .supported import check_air, check_supported
 from .surfaces import media_of
@@ -202,6 +220,10 @@ def define() -> type:
             self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             self.candidates = whole(props, NAME, "candidates", 1, 1)
+            numbers = ("independent", "common")
+            self.random_numbers = choice(props, NAME, "random_numbers", numbers[0], numbers)
+            if self.common and self.estimator != "gated":
+                fail(NAME, "random_numbers", "common", "independent for free flights")
             # pixels of the last image that receive light, those of them whose standard error is
             # unreliable, and samples that were lost to rounding
             self.lit, self.untrusted, self.rejected = 0, 0, 0
@@ -217,13 +239,19 @@ def define() -> type:
         def aov_names(self) -> list[str]:
             return []
 
+        @property
+        def common(self) -> bool:
+            """Whether all beams and gates have the same random numbers."""
+            return self.random_numbers == "common"
+
         def quantities(self) -> list[str]:
             """Quantities that are rendered for every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
             more = COVARIANCE if self.covariance else ()
             by_order = (f"order{order}.S0" for order in orders)
+            error = ("S0_mc_error",) if self.common else ()
             shares = ("S0_largest_share",) if self.shares else ()
-            return [*STOKES, "S0_stderr", *by_order, *more, *shares]
+            return [*STOKES, "S0_stderr", *by_order, *error, *more, *shares]
 
         def channel_names(self, sensor: Sensor) -> list[str]:
             """Names of the last axis of the rendered tensor."""
@@ -453,10 +481,13 @@ def define() -> type:
             cell = lane // rounds_
             beam = cell // gates
             gate = cell - beam * gates
-            number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
+            number = lane - cell * rounds_ + dr.opaque(mi.UInt32, start)
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, self.bounds, differentiable)
-            sample = lidar.emit(seed, beam, number)
+            if self.common:
+                sample = lidar.emit(generator(seed, mi.UInt32(0), number), beam)
+            else:
+                sample = lidar.emit(generator(seed, beam, number * gates + gate), beam)
             low, high = sensor.ranges(sample.frame.n, sample.start)
             # whole paths, twice the ranges
             width = 2 * (high - low) / mi.Float(gates)
@@ -493,6 +524,10 @@ def define() -> type:
                     dr.opaque(mi.UInt32, self.candidates),
                 )
                 stokes = lidar.single(chosen, place, weight * (high - low))
+            if lidar.air.targets:
+                stokes = [
+                    a + b for a, b in zip(stokes, lidar.reflected(sample, low, high), strict=True)
+                ]
             if by_order:
                 by_order.add(stokes[0], mi.UInt32(1), row)
             if self.max_order > 1:
@@ -511,6 +546,13 @@ def define() -> type:
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
             if by_order:
                 means += [one / _opaque(rounds) for one in by_order.totals(parts)]
+            if self.common:
+                # without the sample's number of the pass: of every beam the same passes are traced
+                odd = (
+                    dr.arange(mi.UInt32, dr.width(cell)) - cell * dr.opaque(mi.UInt32, rounds)
+                ) & 1
+                halves = dr.block_sum(dr.select(odd == 0, off[0], -off[0]), rounds)
+                means.append(halves / (MAGNIFIED * _opaque(rounds)))
             return (rounds, means, deviations, largest), lidar.rejected
 
         def _analog(
@@ -530,7 +572,8 @@ def define() -> type:
             within = lane - beam * rounds_
             lidar = Lidar(scene, sensor, self.bounds)
             number = within + dr.opaque(mi.UInt32, start)
-            sample = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
+            index = beam + dr.opaque(mi.UInt32, first)
+            sample = lidar.emit(generator(seed, index, number), index)
             parts, gates = -(-rounds // ROW), sensor.gate_count
             parts_, gates_ = dr.opaque(mi.UInt32, parts), dr.opaque(mi.UInt32, gates)
             rows = count * gates * parts

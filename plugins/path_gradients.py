@@ -68,7 +68,10 @@ def gradients(
     if first == 1:
         # Mitsuba's derivatives call this with gradients suspended
         with dr.resume_grad():
-            slopes = _propagated(lidar.single(sample, path, width), weights)
+            light = lidar.single(sample, path, width)
+            if lidar.air.targets:
+                light = _plus(light, lidar.reflected(sample, low, high))
+            slopes = _propagated(light, weights)
     if last == 1:
         return slopes
     least, most = (dr.opaque(mi.UInt32, order) for order in orders)

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
-from .bodies import slabs
+from .bodies import first_hit, slabs
 from .bounds import Bounds
 from .closed_paths import (
     OpenPath,
@@ -26,7 +26,7 @@ from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
 from .mitsuba_tables import has_tables, off_the_poles
 from .polarization import apply_phase_function, rotate_stokes, transverse
-from .random_numbers import generator, pair
+from .random_numbers import pair
 from .resampling import choose
 from .surfaces import Air, media_of
 from .variant_types import (
@@ -64,6 +64,8 @@ WIDER = 1.6
 NEAR_FLIGHT_FRACTION = 0.3
 # Russian roulette: probability of survival over the weight.
 ROULETTE_FACTOR = 30.0
+# Of the way to a surface, what is left out in front of it.
+SKIN = 1e-6
 
 
 class Sample:
@@ -137,9 +139,8 @@ class Lidar:
         self.rejected = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self.rejected)
 
-    def emit(self, seed: UInt, beam: UInt, number: UInt) -> Sample:
-        """Samples of beams by their index, with independent random numbers."""
-        rng = generator(seed, beam, number)
+    def emit(self, rng: Generator, beam: UInt) -> Sample:
+        """Samples of beams by their index."""
         sensor = self.sensor
         self.field_tan = sensor.field_tangent(beam)
         to_world = sensor.world_transform()
@@ -195,6 +196,74 @@ class Lidar:
             (path > 0) & (closure > 0),
         )
         return received
+
+    def reflected(self, sample: Sample, low: Float, high: Float) -> Stokes:
+        """Stokes vector (about e_h) of the light that a diffuse surface reflects to the telescope.
+
+        ``low`` and ``high`` are twice the gate's ranges less the sample's delay.
+        """
+        si, back, path = self._target(sample)
+        active = (path >= low) & (path < high)
+        medium = mi.MediumPtr(self.sensor.get_medium())
+        # as far as in front of the surface, which would hide itself
+        out, medium = transmittance(
+            self.air,
+            self.bounds,
+            medium,
+            sample.origin,
+            sample.direction,
+            si.t * (1 - SKIN),
+            self.channel,
+            self.wavelengths,
+            sample.time,
+            sample.rng,
+            active,
+            self.differentiable,
+        )
+        return self._from_target(sample, sample.rng, si, back, medium, out, active)
+
+    def _target(self, sample: Sample) -> tuple[Interaction, Vector, Float]:
+        """Where a sample meets a diffuse surface, the way back, and the length of the path."""
+        ray = mi.Ray3f(sample.origin, sample.direction, sample.time, self.wavelengths)
+        si = self.air.targets.ray_intersect(ray)
+        back = sample.aperture - si.p
+        return si, back, si.t + dr.norm(back)
+
+    def _from_target(
+        self,
+        sample: Sample,
+        rng: Generator,
+        si: Interaction,
+        back: Vector,
+        medium: MediumPtr,
+        weight: Float,
+        active: Mask,
+    ) -> Stokes:
+        """Light from a diffuse surface at the telescope, unpolarised, of light of that weight."""
+        distance = dr.norm(back)
+        wo = back / distance
+        active = active & si.is_valid() & self._in_view(sample.axes, -back)
+        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(wo), active)
+        value = (value[0, 0] if mi.is_polarized else value)[self.channel]
+        active = active & (value > 0)
+        place = si.spawn_ray(wo).o
+        out, _ = transmittance(
+            self.air,
+            self.bounds,
+            medium,
+            place,
+            wo,
+            distance,
+            self.channel,
+            self.wavelengths,
+            sample.time,
+            rng,
+            active,
+            self.differentiable,
+        )
+        cosine = -dr.dot(wo, sample.axes.n)
+        light = weight * out * value * self.area * cosine / dr.square(distance)
+        return [dr.select(active, light, 0), mi.Float(0), mi.Float(0), mi.Float(0)]
 
     @dr.syntax
     def by_contribution(
@@ -646,6 +715,35 @@ class Lidar:
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return [apply_phase_function(value, stokes, self.channel) for stokes in several], pdf
 
+    def unscattered(self, sample: Sample, low: Float, high: Float) -> tuple[Stokes, Float, Mask]:
+        """Light that meets a diffuse surface and no air on its way, of an analog free flight.
+
+        It is the first one of `analog`, with the same random numbers. ``low`` and ``high`` are
+        ranges. Returns the Stokes vector (about e_h), the range, and where there is light.
+        """
+        rng, active = mi.PCG32(sample.rng), mi.Bool(True)
+        medium = mi.MediumPtr(self.sensor.get_medium())
+        si, back, path = self._target(sample)
+        range_ = 0.5 * path + sample.delay
+        near = si.t * (1 - SKIN)
+        _, medium, found = collision(
+            self.air,
+            self.bounds,
+            medium,
+            sample.origin,
+            sample.direction,
+            2 * (high - sample.delay),
+            self.channel,
+            self.wavelengths,
+            sample.time,
+            rng,
+            active,
+        )
+        first, _ = first_hit(self.air.opaque, sample.origin, sample.direction, active)
+        active = ~found & (first >= near) & (range_ >= low) & (range_ < high)
+        light = self._from_target(sample, rng, si, back, medium, mi.Float(1), active)
+        return light, range_, active & (light[0] > 0)
+
     @dr.syntax
     def analog(
         self,
@@ -678,6 +776,13 @@ class Lidar:
         travelled, order = mi.Float(2 * sample.delay), mi.UInt32(1)
         gate, held = mi.UInt32(0), _copied([0, 0, 0, 0])
         active = mi.Bool(True)
+        if dr.hint(self.air.targets is not None, mode="scalar"):
+            # a sample of whose light none is scattered in the air: it adds to no other
+            light, place, lit = self.unscattered(sample, low, high)
+            at = mi.UInt32(dr.select(lit, (place - low) / (high - low) * gates, 0))
+            at = row + dr.minimum(at, gates - 1) * parts
+            _deposit(sums, products, largest, magnified, at, light, lit)
+            _split(by_order, light[0], order, at, lit)
         while dr.hint(active, label="scattering orders"):
             began = mi.Bool(active)
             flight, medium, active = collision(

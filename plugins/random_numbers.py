@@ -7,7 +7,10 @@ from .variant_types import Float, Generator, Point, UInt
 
 
 def generator(seed: UInt, group: UInt, number: UInt) -> Generator:
-    """Independent random numbers for every seed, group (beam, pixel or pass) and number in it."""
+    """Independent random numbers for every seed, group (beam, pixel or pass) and number in it.
+
+    Samples of one group have common random numbers in all that is rendered with a seed.
+    """
     key, counter = mi.sample_tea_32(seed, group)
     state, stream = mi.sample_tea_32(key, counter + number)
     rng = mi.PCG32()

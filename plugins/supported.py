@@ -9,7 +9,7 @@ import re
 import mitsuba as mi
 import numpy as np
 
-from .bodies import extent, name_of
+from .bodies import extent, name_of, reflects
 from .parameters import fail
 from .polarization import first_unpolarized_in_blend
 from .surfaces import media_of
@@ -114,13 +114,14 @@ def _check_blends(plugin: str, scene: Scene, sensor: Sensor) -> None:
 
 
 def _check_gate_meets_medium(plugin: str, scene: Scene, sensor: Sensor) -> None:
-    """A gate without any medium in it is an error of the scene, not a black image."""
+    """A gate without a medium or a target in it is an error of the scene, not a black image."""
     if sensor.get_medium() is not None:
         return
     origins, (near, far) = sensor.origins_and_ranges()
     spans = []
     for shape in scene.shapes():
-        if shape.interior_medium() is None and shape.exterior_medium() is None:
+        around = shape.interior_medium() or shape.exterior_medium()
+        if around is None and not reflects(shape):
             continue
         low, high = extent(shape)
         first = np.linalg.norm(np.maximum(0, np.maximum(low - origins, origins - high)), axis=1)

@@ -25,6 +25,7 @@ from .bodies import (
     name_of,
     parts_of_shape,
     passes_light,
+    reflects,
     scene_of,
 )
 from .parameters import fail
@@ -68,6 +69,8 @@ class Air:
         # the last body that a place is in is the smallest: its medium holds
         self.bodies.sort(key=lambda body: -body.volume)
         self.opaque = scene_of(opaque) if opaque else None
+        targets = [shape for shape in opaque if reflects(shape)]
+        self.targets: Scene = scene_of(targets) if targets else None
         around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
         self.around = mi.MediumPtr(around)
         for body in self.bodies:

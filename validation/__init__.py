@@ -5,6 +5,7 @@ writes ``docs/validation.md`` with its figures; it ends with an error if any row
 
 lidar_equation       single scattering: closed forms
 multiple_scattering  all orders in a dense slab: an independent simulation in numpy
+narrow_fields        light scattered twice in 0.05 to 20 mrad: a quadrature in double precision
 steady_state         all ranges together: an integral equation, conservation of energy, Eradiate
 scattering_matrices  particles: published tables, other solvers, inequalities of matrices
 molecules            air: published numbers
@@ -33,6 +34,7 @@ import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here i
 GROUPS = (
     "lidar_equation",
     "multiple_scattering",
+    "narrow_fields",
     "steady_state",
     "scattering_matrices",
     "molecules",

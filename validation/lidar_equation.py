@@ -334,6 +334,45 @@ def depolarisation(effort):
     )
 
 
+def diffuse_targets(effort):
+    """Ground and walls: rho / pi cos A / R^2 T^2."""
+    rho, far, extinction, aperture = 0.3, 200.0, 2e-3, 0.1
+    rows = []
+    for number, (tilt, estimator) in enumerate(
+        itertools.product((0.0, 40.0, 75.0), ("gated", "analog"))
+    ):
+        place = mi.ScalarTransform4f().translate([far, 0.0, 0.0]).rotate([0, 0, 1], tilt)
+        wall = {
+            "type": "rectangle",
+            "to_world": place.rotate([0, 1, 0], -90.0).scale(20.0),
+            "bsdf": {"type": "diffuse", "reflectance": rho},
+        }
+        loaded = scene(
+            (190, 210),
+            {"wall": wall},
+            laser={"beam_radius": 1e-6, "divergence_full_mrad": 0.0},
+            integrator={"estimator": estimator},
+            environment=medium(extinction, "isotropic", 0.0),
+            gate_kind="spherical",
+            aperture_radius=aperture,
+        )
+        found = render(loaded, 70 + number, 100_000 * effort.scale)
+        area = math.pi * aperture**2
+        expected = rho / math.pi * math.cos(math.radians(tilt)) * area / far**2
+        expected *= math.exp(-2 * extinction * far)
+        got, error = (found[name].item() / expected for name in ("S0", "S0_stderr"))
+        # gated samples have all the same contribution but for the place in the telescope
+        error = 0.0 if estimator == "gated" else error
+        label = f"{estimator}, incidence of {tilt:g} degrees: rendered over expected"
+        rows.append(Row(label, "rho / pi cos A / R^2 T^2", 1.0, got, error, 1e-4))
+    return Check(
+        "Diffuse targets",
+        f"A Lambertian wall of reflectance {rho} at {far:g} m, behind air that absorbs "
+        f"{extinction:g} / m.",
+        tuple(rows),
+    )
+
+
 CHECKS = (
     scan_of_a_slab,
     profile_through_layers,
@@ -342,4 +381,5 @@ CHECKS = (
     random_fields,
     phase_functions,
     depolarisation,
+    diffuse_targets,
 )

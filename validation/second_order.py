@@ -55,10 +55,11 @@ def _contributions(case, first, second, third, fourth, fifth, sixth):
     """Contributions to I, Q and dI/d ln(extinction), (3, n)."""
     start, beam = np.array(case.origin), np.array([1.0, *np.tan(case.tilt)])
     beam /= np.linalg.norm(beam)
-    radius, turn = case.aperture * np.sqrt(first), 2 * np.pi * second
+    # evenly in radius: where the beam is out of view, the light falls as its inverse
+    radius, turn = case.aperture * first, 2 * np.pi * second
     telescope = np.stack([np.zeros_like(turn), radius * np.cos(turn), radius * np.sin(turn)], -1)
     path = 2 * (case.gate[0] + (case.gate[1] - case.gate[0]) * third)
-    weight = np.pi * case.aperture**2 * 2 * (case.gate[1] - case.gate[0])
+    weight = 2 * np.pi * case.aperture * radius * 2 * (case.gate[1] - case.gate[0])
     # the direction from the telescope, about that in which it sees the end of the beam
     offset = start - telescope
     reach = _closing(offset, beam, path)

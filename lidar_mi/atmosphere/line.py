@@ -217,7 +217,7 @@ def backscatter_line(
     Parameters
     ----------
     wavelength, temperature, pressure : float
-        m, K, Pa; see `lidar_mi.atmosphere.molecules.standard_atmosphere`.
+        m, K, Pa; see `lidar_mi.atmosphere.standard_atmosphere`.
     laser_width : float
         Full width at half maximum of the emitted line, Hz.
     aerosol_fraction : float

@@ -11,7 +11,6 @@ neglected. Water vapour is neglected: below 1 % in the cross-section.
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import scipy
 
 from lidar_mi.atmosphere.scattering import ScatteringTable, rayleigh_table
@@ -138,29 +137,6 @@ def number_density(pressure: float, temperature: float) -> float:
     return pressure / (scipy.constants.Boltzmann * temperature)
 
 
-def standard_atmosphere(altitude: float) -> tuple[float, float]:
-    """Pressure (Pa) and temperature (K) of the ICAO standard atmosphere.
-
-    Parameters
-    ----------
-    altitude : float
-        Geometric height above sea level in m, -5004 to 81 020.
-
-    Raises
-    ------
-    InputError
-        Out of range.
-    """
-    from ambiance import Atmosphere
-
-    if not -5004 <= altitude <= 81020:
-        raise InputError(f"altitude: {altitude!r} m is not allowed; expected -5004 to 81020 m")
-    # isothermal layers divide zero by zero on their way
-    with np.errstate(invalid="ignore", divide="ignore"):
-        air = Atmosphere(float(altitude))
-        return float(air.pressure[0]), float(air.temperature[0])
-
-
 def molecular_scattering(
     wavelength: float,
     pressure: float = 101325.0,
@@ -175,7 +151,7 @@ def molecular_scattering(
     wavelength : float
         m, in vacuum.
     pressure, temperature : float
-        Pa, K; see `standard_atmosphere`.
+        Pa, K; see `lidar_mi.atmosphere.standard_atmosphere`.
     band : {"cabannes", "rayleigh"}
         What the receiver lets through: the Cabannes line (narrow filter) or all of it.
     co2 : float

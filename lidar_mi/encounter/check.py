@@ -100,7 +100,7 @@ def sections(
     path = encounter.path
     first = _first_slab(experiment)
     yield from preflight.sections(first, experiment.folder, notice, sampled=timed)
-    margin = (gates.look_ahead - gates.stride) / path.speed - encounter.control.latency
+    margin = (gates.look_ahead - gates.stride) / path.speed - encounter.usual_latency
     rows: list[tuple[str, ...]] = [
         ("aircraft", encounter.aircraft.model),
         ("flight", f"{duration(encounter):.3g} s at {shown(path.speed, 'm/s')}"),
@@ -182,7 +182,7 @@ def _first_slab(experiment: Experiment) -> Experiment:
 
 def _check_latency(experiment: Experiment, gates: Gates) -> None:
     encounter = encounter_of(experiment)
-    speed, latency = encounter.path.speed, encounter.control.latency
+    speed, latency = encounter.path.speed, encounter.usual_latency
     least = gates.stride + latency * speed
     if gates.look_ahead <= least:
         raise InputError(

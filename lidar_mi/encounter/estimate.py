@@ -7,6 +7,9 @@ import xarray as xr
 
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
+SKIPPED = "skipped, as the computer was busy with earlier slabs"
+"""Flag of vortices or wind, after their name and a colon."""
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -17,7 +20,7 @@ class Estimate:
     time : float
         When the wind and the vortices are valid: half way between both scans, s.
     delivered : float
-        Time of delivery: the second scan's reference time plus the latency, s.
+        Time at which the vortices are delivered, from the second scan's reference time on, s.
     x : float
         Plane of the slab along the flight path, m.
     wind : xarray.Dataset or None, dims (z, y)
@@ -29,11 +32,12 @@ class Estimate:
     flags : tuple of str
         Limitations of the estimate; empty if there are none.
     seconds : mapping
-        Duration of each part of the estimate, s, without the rendering. `total` is the duration
-        from the second scan on: lines of sight and the first image come before. Default: their sum.
+        Duration of each part of the estimate, s, without the rendering.
     lines : xarray.Dataset or None, dim line
         Speeds along the lines of sight, in the frame of the aircraft half way between both scans.
         None without a Doppler lidar.
+    wind_delivered : float or None
+        Time at which the wind is delivered, s; None: with the vortices.
     """
 
     time: float
@@ -44,3 +48,4 @@ class Estimate:
     flags: tuple[str, ...]
     seconds: Mapping[str, float]
     lines: xr.Dataset | None = None
+    wind_delivered: float | None = None

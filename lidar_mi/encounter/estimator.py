@@ -1,6 +1,6 @@
 """From two images of a slab of air to its wind and its vortices, in real time."""
 
-import time
+import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -11,11 +11,13 @@ import xarray as xr
 
 from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import LineFrames
+from lidar_mi.encounter.estimate import SKIPPED
 from lidar_mi.encounter.line_speeds import LineSpeeds
-from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProcess
+from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProcess, clock_of
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import retrieval_device, window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
+from lidar_mi.retrieval.vortices.acceptance import no_fit
 from lidar_mi.retrieval.vortices.image_fit import detected_fit, started_fit
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
@@ -33,10 +35,8 @@ class SlabEstimate(NamedTuple):
     seconds : dict
         Of the parts `vortices`, `wind` and `combination` after the second image; `lines`,
         `vortices_before` and `wind_before` of the lines, the first image and the expected pair,
-        before it; and `total`, from the second image to the end, with two processes less than the
-        sum. Work that is not finished at the second image counts in `total`: lines are recorded
-        half a period before it, the first image with the second one of the last slab, and each
-        process finishes that slab first.
+        before it. Processor time of the process that works on the part, so that other work of the
+        machine does not count; on a GPU elapsed time.
     lines : Dataset or None
         As `with_speeds` gives them; None without frames.
     flags : tuple of str
@@ -53,8 +53,9 @@ class SlabEstimate(NamedTuple):
 class Estimator:
     """Estimates wind and vortices from pair to pair of images, as an aircraft's computer does.
 
-    Without an expected pair the methods start from nothing. With one they start from it, and the
-    wind from the last one as well: errors are the same in a fraction of the time.
+    Without an expected pair the vortices start from a detection, with one from it. The wind starts
+    from the last one, moved with the expected pair if there is one: errors are the same in a
+    fraction of the time.
 
     Parameters
     ----------
@@ -85,11 +86,16 @@ class Estimator:
             form = InThisProcess if processes == 1 else InOwnProcess
             self._winds = form(methods[0], window_settings(settings, experiment.device))
         self._device = retrieval_device(experiment.device)
-        self._speeds, self._processes = speeds, processes
-        # the last slab's vortices, near which the next wind starts
+        self._speeds = speeds
+        # the vortices of the last slab whose wind was retrieved, near which the next wind starts
         self._last: VortexPairFit | None = None
-        # time that each process worked on the last slab after its second image, s
-        self._busy: Sequence[float] = (0.0, 0.0)
+        self._clock = clock_of(self._device)
+
+    def forget(self) -> None:
+        """Start from nothing again."""
+        self._last = None
+        if self._winds:
+            self._winds.forget()
 
     # no derivatives are recorded: 7 % of the time
     @torch.inference_mode()
@@ -105,6 +111,7 @@ class Estimator:
         frames: LineFrames | None = None,
         complete: Completion | None = None,
         telescope: tuple[float, float, float] | None = None,
+        take: tuple[bool, bool] = (True, True),
     ) -> SlabEstimate:
         """Wind, vortices, speeds along lines of sight, and the time that each took.
 
@@ -126,17 +133,39 @@ class Estimator:
             Completes the images' wind with the lines.
         telescope : (float, float, float), optional
             As `fit_vortices` takes it.
+        take : (bool, bool)
+            Whether vortices (with the lines) and wind are estimated, see `Cores.take`.
         """
+        with _without_garbage_collection():
+            return self._pair_of(
+                image1, image2, dt, noise, expected, times, frames, complete, telescope, take
+            )
+
+    def _pair_of(
+        self,
+        image1: xr.DataArray,
+        image2: xr.DataArray,
+        dt: float,
+        noise: float | xr.DataArray | None,
+        expected: VortexPairFit | None,
+        times: Sequence[xr.DataArray] | None,
+        frames: LineFrames | None,
+        complete: Completion | None,
+        telescope: tuple[float, float, float] | None,
+        take: tuple[bool, bool],
+    ) -> SlabEstimate:
         seconds: dict[str, float] = {}
+        timed = partial(_timed, seconds, clock=self._clock)
+        winds = self._winds if take[1] else None
         first = FirstImage(image1, dt, noise, times, expected)
         wind: xr.Dataset | None = None
         lines: xr.Dataset | None = None
         flags: tuple[str, ...] = ()
-        if self._speeds and frames:
-            with _timed(seconds, "lines"):
+        if self._speeds and frames and take[0]:
+            with timed("lines"):
                 lines = self._speeds.read(frames)
         # submitted before this process fits: the other one works at the same time
-        prepared = self._winds.prepare(first, self._last) if self._winds else None
+        prepared = winds.prepare(first, self._last) if winds else None
         fit: Callable[[xr.DataArray], VortexPairFit] = partial(
             detected_fit,
             image1,
@@ -146,8 +175,8 @@ class Estimator:
             telescope=telescope,
             device=self._device,
         )
-        if expected:
-            with _timed(seconds, "vortices_before"):
+        if expected and take[0]:
+            with timed("vortices_before"):
                 fit = started_fit(
                     image1,
                     dt,
@@ -160,61 +189,40 @@ class Estimator:
         if prepared:
             # in flight the second image comes only now
             seconds["wind_before"] = prepared.result()
-        with _timed(seconds, "total"):
-            completion = partial(complete, lines=lines) if complete else None
-            retrieved = self._winds.retrieve(image2, completion) if self._winds else None
-            with _timed(seconds, "vortices"):
+        completion = partial(complete, lines=lines) if complete else None
+        retrieved = winds.retrieve(image2, completion) if winds else None
+        pair = no_fit("lamb_oseen", SKIPPED)
+        if take[0]:
+            with timed("vortices"):
                 pair = fit(image2)
                 if expected and expected.slopes is not None and pair.inclined is not None:
                     assert expected.slope_covariance is not None  # as the slopes
                     pair = pair.with_slopes(expected.slopes, expected.slope_covariance)
-            if retrieved:
-                wind, flags, parts = retrieved.result()
-                seconds |= parts
-        # without an expected pair there may be no last slab, or skipped ones: no work is pending
-        since = self._busy if expected else (0.0, 0.0)
-        self._busy = _with_delay(seconds, since, dt, self._processes)
-        # a failed fit is no start for the next wind
-        self._last = pair if pair.success else None
+        if retrieved:
+            wind, flags, parts = retrieved.result()
+            seconds |= parts
+            # a failed fit is no start for the next wind
+            self._last = pair if pair.success else None
+        elif self._winds:
+            flags = (f"wind: {SKIPPED}",)
         return SlabEstimate(wind, pair, seconds, lines, flags)
 
 
-def _with_delay(
-    seconds: dict[str, float], since: Sequence[float], period: float, processes: int
-) -> list[float]:
-    """Add the delay of the processes at the second image to the total.
-
-    A process goes on with the last slab for so many seconds `since` the first image, which came
-    with that slab's second one. Then it does the work before the second image; the lines are
-    recorded half a period before it. A slab delays the next one by a period at most: after a longer
-    one slabs are skipped.
-
-    Returns
-    -------
-    list of float
-        Time that each process works on the slab after its second image, s.
-    """
-
-    def of(*parts: str) -> float:
-        return sum(seconds.get(part, 0.0) for part in parts)
-
-    before = [of("vortices_before"), of("wind_before")]
-    after = [of("vortices"), of("wind", "combination")]
-    if processes == 1:
-        # one process does the work of both, one after the other
-        before, after, since = [sum(before)], [sum(after)], since[:1]
-    ended = [start + work for start, work in zip(since, before, strict=True)]
-    if "lines" in seconds:
-        # the lines are there half a period after the first image
-        ended[0] = max(ended[0], period / 2) + seconds["lines"]
-    done = [max(0.0, end - period) + work for end, work in zip(ended, after, strict=True)]
-    seconds["total"] += max(done) - max(after)
-    return [min(one, period) for one in done] * (2 // processes)
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Collections, of 0.1 s and more over all objects of the libraries, wait until the end."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+def _timed(seconds: dict[str, float], part: str, clock: Callable[[], float]) -> Iterator[None]:
     """Store the duration of the block under its name."""
-    began = time.perf_counter()
+    began = clock()
     yield
-    seconds[part] = time.perf_counter() - began
+    seconds[part] = clock() - began

@@ -7,10 +7,10 @@ pitching are `heave.Heave`. Both are independent of each other, as for small ban
 from dataclasses import replace
 
 import numpy as np
-from ambiance import Atmosphere
 from scipy.constants import g
 from scipy.linalg import expm
 
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.encounter.aircraft import (
     LARGEST_ROLL,
     AircraftState,
@@ -47,7 +47,7 @@ class HeaveModel:
 
     def __init__(self, aircraft: Aircraft, path: Path) -> None:
         keys, speed = aircraft.heave, path.speed
-        self.density = float(Atmosphere(path.altitude).density[0])
+        self.density = standard_atmosphere(path.altitude).density
         span, area, slope = aircraft.span, aircraft.wing_area, aircraft.lift_slope
         wing = as_wing(wing_strips(span, area, slope, place=(wing_place(aircraft), 0, 0)))
         tail_span = np.sqrt(TAIL_ASPECT_RATIO * keys.tail_area)

@@ -83,6 +83,7 @@ class WakeTracker:
     slabs: list[Slab] = field(default_factory=list)
     arrivals: list[Arrival] = field(default_factory=list)
     _undelivered: list[Estimate] = field(default_factory=list)
+    _winds: list[Estimate] = field(default_factory=list)
     _usable: list[Track] = field(default_factory=list)
     _scans: int = 0
     _last_slab: tuple[float, float] = (np.nan, np.nan)
@@ -99,12 +100,17 @@ class WakeTracker:
             estimate = self.lidar.step(due, pose, self._expected())
             self._scans += 1
             self._undelivered.append(estimate)
+            if self.ahead is not None and estimate.wind is not None:
+                self._winds.append(estimate)
             self._last_slab = (estimate.x, estimate.time)
             if self.on_estimate:
                 self.on_estimate(estimate)
         # latency: what the lidar has not delivered is not known yet
-        while self._undelivered and self._undelivered[0].delivered <= state.time + 1e-9:
-            self._track(self._undelivered.pop(0), state.x)
+        now = state.time + 1e-9
+        while self._undelivered and self._undelivered[0].delivered <= now:
+            self._track(self._undelivered.pop(0))
+        while self._winds and _wind_time(self._winds[0]) <= now:
+            self._learn(self._winds.pop(0), state.x)
         self._arrive(state)
 
     @property
@@ -195,7 +201,12 @@ class WakeTracker:
         fraction = float(self._remaining(np.array(x)))
         return fraction * np.sqrt(np.einsum("cnk,kl,cnl->cn", slopes, pair.covariance, slopes))
 
-    def _track(self, estimate: Estimate, place: float) -> None:
+    def _learn(self, estimate: Estimate, place: float) -> None:
+        assert self.ahead is not None and estimate.wind is not None  # as it is in the queue
+        vortices = self._vortices if self._usable else None
+        self.ahead.add(estimate.x, estimate.time, estimate.wind, vortices, place)
+
+    def _track(self, estimate: Estimate) -> None:
         before, pair, found = self.track, estimate.pair, None
         if before is not None:
             found = updated(before, pair, estimate.x, estimate.time)
@@ -208,9 +219,11 @@ class WakeTracker:
             last = self._usable[-1].x if self._usable else None
             continued = any(slab.x == last for slab in found.slabs)
             self._usable[len(self._usable) - continued :] = [found]
-        if self.ahead is not None and estimate.wind is not None:
-            vortices = self._vortices if self._usable else None
-            self.ahead.add(estimate.x, estimate.time, estimate.wind, vortices, place)
+
+
+def _wind_time(estimate: Estimate) -> float:
+    """When the wind of an estimate is delivered, s."""
+    return estimate.delivered if estimate.wind_delivered is None else estimate.wind_delivered
 
 
 def _tracked(

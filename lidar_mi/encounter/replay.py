@@ -45,20 +45,21 @@ class RecordedLidar:
         From scan to scan, s.
     stride : float
         From slab to slab, m.
-    latency : float
-        Of the new flight, s.
+    latency : float or None
+        Of the new flight, s; None: times of delivery as recorded.
     """
 
     track: xr.Dataset
     period: float
     stride: float
-    latency: float
+    latency: float | None
 
     def step(
         self, t: float, pose: AircraftPose | None = None, expected: VortexPairFit | None = None
     ) -> Estimate:
         """The estimate that was delivered of the scan at a time (s), from whatever pose."""
-        valid, delivered = t - self.period / 2, t + self.latency
+        valid = t - self.period / 2
+        delivered = t + (self.latency or 0.0)
         away = np.abs(self.track["time"].values - valid)
         number = int(away.argmin())
         if away[number] > self.period / 4:
@@ -66,10 +67,23 @@ class RecordedLidar:
             x = float(self.track["x"][0]) + scans * self.stride
             return Estimate(valid, delivered, x, None, None, (NOT_RECORDED,), {})
         one = self.track.isel(slab=number)
+        wind_delivered = None
+        if self.latency is None:
+            delivered = float(one["delivered"])
+            if "wind_delivered" in one and np.isfinite(one["wind_delivered"]):
+                wind_delivered = float(one["wind_delivered"])
         flags = tuple(text for text in str(one["flags"].values).split("; ") if text)
-        seconds = {"total": float(one["seconds"])}
-        wind = wind_of(self.track, number)
-        return Estimate(valid, delivered, float(one["x"]), wind, _pair(one), flags, seconds)
+        return Estimate(
+            valid,
+            delivered,
+            float(one["x"]),
+            wind_of(self.track, number),
+            _pair(one),
+            flags,
+            {"all": float(one["seconds"])},
+            None,
+            wind_delivered,
+        )
 
 
 def _pair(one: xr.Dataset) -> VortexPairFit | None:

@@ -7,8 +7,8 @@ wake acts (`strips.roll_damping`); the aileron's moment is q S b C_lda da.
 from dataclasses import replace
 
 import numpy as np
-from ambiance import Atmosphere
 
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.encounter.aircraft import LARGEST_ROLL, AircraftState, Commands, Limits, deflected
 from lidar_mi.encounter.strips import Loads, roll_damping, wing_strips
 from lidar_mi.experiment.schema.encounter import Aircraft, Path
@@ -26,7 +26,7 @@ class RollModel:
 
     def __init__(self, aircraft: Aircraft, path: Path) -> None:
         self.state = AircraftState(airspeed=path.speed)
-        self.density = float(Atmosphere(path.altitude).density[0])
+        self.density = standard_atmosphere(path.altitude).density
         self.strips = wing_strips(aircraft.span, aircraft.wing_area, aircraft.lift_slope)
         self.roll_damping = roll_damping(self.strips, path.speed, self.density)
         self.limits = Limits(

@@ -40,7 +40,7 @@ class ScanWindow:
     encounter: Encounter
     size: tuple[float, float]
     _middles: dict[int, np.ndarray] = field(default_factory=dict)
-    _estimates: "dict[int, VortexPairFit]" = field(default_factory=dict)
+    _estimates: "dict[float, VortexPairFit]" = field(default_factory=dict)
 
     def at(
         self, number: int, place: tuple[float, float], expected: "VortexPairFit | None"
@@ -71,24 +71,24 @@ class ScanWindow:
         self._middles[number] = middle
         return float(middle[0]), float(middle[1])
 
-    def add(self, number: int, pair: "VortexPairFit") -> None:
-        """The estimate that a scan has completed."""
-        oldest = number - self._delay - 1
-        self._estimates = {n: p for n, p in self._estimates.items() if n >= oldest}
-        self._estimates[number] = pair
-
-    @property
-    def _delay(self) -> int:
-        """Scans until an estimate is delivered."""
-        return math.ceil(self.encounter.control.latency * self.encounter.rate - 1e-9)
+    def add(self, delivered: float, pair: "VortexPairFit") -> None:
+        """An estimate that is delivered at a time, s."""
+        self._estimates[delivered] = pair
 
     def _wanted(self, number: int, expected: "VortexPairFit | None") -> np.ndarray | None:
         """Middle of the pair in the farther slab, path frame, m; None if none is known."""
         if expected is not None:
             slopes = expected.slopes if expected.slopes is not None else np.zeros(2)
             return _middle(expected) + slopes * self.encounter.path.speed / self.encounter.rate
-        newest = self._estimates.get(number - self._delay)
-        if newest is None or not newest.probability >= _LEAST_PROBABILITY:
+        now = number / self.encounter.rate + 1e-9
+        known = [time for time in self._estimates if time <= now]
+        if not known:
+            return None
+        newest = self._estimates[max(known)]
+        # a step that is repeated needs the one before
+        oldest = max(known) - 1 / self.encounter.rate
+        self._estimates = {t: p for t, p in self._estimates.items() if t >= oldest - 1e-9}
+        if not newest.probability >= _LEAST_PROBABILITY:
             return None
         return _middle(newest) if np.isfinite(newest.parameters).all() else None
 

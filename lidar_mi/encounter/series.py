@@ -9,6 +9,7 @@ import xarray as xr
 
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftState, Commands
+from lidar_mi.encounter.estimate import SKIPPED
 from lidar_mi.encounter.preview import Slab
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.encounter.vector_record import recorded_vectors
@@ -187,7 +188,8 @@ def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
 
 _PER_SLAB = {
     "time": ("s", "time at which the estimate is valid"),
-    "delivered": ("s", "time at which the estimate is there"),
+    "delivered": ("s", "time at which the vortices are there"),
+    "wind_delivered": ("s", "time at which the wind is there"),
     "x": ("m", "plane of the slab along the path"),
     "accepted": ("1", "1: the fit of this slab is valid"),
     "usable": ("1", "1: the track can be steered by"),
@@ -195,12 +197,14 @@ _PER_SLAB = {
     "rejected": ("1", "slabs that the track refused"),
     "innovation": ("1", "normalised square of the innovation"),
     "innovation_dof": ("1", "its degrees of freedom"),
+    "skipped": ("1", "1: the computer was busy, and its vortices were skipped"),
+    "wind_skipped": ("1", "1: the same of its wind"),
     "error_v_los": ("m s-1", "rms error of the speeds along lines of sight"),
     "error_u": ("m s-1", "rms error of u over the valid vectors"),
     "error_v": ("m s-1", "rms error of v over the valid vectors"),
     "error_w": ("m s-1", "rms error of w over the valid vectors"),
     "vectors": ("1", "number of valid vectors"),
-    "seconds": ("s", "time that the estimate took"),
+    "seconds": ("s", "processor time of the estimate"),
 }
 
 
@@ -211,6 +215,7 @@ def _row(slab: Slab, wake: WakeAlongPath) -> dict[Any, float]:
     row: dict[Any, float] = {
         "time": estimate.time,
         "delivered": estimate.delivered,
+        "wind_delivered": np.nan if estimate.wind_delivered is None else estimate.wind_delivered,
         "x": estimate.x,
         "accepted": float(pair is not None and pair.success),
         "usable": float(track is not None and track.usable),
@@ -218,7 +223,9 @@ def _row(slab: Slab, wake: WakeAlongPath) -> dict[Any, float]:
         "rejected": float(track.rejected if track else 0),
         "innovation": float(innovation[0]),
         "innovation_dof": float(innovation[1]),
-        "seconds": float(estimate.seconds.get("total", sum(estimate.seconds.values()))),
+        "seconds": float(sum(estimate.seconds.values())),
+        "skipped": float(f"vortices: {SKIPPED}" in estimate.flags),
+        "wind_skipped": float(f"wind: {SKIPPED}" in estimate.flags),
         "error_v_los": _line_error(estimate.lines),
         **_wind_errors(estimate.wind, wake, estimate.x, estimate.time),
     }

@@ -38,10 +38,12 @@ class SlabRecorder:
             vectors = estimate.wind
             every = max(1, round(vectors.sizes["y"] / _VECTORS))
             some = slice(every // 2, None, every)
-            vectors = vectors[["v", "w", "flag"]].isel(y=some, z=some).transpose("z", "y")
+            vectors = vectors[["v", "w", "flag"]].reset_coords(drop=True)
+            vectors = vectors.isel(y=some, z=some).transpose("z", "y")
             valid = vectors["flag"] == 0
             found |= {name: vectors[name].where(valid).astype(np.float32) for name in ("v", "w")}
-        about = {"time": estimate.time, "x": estimate.x, "delivered": estimate.delivered}
+        late = estimate.delivered if estimate.wind_delivered is None else estimate.wind_delivered
+        about = {"time": estimate.time, "x": estimate.x, "delivered": late}
         self._slabs.append(xr.Dataset(found).assign(about))
 
     def dataset(self) -> xr.Dataset | None:
@@ -51,9 +53,12 @@ class SlabRecorder:
         """
         if not self._slabs:
             return None
-        first = self._slabs[0]
+        first = next((one for one in self._slabs if "v" in one), self._slabs[0])
         grid = {name: first[name] for name in first.dims}
-        found = xr.concat([one.interp(grid) for one in self._slabs], "slab")
+        # a slab whose wind the computer skipped has images alone
+        nothing = {name: np.nan * first[name] for name in "vw" if name in first}
+        slabs = [one if "v" in one else one.assign(nothing) for one in self._slabs]
+        found = xr.concat([one.interp(grid) for one in slabs], "slab")
         # interpolation gives double precision, which no figure needs
         return found.assign(
             {name: found[name].astype(np.float32) for name in first if first[name].ndim}

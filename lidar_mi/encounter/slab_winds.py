@@ -71,6 +71,11 @@ class SlabWind(NamedTuple):
     seconds: dict[str, float]
 
 
+def clock_of(device: object) -> Callable[[], float]:
+    """What times the work on a device: processor time, which other work does not lengthen."""
+    return time.process_time if str(device) == "cpu" else time.perf_counter
+
+
 def limits(wind: xr.Dataset) -> tuple[str, ...]:
     """Reasons for which half of the vectors or more are flagged, such as "wind: no skill"."""
     flag = wind["flag"]
@@ -87,8 +92,8 @@ class SlabWinds:
     """The winds of successive slabs by one method.
 
     By "variational" a wind starts from the last one, moved with the expected pair and changed by
-    the difference of the winds of both pairs. It does not depend on this slab's vortices. Other
-    methods start from nothing.
+    the difference of the winds of both pairs; without a pair from the last one as it is. It does
+    not depend on this slab's vortices. Other methods start from nothing.
 
     Parameters
     ----------
@@ -104,6 +109,11 @@ class SlabWinds:
         self._reference: VortexPairFit | None = None
         self._slab: FirstImage
         self._prepared: ExpectedFlow | None = None
+        self._clock = clock_of(windows.get("device", "cpu"))
+
+    def forget(self) -> None:
+        """Start from nothing again."""
+        self._flow = self._reference = None
 
     # no derivatives are recorded, as in `Estimator.pair_of`
     @torch.inference_mode()
@@ -121,14 +131,14 @@ class SlabWinds:
         float
             Duration, s.
         """
-        began = time.perf_counter()
+        began = self._clock()
         self._slab, start = slab, self._start(slab, before)
         self._prepared = (
             expected_wind(slab.image, start, slab.noise, self._windows.get("device", "cpu"))
             if start
             else None
         )
-        return time.perf_counter() - began
+        return self._clock() - began
 
     @torch.inference_mode()
     def retrieve(self, second: xr.DataArray, complete: Complete | None = None) -> SlabWind:
@@ -147,14 +157,14 @@ class SlabWinds:
             As from `retrieve_wind`, completed. By "variational" the attribute `from_start` of the
             images' wind says whether it was found from the last one.
         """
-        began = time.perf_counter()
+        began = self._clock()
         wind = self._wind(second)
         flags = limits(wind)
-        seconds = {"wind": time.perf_counter() - began}
+        seconds = {"wind": self._clock() - began}
         if complete:
             wind, more = complete(wind)
             flags += more
-            seconds["combination"] = time.perf_counter() - began - seconds["wind"]
+            seconds["combination"] = self._clock() - began - seconds["wind"]
         return SlabWind(wind, flags, seconds)
 
     def _wind(self, second: xr.DataArray) -> xr.Dataset:
@@ -170,11 +180,11 @@ class SlabWinds:
 
     def _start(self, slab: FirstImage, before: VortexPairFit | None) -> Flow | None:
         flow, expected = self._flow, slab.expected
-        if flow is None or expected is None or before is None:
-            return None
         # the nodes that both scans cover change with the aircraft's place
-        if slab.image.shape != flow.windows.shape:
+        if flow is None or slab.image.shape != flow.windows.shape:
             return None
+        if expected is None or before is None:
+            return flow
         self._reference = self._reference or before
         return _shifted(flow, slab, expected, before, self._reference)
 
@@ -221,6 +231,10 @@ class InThisProcess:
         """As `SlabWinds.prepare`."""
         return _done(self._winds.prepare, slab, before)
 
+    def forget(self) -> None:
+        """As `SlabWinds.forget`."""
+        self._winds.forget()
+
     def retrieve(self, second: xr.DataArray, complete: Complete | None = None) -> Future[SlabWind]:
         """As `SlabWinds.retrieve`."""
         return _done(self._winds.retrieve, second, complete)
@@ -252,6 +266,10 @@ class InOwnProcess:
     def prepare(self, slab: FirstImage, before: VortexPairFit | None) -> Future[float]:
         """As `SlabWinds.prepare`."""
         return self._pool.submit(_prepare, slab, before)
+
+    def forget(self) -> None:
+        """As `SlabWinds.forget`."""
+        self._pool.submit(_forget).result()
 
     def retrieve(self, second: xr.DataArray, complete: Complete | None = None) -> Future[SlabWind]:
         """As `SlabWinds.retrieve`."""
@@ -285,6 +303,10 @@ def _ready() -> None:
 
 def _prepare(slab: FirstImage, before: VortexPairFit | None) -> float:
     return _winds.prepare(slab, before)
+
+
+def _forget() -> None:
+    _winds.forget()
 
 
 def _retrieve(second: xr.DataArray, complete: Complete | None) -> SlabWind:

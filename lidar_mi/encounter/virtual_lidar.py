@@ -1,8 +1,10 @@
 """The lidar as an object that is stepped: light, detector, and the estimate from their signals."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,9 +12,10 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.combination import Completion
+from lidar_mi.encounter.computer import Cores
 from lidar_mi.encounter.doppler import LineFrames, Midway, doppler_scans
 from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.estimator import Estimator
+from lidar_mi.encounter.estimator import Estimator, SlabEstimate
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.pointing import pointing_error
 from lidar_mi.encounter.pose import AircraftPose
@@ -127,6 +130,8 @@ class VirtualLidar:
         sizes = float(np.ptp(self.gates.y)), float(np.ptp(self.gates.z))
         self._window = ScanWindow(self.encounter, sizes)
         self._poses: dict[int, AircraftPose] = {}
+        self._cores: dict[int, Cores] = {}
+        self._started = False
         self._renderer: ScanRenderer | None = None
         self._scans: dict[int, Scan] = {}
         self._store = scans
@@ -176,18 +181,20 @@ class VirtualLidar:
         self._scans = {number: scan} | ({number - 1: before} if before else {})
         self._poses = {number: pose} | ({number - 1: came_from} if came_from else {})
         period = self.gates.period
-        delivered = number * period + self.encounter.control.latency
         valid, x = (number - 0.5) * period, self.gates.slab(number - 1)
+        soonest = number * period + self.encounter.fixed_latency
+        nothing = partial(Estimate, valid, soonest, x, None, None, seconds={})
         if before is None or came_from is None:
             self.images = None
-            return Estimate(valid, delivered, x, None, None, (NO_EARLIER_SCAN,), {})
+            return nothing(flags=(NO_EARLIER_SCAN,))
         images, flags = _on_first_grid(before, scan)
         self.images = images
         if images is None:
-            return Estimate(valid, delivered, x, None, None, flags, {})
+            return nothing(flags=flags)
         midway = Midway.between(came_from, pose, period)
         complete = self._completion(x, midway, pose)
-        found = self._estimator.pair_of(
+        found = self._estimated(
+            number,
             images.first,
             images.second,
             period,
@@ -197,14 +204,56 @@ class VirtualLidar:
             complete=complete if self._doppler or complete.by_pointing else None,
             telescope=(midway.place[0] - x, midway.place[1], midway.place[2]),
         )
-        self._window.add(number, found.pair)
+        delivered, wind_delivered = self._delivered(number, found.seconds)
+        if "vortices" in found.seconds:
+            self._window.add(delivered, found.pair)
         pair = found.pair.with_common_error(
             complete.common, complete.common, complete.rotation, complete.roll_axis
         )
         flags += found.flags
         if not pair.success:
             flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
-        return Estimate(valid, delivered, x, found.wind, pair, flags, found.seconds, found.lines)
+        return Estimate(
+            valid,
+            delivered,
+            x,
+            found.wind,
+            pair,
+            flags,
+            found.seconds,
+            found.lines,
+            wind_delivered if found.wind is not None else None,
+        )
+
+    def _estimated(self, number: int, *images: Any, **about: Any) -> SlabEstimate:
+        """What the cores that take this slab estimate."""
+        if self.encounter.control.latency is not None:
+            return self._estimator.pair_of(*images, **about)
+        if not self._started:
+            # what a program loads as it starts is no time of a slab
+            self._estimator.pair_of(*images, **about)
+            self._estimator.forget()
+            self._started = True
+        fits, winds = self._busy(number).take(number * self.gates.period, self.gates.period)
+        # without lines the core of the wind has nothing to combine
+        winds = winds and (fits or self._doppler is None)
+        return self._estimator.pair_of(*images, **about, take=(fits, winds))
+
+    def _busy(self, number: int) -> Cores:
+        """The cores before a scan."""
+        return self._cores.get(number - 1, Cores())
+
+    def _delivered(self, number: int, seconds: Mapping[str, float]) -> tuple[float, float]:
+        """Times at which vortices and wind of a scan's slab are there, s."""
+        control, period = self.encounter.control, self.gates.period
+        time = number * period
+        if control.latency is not None:
+            return (time + control.latency,) * 2
+        charged = {part: control.computing_factor * value for part, value in seconds.items()}
+        cores = self._busy(number).after(time, period, charged)
+        # this scan for the next one, the one before for a step that is repeated
+        self._cores = {n: c for n, c in self._cores.items() if n == number - 1} | {number: cores}
+        return max(time, cores.vortices), max(time, cores.wind)
 
     def _line_frames(
         self, number: int, x: float, valid: float, midway: Midway
@@ -249,8 +298,8 @@ class VirtualLidar:
         use_variant(experiment.render.variant)
         if self._renderer is None:
             self._renderer = self._renderer_of(air, plan, self._settings)
-        # seeds as of the images of an experiment
-        scan = with_products(self._renderer.render(air, plan, experiment.seed + (number << 16)))
+        seed = self._settings.scan_seed(experiment.seed, number)
+        scan = with_products(self._renderer.render(air, plan, seed))
         scan = self._detected(scan, plan, number)
         near, far = (self._image(scan, plan, gate, pose) for gate in (0, -1))
         return Scan(near[0], *far)
@@ -285,7 +334,8 @@ class VirtualLidar:
 
         The pilot is of the nominal pose, so that images do not depend on the first pose.
         """
-        experiment, settings = self.experiment, self.experiment.render
+        experiment = self.experiment
+        settings = experiment.render.for_winds()
         if settings.samples_per_beam != "auto":
             return settings
         plan = self.gates.plan()

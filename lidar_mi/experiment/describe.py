@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from lidar_mi.atmosphere.aerosols import AEROSOLS
-from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
+from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering
 from lidar_mi.atmosphere.particle_scattering import Notice
 from lidar_mi.atmosphere.scattering import ScatteringTable, describe
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.io.scattering_table import aerosol_table, read_table
 from lidar_mi.io.size import fits
@@ -109,7 +110,7 @@ def _table_file(path: Path) -> Iterator[Section]:
 
 def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
     """The whole band of Rayleigh scattering, and the line that a narrow receiver detects."""
-    pressure, temperature = standard_atmosphere(altitude)
+    pressure, temperature, _ = standard_atmosphere(altitude)
     bands = [molecular_scattering(wavelength, pressure, temperature, band) for band in BANDS]
     rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"), strict=True)))]
     for label, name, unit in (

@@ -141,8 +141,8 @@ class Footprint:
     def _per_beam(self, gates: int) -> float:
         """Bytes that grow with the number of beams: the wake's nodes, images, vectors."""
         orders = self.render.max_order
-        # Stokes vector, errors, correlation; both products with their errors; the detector's
-        quantities = 11 + (orders if orders > 1 else 0) + 2 * bool(self.detector)
+        # Stokes vector, errors and correlation; both products with their errors; the detector's
+        quantities = 12 + (orders if orders > 1 else 0) + 2 * bool(self.detector)
         voxels = gates if self.volume else 0
         return (
             PER_NODE
@@ -165,4 +165,5 @@ class Footprint:
         depolarisation = polarised and tuple(self.lidar.stokes) == (1, 1, 0, 0)
         orders = render.max_order + 2 if render.max_order > 1 else 0
         noisy = 2 * bool(self.detector)
-        return 5 + 2 * polarised + 2 * depolarisation + orders + noisy
+        shared = 2 * render.for_winds().common
+        return 5 + shared + 2 * polarised + 2 * depolarisation + orders + noisy

@@ -315,6 +315,11 @@ def _checked(
         )
     if not air.environment > 0:
         raise InputError(f"air.environment: {air.environment} is not allowed; expected above 0")
+    # counts of all beams are summed: errors that beams share would not average out
+    if settings.common:
+        raise InputError(
+            "render.random_numbers: common is not allowed for an inversion; expected independent"
+        )
     if settings.samples_per_beam == "auto":
         raise InputError(
             "render.samples_per_beam: auto is not allowed for an inversion; expected a number"

@@ -321,6 +321,8 @@ def label_scan(scan: "xr.Dataset") -> "xr.Dataset":
     import lidar_mi.plots  # noqa: F401 - scan.lidar.plot()
 
     meaning = _MEANING | {
+        "S0_mc_error": "a realisation of the Monte Carlo error of S0, of numbers common to beams",
+        "S0_pair_stderr": "Monte Carlo standard error of S0 that the other image does not share",
         "S0_largest_share": "largest share of one Monte Carlo sample in the variance of S0",
         **{f"S{k}_stderr": f"Monte Carlo standard error of S{k}" for k in (1, 2, 3)},
         "S0_S1_correlation": "correlation of the Monte Carlo errors of S0 and S1",

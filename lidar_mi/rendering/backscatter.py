@@ -121,7 +121,8 @@ def render_scans(
     albedo : float
         Single-scattering albedo of slab and environment.
     seed : int
-        Scan k uses seed + k * 2^16, well separated for neighbouring experiments.
+        Scan k uses `RenderSettings.scan_seed`: seed + k * 2^16, well separated for neighbouring
+        experiments, or with common random numbers the same seed.
     progress : callable, optional
         Called with (scan, samples done, samples in all).
     scans : sequence of int, optional
@@ -136,6 +137,7 @@ def render_scans(
     xr.Dataset
         S0 ... S3, S0_stderr, S0_largest_share (of one sample in the variance) and, with more than
         one order, each order's S0 as ``orderK.S0``, dims (gate, z, y); Y (z, y); y and z ascending.
+        With common random numbers S0_mc_error, a realisation of the Monte Carlo error of S0.
         Of polarised variants also S1_stderr, S2_stderr, S3_stderr and S0_S1_correlation.
         Where a plan has beams, also ``beam_time`` (s) and ``y_reported``, ``z_reported`` (m), where
         a beam as reported crosses the plane in the middle of the gates. One scan at a time, as soon
@@ -151,7 +153,7 @@ def render_scans(
             )
         report = partial(progress, index) if progress else None
         store = batches(index) if batches else None
-        yield renderer.render(air, plan, seed + (index << 16), report, store)
+        yield renderer.render(air, plan, settings.scan_seed(seed, index), report, store)
 
 
 class ScanRenderer:
@@ -265,6 +267,7 @@ def scene_dict(
             "covariance": mi.is_polarized,
             "shares": True,
             "estimator": settings.estimator,
+            "random_numbers": "common" if settings.common else "independent",
             "candidates": settings.candidates,
             "samples_per_pass": samples_at_once(
                 settings.given_per_pass, settings.memory, mi.variant()
@@ -424,6 +427,7 @@ def _as_dataset(
         "samples_per_beam": settings.without_detector(plan.gate_count),
         "max_order": settings.max_order,
         "estimator": settings.estimator,
+        "random_numbers": "common" if settings.common else "independent",
         "gate_kind": plan.gate_kind,
         "gate_count": plan.gate_count,
         "gate_start": float(plan.gate_start),

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from lidar_mi.rendering.pair_error import pair_stderr
 from lidar_mi.rendering.settings import RenderSettings
 
 LEAST = 16
@@ -55,11 +56,12 @@ def noise_ratio(scan: xr.Dataset) -> np.ndarray:
     Parameters
     ----------
     scan : xr.Dataset
-        With ``S0_stderr`` and ``S0_noise_std``. NaN where the detector has no noise.
+        With ``S0_stderr``, of common random numbers ``S0_pair_stderr``, which counts then, and
+        ``S0_noise_std``. NaN where the detector has no noise.
     """
     simulated, detected = (
-        scan[name].transpose("gate", "z", "y").values.astype(float) ** 2
-        for name in ("S0_stderr", "S0_noise_std")
+        error.transpose("gate", "z", "y").values.astype(float) ** 2
+        for error in (pair_stderr(scan), scan["S0_noise_std"])
     )
     return np.divide(simulated, detected, out=np.full(simulated.shape, np.nan), where=detected > 0)
 

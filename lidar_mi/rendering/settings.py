@@ -1,9 +1,9 @@
 """Settings of the light transport."""
 
 import math
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lidar_mi.description import Description
 from lidar_mi.units import Length, Memory, Number, Within
@@ -67,6 +67,12 @@ class RenderSettings(Description):
         description="forced collisions in the gates, or analog sampling, which needs a thousand "
         "times as many samples or more for the same noise",
     )
+    random_numbers: Literal["auto", "independent", "common"] = Field(
+        "auto",
+        description="of beams, gates and scans: their own, or the same in all, whose errors winds "
+        "hardly see; auto: common for winds from images, independent where photons are counted "
+        "and with analog sampling",
+    )
     candidates: Annotated[int, Within(1, 1024, "more cost time and hardly lower the noise")] = (
         Field(
             1,
@@ -89,6 +95,36 @@ class RenderSettings(Description):
     def given_per_pass(self) -> int | None:
         """Samples of a pass, if they are given."""
         return _given_per_pass(self)
+
+    @model_validator(mode="after")
+    def _gated_alone(self) -> Self:
+        if self.random_numbers == "common" and self.estimator == "analog":
+            raise ValueError(
+                "random_numbers: common is not allowed with estimator analog; expected independent"
+            )
+        return self
+
+    def for_winds(self) -> "RenderSettings":
+        """Settings of images that winds are retrieved from: auto is common, if sampling is gated.
+
+        Elsewhere auto is independent: errors that all beams share do not average out in counts.
+        """
+        if self.random_numbers == "auto" and self.estimator == "gated":
+            return self.model_copy(update={"random_numbers": "common"})
+        return self
+
+    @property
+    def common(self) -> bool:
+        """Whether all beams, gates and scans have the same random numbers."""
+        return self.random_numbers == "common"
+
+    def scan_seed(self, seed: int, scan: int) -> int:
+        """Seed of a scan's light: common numbers need one seed, independent ones one each.
+
+        Common numbers of two seeds would be errors that all beams of an image share and that
+        images do not, which image velocimetry takes for motion.
+        """
+        return seed if self.common else seed + (scan << 16)
 
     def without_detector(self, gates: int) -> int:
         """Samples per beam as given, or `SAMPLES_PER_GATE` of every gate."""

@@ -3,7 +3,6 @@ King factor, 1 % in depolarisation, and any mix-up of Cabannes line and whole Ra
 
 import math
 
-import numpy as np
 import pytest
 
 from lidar_mi.atmosphere import molecules
@@ -109,21 +108,6 @@ def test_number_density_and_extinction_at_sea_level():
     assert air.extinction == pytest.approx(air.number_density * air.cross_section, rel=1e-12)
     # 1.32e-2 / km, the sea-level textbook value at 532 nm
     assert air.extinction == pytest.approx(1.316e-5, rel=1e-3)
-
-
-def test_standard_atmosphere():
-    """ICAO standard atmosphere at sea level, 8.5 km and the tropopause."""
-    pytest.importorskip("ambiance", reason="ambiance (standard atmosphere) is not installed")
-    pressure, temperature = molecules.standard_atmosphere(0)
-    assert (pressure, temperature) == pytest.approx((101325.0, 288.15), rel=1e-9)
-    # ICAO Doc 7488: 8500 m geometric: 232.974 K, 331.54 hPa
-    pressure, temperature = molecules.standard_atmosphere(8500)
-    assert (pressure, temperature) == pytest.approx((33154, 232.974), rel=1e-5)
-    assert molecules.standard_atmosphere(15000)[1] == pytest.approx(216.65)
-    with pytest.raises(InputError, match=r"altitude: 90000.*-5004 to 81020"):
-        molecules.standard_atmosphere(90000)
-    with pytest.raises(InputError, match="altitude"):
-        molecules.standard_atmosphere(np.nan)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_folder_holds_the_flight(tmp_path):
     with xr.open_dataset(tmp_path / "out" / "flight.nc", engine="h5netcdf") as found:
         assert found["roll"].attrs["units"] == "rad" and found.sizes["flight"] == 3
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Without control, the wake rolls the aircraft by" in page and "http" not in page
+    assert "Largest roll angles in this wake: " in page and "http" not in page
     # again: nothing is flown
     before = (tmp_path / "out" / "flight.nc").stat().st_mtime_ns
     again = lm.fly(one, tmp_path / "out", notice=silent)
@@ -78,15 +78,14 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     assert (tmp_path / "summary.txt").read_text().split("\n")[:-1] == flight.answer
     assert flight.answer[-1].startswith("Landing, flight control, from wind vectors: ")
     page = (tmp_path / "report.html").read_text()
-    assert "with the lidar by" in page and "own goal of 80 %" in page
+    assert "Beyond the autopilot, the lidar removes" in page and "own goal of 80 %" in page
     assert "Requirements, as measured in flight" in page
     row = 'data-head="required">at least 10 Hz</td><td data-head="in flight">10 Hz</td>'
     assert f"slabs per second</td><td {row}" in page
     assert flight.metrics["encounter.normalised_innovation"] < 2
     shown = str(flight)
     assert (
-        "largest roll angle / degrees" in shown
-        and "first usable track before the wake is felt" in shown
+        "largest roll angle / degrees" in shown and "first preview before the wake is felt" in shown
     )
 
 

@@ -49,6 +49,7 @@ def test_estimates_are_those_of_the_flight(flown):
     first, folder = flown
     one = experiment()
     lidar = recorded_lidar(recorded_flight(folder, one), one)
+    assert lidar.latency is None  # by default as recorded
     found = lidar.step(0.4)
     number = int(np.abs(first.track["time"].values - 0.35).argmin())
     assert (found.time, found.delivered) == pytest.approx((0.35, 0.52))
@@ -124,6 +125,9 @@ def test_the_command(flown, tmp_path):
     sets = ("--set", "encounter.control.latency=0.2 s")
     done = shell("fly", "--replay", folder, *sets, "-o", tmp_path / "again")
     assert done.returncode == 0, done.stderr
-    assert "with the lidar by" in done.stdout and (tmp_path / "again" / "track.nc").is_file()
+    assert (
+        "Beyond the autopilot, the lidar removes" in done.stdout
+        and (tmp_path / "again" / "track.nc").is_file()
+    )
     done = shell("fly")
     assert done.returncode == 2 and "EXPERIMENT: missing; expected an experiment" in done.stderr

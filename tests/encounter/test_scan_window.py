@@ -72,7 +72,8 @@ def test_a_probable_pair_is_followed_once_it_is_delivered(latency, delay):
     moved = []
     for number in range(6):
         moved.append(window.at(number, AHEAD, None)[0])
-        window.add(number, pair_at(40.0, 0.0, probability=0.9 if number else np.nan))
+        pair = pair_at(40.0, 0.0, probability=0.9 if number else np.nan)
+        window.add(0.1 * number + float(latency.split()[0]), pair)
     assert np.flatnonzero(moved)[0] == 1 + delay
 
 
@@ -81,7 +82,7 @@ def test_without_a_probable_pair_it_looks_ahead_again():
     for number in range(4):
         window.at(number, AHEAD, pair_at(20.0, 0.0))
     for number in range(4, 12):
-        window.add(number - 1, pair_at(20.0, 0.0, probability=0.3))
+        window.add(0.1 * (number - 1) + 0.12, pair_at(20.0, 0.0, probability=0.3))
         last = window.at(number, AHEAD, None)
     assert last == pytest.approx((0, 0), abs=1e-9)
 

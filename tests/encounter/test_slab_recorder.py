@@ -58,3 +58,13 @@ def test_nothing_seen_is_nothing_kept():
     recorder = SlabRecorder(SimpleNamespace(images=None))
     recorder.add(estimate(75.0, wind=False))
     assert recorder.dataset() is None
+
+
+def test_slabs_without_a_wind_have_images():
+    """The computer may have skipped the wind of any slab, the first one too."""
+    recorder = SlabRecorder(SimpleNamespace(images=image()))
+    for x, wind in ((75.0, False), (82.5, True), (90.0, False)):
+        recorder.add(estimate(x, wind=wind))
+    found = recorder.dataset()
+    assert np.isfinite(found["v"]).any(("z", "y")).values.tolist() == [False, True, False]
+    assert np.isfinite(found["image"]).all()

@@ -195,7 +195,7 @@ def test_wind_where_a_method_gives_vectors():
     lidar.step(0.0)
     estimate = lidar.step(0.1)
     wind, valid = estimate.wind, estimate.wind["flag"] == 0
-    assert set(estimate.seconds) == {"wind_before", "wind", "vortices", "total"}
+    assert set(estimate.seconds) == {"wind_before", "wind", "vortices"}
     assert float(valid.mean()) > 0.5
     _, v, w = lidar.wake.wind(estimate.x, wind["y_vector"], wind["z_vector"], estimate.time)
     for found, true in ((wind["v"], v), (wind["w"], w)):
@@ -238,14 +238,7 @@ def test_both_lidars_give_three_components():
             off = (wind[name].values - true) / wind[f"{name}_stderr"].values
             squares[name].append(np.mean(off[valid] ** 2))
             np.testing.assert_array_equal(wind[name], same.wind[name])
-        assert set(estimate.seconds) == {
-            "lines",
-            "wind_before",
-            "vortices",
-            "wind",
-            "combination",
-            "total",
-        }
+        assert set(estimate.seconds) == {"lines", "wind_before", "vortices", "wind", "combination"}
         assert estimate.lines.sizes["line"] == 12
     for name, found in squares.items():
         # standard errors of u are three times too large

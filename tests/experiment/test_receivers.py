@@ -12,7 +12,7 @@ from scipy import constants
 from scipy.optimize import minimize_scalar
 
 from lidar_mi.atmosphere.line import backscatter_line
-from lidar_mi.atmosphere.molecules import standard_atmosphere
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import receivers
 from lidar_mi.experiment.stages.ring_instrument import air_rings
@@ -145,7 +145,7 @@ def test_wrong_temperature_moves_the_ratio_of_two_filters():
     found = assumption_error(receiver.channels, 1e6, assumed="temperature", by=5.0, v_los=50.0)
     series = harmonics(DoubleEdge(), lidar.wavelength)
     times = np.arange(series.shape[1]) * DoubleEdge().delay(lidar.wavelength)
-    pressure, usual = standard_atmosphere(lidar.altitude)
+    pressure, usual, _ = standard_atmosphere(lidar.altitude)
 
     def response(v, kelvin):
         line = backscatter_line(lidar.wavelength, kelvin, pressure, lidar.laser_width)

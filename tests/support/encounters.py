@@ -3,7 +3,7 @@
 import lidar_mi as lm
 
 
-def small_encounter(seed=1, path=None, wake=None, render=None, **changes):
+def small_encounter(seed=1, path=None, wake=None, render=None, control=None, **changes):
     """An encounter that a step of takes some tenths of a second."""
     pair = {
         "circulation": "300 m^2/s",
@@ -24,7 +24,9 @@ def small_encounter(seed=1, path=None, wake=None, render=None, **changes):
             "retrieval": {"methods": ["vortex_fit"]},
             "encounter": {
                 "path": {"start": "190 m", "crossing_angle": "0 deg", "climb_angle": "0 deg"}
-                | (path or {})
+                | (path or {}),
+                # that of a machine would differ from run to run
+                "control": control or {"latency": "0.12 s"},
             },
         }
         | changes,

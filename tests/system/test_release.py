@@ -1,7 +1,7 @@
-"""What a release consists of beside the package: recipe, image, citation, paper, workflows.
+"""What a release consists of beside the package: image, citation, paper, workflows.
 
 Detects a version, a dependency or a bound that one of them states otherwise than pyproject.toml, a
-file that the container image or its recipe would lack, and a paper that cites nothing it has.
+file that the container image would lack, and a paper that cites nothing it has.
 """
 
 import json
@@ -19,16 +19,8 @@ import lidar_mi
 ROOT = Path(__file__).resolve().parents[2]
 
 pytestmark = pytest.mark.skipif(
-    not (ROOT / "recipe").is_dir(), reason="a release is made from the source tree"
+    not (ROOT / "CITATION.cff").is_file(), reason="a release is made from the source tree"
 )
-
-# names there -> those of conda-forge
-CONDA = {
-    "openexr": "openexr-python",
-    "torch": "pytorch",
-    "matplotlib": "matplotlib-base",
-    "lazy-loader": "lazy_loader",
-}
 
 
 @pytest.fixture(scope="module")
@@ -40,21 +32,7 @@ def test_one_version(project):
     version = project["version"]
     assert lidar_mi.__version__ == version
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
-    assert f'{{% set version = "{version}" %}}' in (ROOT / "recipe" / "meta.yaml").read_text()
     assert f"`{version}`" in (ROOT / "docs" / "versions.md").read_text() or "rc" not in version
-
-
-def test_recipe_asks_for_what_the_project_does(project):
-    """conda-forge has the ranges of pyproject.toml, in its own names."""
-    text = (ROOT / "recipe" / "meta.yaml").read_text()
-    run = re.search(r"^  run:\n(.*?)\n\n", text, re.MULTILINE | re.DOTALL)[1]
-    listed = dict(re.findall(r"^    - (\S+) (\S+)$", run, re.MULTILINE))
-    expected = {}
-    for requirement in map(Requirement, project["dependencies"]):
-        name = requirement.name.lower()
-        bounds = sorted(map(str, requirement.specifier), reverse=True)
-        expected[CONDA.get(name, name)] = ",".join(bounds)
-    assert listed == expected
 
 
 def test_image_has_what_a_wheel_is_made_of():

@@ -160,7 +160,7 @@ def measured_in_flight(
     look_ahead = _look_ahead(series, track)
     found = {
         "range": float(np.median(look_ahead) * speed) if look_ahead.size else float("nan"),
-        "slabs_per_second": _rate(track["delivered"].values),
+        "slabs_per_second": _rate(track),
         "slab_depth": slab_depth,
         "points_per_slab": float(measured["vectors"].median()) if measured.sizes["slab"] else 0.0,
     }
@@ -183,9 +183,13 @@ def judged_in_flight(
     ]
 
 
-def _rate(times: np.ndarray) -> float:
-    """Estimates a second (Hz), without the rounding of their times."""
-    return round(float(1 / np.median(np.diff(times))), 9) if times.size > 1 else 0.0
+def _rate(track: xr.Dataset) -> float:
+    """Estimates a second (Hz), less those that the computer skipped."""
+    if track.sizes["slab"] < 2:
+        return 0.0
+    taken = 1 - float(track["skipped"].mean()) if "skipped" in track else 1.0
+    # without the rounding of times
+    return round(taken / float(np.median(np.diff(track["time"].values))), 9)
 
 
 def _look_ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
@@ -211,6 +215,10 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
     if steered.size:
         found["preview_from"] = float(one["time"][steered[0]])
         found["lead_time"] = felt_from(series) - found["preview_from"]
+    if "preview_withdrawn" in one:
+        step = float(one["time"][1] - one["time"][0])
+        found["withdrawn"] = step * float(one["preview_withdrawn"].sum())
+    found |= _latencies(track)
     usable = np.flatnonzero(track["usable"].values > 0)
     found["usable_slabs"] = float(usable.size)
     accepted = track["accepted"].values > 0
@@ -231,6 +239,26 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
         found["normalised_innovation"] = float(
             track["innovation"].values[known].sum() / dof[known].sum()
         )
+    return found
+
+
+def _latencies(track: xr.Dataset) -> dict[str, float]:
+    """Times from the second scan to the delivery, and what a busy computer skipped."""
+    scanned = track["time"].values + np.median(np.diff(track["time"].values)) / 2
+    found = {}
+    for name, delivered, skipped in (
+        ("latency", "delivered", "skipped"),
+        ("wind_latency", "wind_delivered", "wind_skipped"),
+    ):
+        if delivered not in track or skipped not in track:
+            continue
+        found[skipped + "_slabs"] = float(track[skipped].sum())
+        there = np.isfinite(track[delivered].values) & (track[skipped].values == 0)
+        if name == "latency":
+            there &= track["estimated"].values > 0
+        if there.any():
+            late = track[delivered].values[there] - scanned[there]
+            found[name], found[f"{name}_99"] = map(float, np.quantile(late, [0.5, 0.99]))
     return found
 
 

@@ -25,6 +25,11 @@ _ENCOUNTER = {
     "largest_lift": "N",
     "preview_from": "s",
     "lead_time": "s",
+    "withdrawn": "s",
+    "latency": "s",
+    "latency_99": "s",
+    "wind_latency": "s",
+    "wind_latency_99": "s",
     "look_ahead": "s",
     "core_error": "m",
 }

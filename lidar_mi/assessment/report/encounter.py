@@ -32,7 +32,14 @@ _OF_A_FLIGHT = (
 _OF_THE_LIDAR = (
     ("lead_time", "first preview before the wake is felt", "s", 1.0),
     ("look_ahead", "estimate before the wing is in its slab (median)", "s", 1.0),
+    ("withdrawn", "preview withdrawn, as the measured roll contradicts it", "s", 1.0),
+    ("latency", "latency of the vortices, from the second scan (median)", "s", 1.0),
+    ("latency_99", "the same, in 99 % of the slabs at most", "s", 1.0),
+    ("wind_latency", "latency of the wind (median)", "s", 1.0),
+    ("wind_latency_99", "the same, in 99 % of the slabs at most", "s", 1.0),
     ("slabs", "slabs delivered", "", 1.0),
+    ("skipped_slabs", "slabs whose vortices the busy computer skipped", "", 1.0),
+    ("wind_skipped_slabs", "slabs whose wind it skipped", "", 1.0),
     ("accepted_slabs", "slabs with an accepted fit of both vortices", "", 1.0),
     ("rejected_slabs", "accepted fits that the track rejected", "", 1.0),
     ("slabs_to_track", "accepted fits until the track is usable", "", 1.0),
@@ -212,7 +219,12 @@ def encounter_answer(
             f"{percent(metrics['encounter.prediction_error'])} (rms)."
         )
         lead += _limits(metrics)
-    return lead
+    if metrics.get("encounter.withdrawn", 0) > 0:
+        lead.append(
+            f"The measured roll contradicted the preview, which was withdrawn for "
+            f"{three(metrics['encounter.withdrawn'])} s: the autopilot flew."
+        )
+    return lead + _latency(metrics)
 
 
 def what_the_lidar_added(metrics: Mapping[str, float], controller: str = "") -> list[str]:
@@ -272,6 +284,25 @@ def _added(
         f"{percent(fraction)} of what perfect preview removes ({three(blind - perfect)}): it "
         f"{verdict} lidar-mi's own goal of {percent(GOAL)}."
     )
+
+
+def _latency(metrics: Mapping[str, float]) -> list[str]:
+    """When the computer delivered its estimates, and what it skipped."""
+    if "encounter.latency" not in metrics:
+        return []
+    said = []
+    for what, name, skipped in (
+        ("The vortices", "latency", "skipped_slabs"),
+        ("The wind", "wind_latency", "wind_skipped_slabs"),
+    ):
+        if f"encounter.{name}" in metrics:
+            median, most = (three(metrics[f"encounter.{name}{end}"]) for end in ("", "_99"))
+            said.append(
+                f"{what} of a slab {'are' if what.endswith('s') else 'is'} delivered {median} s "
+                f"after its second scan (median; {most} s in 99 %); the computer was too busy for "
+                f"{metrics[f'encounter.{skipped}']:.0f} of {metrics['encounter.slabs']:.0f} slabs."
+            )
+    return [" ".join(said)]
 
 
 def _lead_time(metrics: Mapping[str, float]) -> str:

@@ -9,9 +9,9 @@ import math
 from typing import Literal, get_args
 
 import numpy as np
-from ambiance import Atmosphere
 from scipy.constants import foot, knot
 
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.errors import InputError
 
 Level = Literal["light", "moderate", "severe"]
@@ -147,5 +147,5 @@ def design_gust_speed(altitude: float, gradient: float, alleviation: float = 1.0
             f"gust.alleviation: {alleviation:g} is not allowed; expected above 0, at most 1"
         )
     equivalent = reference_gust_speed(altitude) * alleviation * (gradient / high) ** (1 / 6)
-    density = [float(Atmosphere(h).density[0]) for h in (0.0, altitude)]
+    density = [standard_atmosphere(h).density for h in (0.0, altitude)]
     return equivalent * math.sqrt(density[0] / density[1])

@@ -181,8 +181,16 @@ class Control(Section):
         description="pair: the loads of the tracked vortices; wind: those of the vortices and of "
         "the air about them, from the wind vectors",
     )
-    latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
-        0.12, description="time from the second scan of a slab to the delivery of its estimate"
+    latency: Annotated[Time, Within(0, 10, "seconds")] | None = Field(
+        None,
+        description="time from the second scan of a slab to the delivery of its estimate, whatever "
+        "was computed; default: the processor time that the computation took, on two cores, with "
+        "waiting",
+    )
+    computing_factor: Annotated[Number, Within(0.001, 1000, "computers")] = Field(
+        1.0,
+        description="computing time of the aircraft's computer over that of this machine, where "
+        "the latency is not given",
     )
     levelling_time: Annotated[Time, Within(0.1, 1000, "a pilot")] | None = Field(
         3.0,
@@ -225,3 +233,13 @@ class Encounter(Section):
     )
     window: Window = Window()
     control: Control = Control()
+
+    @property
+    def fixed_latency(self) -> float:
+        """The latency of every slab, 0 if it is that of the computation, s."""
+        return 0.0 if self.control.latency is None else self.control.latency
+
+    @property
+    def usual_latency(self) -> float:
+        """The fixed latency, or a period, within which a slab is to be computed, s."""
+        return 1 / self.rate if self.control.latency is None else self.control.latency

@@ -74,11 +74,11 @@ class VortexPair(Section):
                     raise ValueError(f"{name}: not allowed without aircraft")
             return self
         # loaded only where it is needed
-        from ambiance import Atmosphere
+        from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 
         kind = aircraft_type(self.aircraft)
         mass = kind.landing_mass if self.mass is None else self.mass
-        density = float(Atmosphere(self.altitude).density[0])
+        density = standard_atmosphere(self.altitude).density
         for name, value in wake_of(kind.span, mass, self.speed, density)._asdict().items():
             if name not in self.model_fields_set:
                 # the section is frozen from here on

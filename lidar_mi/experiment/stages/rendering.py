@@ -29,6 +29,7 @@ from lidar_mi.instrument.scan import Scan, ScanPlan, plan_scans
 from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.batches import Batches
+from lidar_mi.rendering.pair_error import unshared_fraction
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.settings import RenderSettings
@@ -147,6 +148,7 @@ def given_samples(
 
 def samples_by_noise(
     wake: Wake,
+    platform: Platform,
     scan: Scan,
     lidar: BackscatterLidar,
     detector: Detector,
@@ -160,7 +162,7 @@ def samples_by_noise(
 ) -> int:
     """Monte Carlo samples per beam, by the noise of the detector; see `chosen_samples`."""
     chosen = chosen_samples(
-        wake, scan, lidar, detector, scattering, render, seed, truth, plans, air, log
+        wake, platform, scan, lidar, detector, scattering, render, seed, truth, plans, air, log
     )
     log(samples_text(render, chosen))
     return chosen.number
@@ -269,7 +271,7 @@ def _rendered(
         lidar,
         environment_extinction(wake),
         *air,
-        render,
+        render.for_winds(),
         seed,
         scans=wanted,
         molecules=molecules(wake.extinction.molecules, lidar.wavelength, scattering.band),
@@ -279,6 +281,7 @@ def _rendered(
 
 def chosen_samples(
     wake: Wake,
+    platform: Platform,
     scan: Scan,
     lidar: BackscatterLidar,
     detector: Detector,
@@ -302,7 +305,8 @@ def chosen_samples(
     # noise is that of air at the scan's reference time, which need not be moved for it
     fields, wanted = truth.extinction, range(len(plans))
     few = with_samples(render, number)
-    pilots = _rendered(fields, wake, lidar, scattering, few, seed, plans, air, wanted)
+    pilots = list(_rendered(fields, wake, lidar, scattering, few, seed, plans, air, wanted))
+    pilots = with_pair_stderr(pilots, truth.wind, platform.dt)
     found = []
     for plan, pilot in zip(plans, pilots, strict=True):
         noisy = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, scan.pulses_per_beam)
@@ -363,19 +367,25 @@ def batches_of(
 
 def detect_images(
     wake: Wake,
+    platform: Platform,
     scan: Scan,
     lidar: BackscatterLidar,
     detector: Detector | None,
     seed: int,
+    truth: Truth,
     images: Mapping[str, xr.Dataset],
     plans: Sequence[ScanPlan],
 ) -> list[xr.Dataset]:
-    """The images of all beams, with noisy ones in addition if there is a detector."""
+    """The images of all beams, with noisy ones in addition if there is a detector.
+
+    Of common random numbers also ``S0_pair_stderr``, see `with_pair_stderr`.
+    """
     # images are per emitted energy: those of another pulse energy are the same
     scans = [
         _on_nodes(images[name].assign_attrs(pulse_energy=lidar.pulse_energy), plan)
         for name, plan in zip(IMAGES, plans, strict=True)
     ]
+    scans = with_pair_stderr(scans, truth.wind, platform.dt)
     if detector is None:
         return scans
     # geometry and air are in single precision in a file: here they are known exactly
@@ -388,6 +398,48 @@ def detect_images(
         for index, (one, plan) in enumerate(zip(scans, plans, strict=True))
     ]
     return [one.assign_attrs(monte_carlo_fraction=monte_carlo_fraction(one)) for one in found]
+
+
+def with_pair_stderr(scans: Sequence[xr.Dataset], wind: xr.Dataset, dt: float) -> list[xr.Dataset]:
+    """Scans with ``S0_pair_stderr``, the Monte Carlo error that the other scan does not share.
+
+    By `unshared_fraction`, between the nodes that the true wind moves one into the other; errors
+    of beams that were reported elsewhere are compared on the nodes. Unchanged without
+    ``S0_mc_error``: errors of independent random numbers.
+    """
+    from lidar_mi.retrieval.images.gridding import on_nodes
+
+    if any("S0_mc_error" not in scan for scan in scans):
+        return list(scans)
+    names = ["S0_mc_error", "S0_stderr"]
+    places = ["y_reported", "z_reported"] if "y_reported" in scans[0] else []
+    first, second = (scan[names + places].transpose("gate", "z", "y") for scan in scans)
+    if places:
+        first, second = on_nodes(first, errors=False), on_nodes(second, errors=False)
+    moved = {}
+    for axis, name in (("z", "w"), ("y", "v")):
+        nodes, others = first[axis], second[axis].values
+        there = nodes + dt * wind[name].interp(z=first["z"], y=first["y"])
+        moved[axis] = ((there - others[0]) / (others[1] - others[0])).transpose("z", "y").values
+    errors = first["S0_mc_error"], second["S0_mc_error"], first["S0_stderr"]
+    fractions = np.stack(
+        [
+            unshared_fraction(a, b, c, moved["z"], moved["y"])
+            for a, b, c in zip(*(one.values.astype(float) for one in errors), strict=True)
+        ]
+    )
+    found = []
+    for scan in scans:
+        fraction = xr.DataArray(fractions, first["S0_stderr"].coords, ("gate", "z", "y"))
+        if places:
+            at = {
+                axis: scan[f"{axis}_reported"].clip(*first[axis].values[[0, -1]]) for axis in "zy"
+            }
+            fraction = fraction.interp(at).drop_vars(["z", "y"], errors="ignore")
+        error = scan["S0_stderr"].transpose("gate", "z", "y")
+        values = (error.values * np.sqrt(fraction.values)).astype(np.float32)
+        found.append(scan.assign(S0_pair_stderr=(("gate", "z", "y"), values)))
+    return found
 
 
 def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:

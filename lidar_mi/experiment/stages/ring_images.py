@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
-from lidar_mi.atmosphere.molecules import standard_atmosphere
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Only, Store
 from lidar_mi.experiment.log import Log
@@ -83,7 +83,7 @@ def air_line(
 ) -> Line:
     """The spectral line of the air's light."""
     lidar = doppler_lidar
-    pressure, temperature = standard_atmosphere(lidar.altitude)
+    pressure, temperature, _ = standard_atmosphere(lidar.altitude)
     return backscatter_line(
         lidar.wavelength,
         temperature,

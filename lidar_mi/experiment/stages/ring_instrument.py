@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
-from lidar_mi.atmosphere.molecules import standard_atmosphere
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
@@ -102,7 +102,7 @@ def air_rings(
     light_degree, background_degree : int
         Of the smooth variations of light and background that are fitted along.
     """
-    pressure, temperature = standard_atmosphere(lidar.altitude)
+    pressure, temperature, _ = standard_atmosphere(lidar.altitude)
     # aerosol that is fitted has harmonics of its own: the line is that of molecules
     known = lidar.aerosol_fraction if aerosol_std == 0 else 0.0
 

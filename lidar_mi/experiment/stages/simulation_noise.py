@@ -41,9 +41,10 @@ def simulation_noise(
 ) -> xr.Dataset | None:
     """Changes of the wind by as much noise again as the simulation's, by every method.
 
-    Noise of the stated Monte Carlo standard errors is added to both images and the wind is
-    retrieved once more. To first order its changes have the variance that the simulation's noise
-    has in the wind, through whatever the method does with it.
+    A realisation of the Monte Carlo error is added to both images and the wind is retrieved once
+    more: of common random numbers that which the images have, else noise of the stated standard
+    errors. To first order the changes of the wind have the variance that the simulation's noise has
+    in it, through whatever the method does with it.
 
     Returns
     -------
@@ -94,8 +95,12 @@ def simulation_noise(
 
 
 def _with_more_noise(scan: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
-    """A scan with noise of its Monte Carlo standard error in addition, the same in both images."""
-    stderr = attenuated_backscatter_stderr(scan)
-    noise = stderr * random.standard_normal(stderr.shape)
+    """A scan with a realisation of its Monte Carlo error in addition, the same in both images."""
+    if "S0_mc_error" in scan:
+        first = scan.isel(gate=0)
+        noise = (scan["Y"] * first["S0_mc_error"] / first["S0"].where(first["S0"] > 0)).fillna(0.0)
+    else:
+        stderr = attenuated_backscatter_stderr(scan)
+        noise = stderr * random.standard_normal(stderr.shape)
     names = [name for name in ("Y", "Y_noisy") if name in scan]
     return scan.assign({name: scan[name] + noise for name in names})

@@ -26,6 +26,7 @@ from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.rendering.pair_error import pair_stderr
 from lidar_mi.retrieval.images.window_sizes import check_window_sizes
 
 
@@ -197,10 +198,10 @@ def scan_volumes(
 
     first = scans[0]
     pairs: dict[str, Pair] = {Source.BACKSCATTER: both(lambda k: of_scan(k, "S0"))}
-    noise: dict[str, xr.DataArray] = {Source.BACKSCATTER: level(first["S0_stderr"])}
+    noise: dict[str, xr.DataArray] = {Source.BACKSCATTER: level(pair_stderr(first))}
     if detector:
         pairs[Source.NOISY] = both(lambda k: of_scan(k, "S0_noisy"))
-        noise[Source.NOISY] = level(combined_noise(first["S0_stderr"], first["S0_noise_std"]))
+        noise[Source.NOISY] = level(combined_noise(pair_stderr(first), first["S0_noise_std"]))
     return Volumes(pairs, noise)
 
 

@@ -19,6 +19,7 @@ from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.rendering.pair_error import pair_stderr
 from lidar_mi.retrieval.images.window_sizes import check_window_sizes
 from lidar_mi.retrieval.method_names import ImageMethod
 
@@ -234,11 +235,11 @@ def pixel_times(wake: Wake, scan: Scan, scans: Sequence[xr.Dataset]) -> list[xr.
 
 
 def attenuated_backscatter_stderr(scan: xr.Dataset) -> xr.DataArray:
-    """Standard error of the attenuated backscatter Y, same unit."""
+    """Monte Carlo error of the attenuated backscatter Y that winds see, see `pair_stderr`."""
     first = scan.isel(gate=0)
     lit = first["S0"] > 0
     # Y is proportional to S0: relative errors are the same
-    return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
+    return (scan["Y"] * pair_stderr(first) / first["S0"].where(lit)).fillna(0.0)
 
 
 def known_blur(retrieval: Retrieval, lidar: BackscatterLidar, plan: ScanPlan) -> float:

@@ -98,7 +98,7 @@ def standing(
     windows : Windows
     false_alarm : float
     """
-    first, second, known, d = _warped(images[:2], found, windows)
+    first, second, known, d = warped(images[:2], found, windows)
     speed = d.norm(dim=0)
     use = known & (speed > _SLOWEST)
     use[:_RIM] = use[-_RIM:] = False
@@ -132,7 +132,7 @@ def standing(
     return Standing(fraction, stderr)
 
 
-def _warped(
+def warped(
     images: Sequence[torch.Tensor], found: Displacement, windows: Windows
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Two images over their means at mid-time, where both are known, and the displacement, px."""

@@ -6,6 +6,7 @@ What else makes the images differ is estimated from what the fit leaves (`compon
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -17,6 +18,7 @@ from lidar_mi.retrieval.flow.components import Response, differences, without_te
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
+from lidar_mi.retrieval.flow.noise_check import variance_by_coloured_noise
 from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
@@ -206,12 +208,35 @@ def variational_and_flow(
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
-    # what the splines do not resolve is not in the posterior
+    # what the splines do not resolve is not in the posterior, nor noise that is not white
     eye = torch.eye(windows.dims).to(covariance)
     finer = interpolated(unresolved.to(like), pixels, centres).to(covariance)
+    lines, coloured = "", torch.zeros_like(finer)
+    if windows.dims == 2 and posterior.response is not None:
+        coloured, lines = variance_by_coloured_noise(
+            linear, images, mesh, windows, posterior.response
+        )
+        finer = finer + coloured.to(finer)
     additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
     covariance = covariance + additional
-    result = result._replace(covariance=covariance)
+    if bool((coloured > 0).double().mean() > 0.5) and len(settings.noise_rounds[-1]) > 1:
+        again = variational_and_flow(
+            stack,
+            windows,
+            min_correlation,
+            noise,
+            blur,
+            spacing,
+            replace(
+                settings, noise_rounds=(*settings.noise_rounds[:-1], settings.noise_rounds[-1][:-1])
+            ),
+            keep=keep,
+        )
+        assert again[0].covariance is not None
+        if again[0].covariance.diagonal().mean() < covariance.diagonal().mean():
+            return again
+    said = {"noise_of_lines": lines} if lines else {}
+    result = result._replace(covariance=covariance, attributes=said)
     if bare is None:
         return result, None
     bare = interpolated(bare, pixels, centres) > 0.5

@@ -11,6 +11,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
+from lidar_mi.retrieval.defects.copies import Copy, without_copy
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.defects.removal import CleanImages, as_they_are, without_defects
 from lidar_mi.retrieval.defects.unrelated import unrelated
@@ -106,8 +107,9 @@ def retrieve_wind(
         `y_vector`, `z_vector` are the position of the vector at mid-time: the centre and, with "cc"
         and "ws", half the displacement. "vortex_fit" adds the pair's numbers, see
         `VortexPairFit.quantities`. Rejected vectors keep their value, or NaN if there is none.
-        Attributes name what was found in the images: `defects`, `fixed_pattern`, `illumination`,
-        `identical_images` (bit for bit, from which no motion can be known: no vector is valid).
+        Attributes name what was found in the images: `defects`, `fixed_pattern`, `copy_at_rest`,
+        `illumination`, `identical_images` (bit for bit, from which no motion can be known: no
+        vector is valid).
 
     Raises
     ------
@@ -174,9 +176,9 @@ def _vectors(
             )
             flag = flag | of_bootstrap(covariance)
         found = found._replace(covariance=covariance)
-    pattern = Standing()
+    pattern, copy = Standing(), Copy()
     if checks and not method.local and not (given.times and method.timed):
-        found, pattern, spoilt = _without_pattern(found, seen, windows)
+        found, pattern, copy, spoilt = _without_pattern(found, seen, windows, estimate)
         flag = flag | spoilt
     if method.local:
         flag = flag | _flags_among_neighbours(found.d, low, windows, validation)
@@ -188,7 +190,7 @@ def _vectors(
     when = vector_times(times, given.dt, windows, found.d.cpu().numpy(), method.centred)
     reversed_time = torch.as_tensor(np.isnan(when.difference), device=flag.device)
     flag = flag | (Flag.NO_MATCH * reversed_time).to(torch.int16)
-    return Vectors(found._replace(flag=flag), texture, pattern, when)
+    return Vectors(found._replace(flag=flag), texture, pattern, copy, when)
 
 
 def _estimator(
@@ -217,16 +219,30 @@ def _estimator(
 
 
 def _without_pattern(
-    found: Displacement, images: Sequence[torch.Tensor], windows: Windows
-) -> tuple[Displacement, Standing, int]:
-    """A fitted field without the bias by a faint pattern at rest, or flags where it stays."""
+    found: Displacement,
+    images: Sequence[torch.Tensor],
+    windows: Windows,
+    estimate: Callable[..., Displacement],
+) -> tuple[Displacement, Standing, Copy, int]:
+    """A fitted field without the bias by what is at rest in both images, or flags where it stays.
+
+    That is a faint pattern, or a copy of one image in the other.
+    """
     if found.covariance is None:
-        return found, Standing(), 0
-    pattern = standing(images[:2], found, windows)
+        return found, Standing(), Copy(), 0
+    raw = pair = images[:2]
+    copy = Copy()
+    if len(images) == 2 and not found.quantities:
+        again = partial(estimate, stride=windows.stride)
+        found, copy, pair = without_copy(again, found, pair, windows)
+    pattern = standing(pair, found, windows)
     # parameters that are fitted in addition to the vectors would stay biased
-    if pattern.spoils or (pattern.fraction and found.quantities):
-        return found, pattern, Flag.AT_REST.value
-    return pattern.corrected(found), pattern, 0
+    spoilt = pattern.spoils or (pattern.fraction and found.quantities)
+    # what no copy explains and no pattern either
+    spoilt = spoilt or (copy.significant and pair is raw and not pattern.fraction)
+    if spoilt:
+        return found, pattern, copy, Flag.AT_REST.value
+    return pattern.corrected(found), pattern, copy, 0
 
 
 def _flags_among_neighbours(

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from lidar_mi.retrieval.defects.copies import Copy
 from lidar_mi.retrieval.defects.faint_pattern import Standing
 from lidar_mi.retrieval.defects.removal import CleanImages
 from lidar_mi.retrieval.images.beam_times import VectorTimes
@@ -29,12 +30,15 @@ class Vectors(NamedTuple):
         Of the templates of image 1.
     pattern : Standing
         The faint pattern at rest whose bias was removed.
+    copy : Copy
+        Of one image in the other, at rest, that was removed.
     times : VectorTimes
     """
 
     found: Displacement
     texture: Texture
     pattern: Standing
+    copy: Copy
     times: VectorTimes
 
 
@@ -46,7 +50,7 @@ def pair_dataset(
     validation: VectorValidation,
 ) -> xr.Dataset:
     """The data set that `retrieve_wind` returns."""
-    found, texture, _, times = vectors
+    found, texture, _, _, times = vectors
     image, steps = given.images[0], spacing(given.images[0])
     moved = found.d.cpu().numpy() * np.reshape(steps, (2, 1, 1))
     variables = winds(found, _AXES, steps, times.difference)
@@ -69,7 +73,7 @@ def pair_dataset(
         vector = place + (0.0 if method.centred else 0.5) * along
         about = f"{axis} of the vector at mid-time", "m"
         coords[f"{axis}_vector"] = field(_AXES, vector, *about)
-    attributes = _options(method, given, validation) | _remarks(given, clean, vectors.pattern)
+    attributes = _options(method, given, validation) | _remarks(given, clean, vectors)
     title = "Wind in the image plane from an image pair"
     return dataset(variables, coords, title, attributes, found)
 
@@ -98,13 +102,15 @@ def _options(method: Method, given: PairInput, validation: VectorValidation) -> 
     return named
 
 
-def _remarks(given: PairInput, clean: CleanImages, pattern: Standing) -> dict[str, Any]:
+def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str, Any]:
     """What was found in the images, of which nothing is said where there is nothing."""
+    pattern = vectors.pattern
     patterns = [str(part) for part in (clean.defects.pattern, pattern) if str(part)]
     said = {
         "defects": str(clean.defects),
         "fixed_pattern": ", ".join(patterns),
         "standing_fraction": pattern.fraction,
+        "copy_at_rest": str(vectors.copy),
         "identical_images": given.same,
         "illumination": clean.change_of_illumination,
     }

@@ -1,5 +1,6 @@
 """Samples that are chosen, and what the simulation's noise adds to the wind.
 
+With random numbers that are independent, and with common ones, whose errors move with the air.
 Detects: a stated variance that differs from that of other random numbers by a fifth, an image that
 holds samples of its pilot or depends on more than the number of its samples, an error of the wind
 that is the simulation's and called the lidar's, and one that is the lidar's and called the
@@ -8,6 +9,7 @@ simulation's by half.
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
@@ -41,7 +43,7 @@ def newcomer(**changes):
         "lidar": {"pulse_energy": "5 mJ", "pulse_duration": "10 ns"},
         "scan": {"range": "200 m"},
         "detector": {},
-        "render": {"max_order": 1},
+        "render": {"max_order": 1, "random_numbers": "independent"},
         "retrieval": {"methods": ["variational"], "stride": 3, "sources": "measured"},
     }
     return reading.check(reading.merged(data, changes), "newcomer")
@@ -60,6 +62,11 @@ def rendered(experiment, prepared, **how):
     graph, results = stages_of(experiment), needed(prepared)
     samples = graph.compute(graph["samples"], results, Log(), experiment.folder)
     return dict(call(render_images, experiment, **needed(prepared), samples=samples, **how))
+
+
+def detect(experiment, prepared, images):
+    plans, truth = prepared.results["plans"], prepared.results["truth"]
+    return call(detect_images, experiment, truth=truth, images=images, plans=plans)
 
 
 def reseeded(experiment, seed):
@@ -82,8 +89,8 @@ def test_the_stated_fraction_is_that_of_other_random_numbers(prepared, number):
         for seed in range(1, count + 1)
     ]
     s0 = np.stack([image["S0"].values[0].astype(float) for image in images])
-    one = {"image_t1": images[0], "image_t2": images[0]}
-    detected = call(detect_images, asked, images=one, plans=[plan, plan])[0]
+    one, truth = {"image_t1": images[0], "image_t2": images[0]}, prepared.results["truth"]
+    detected = call(detect_images, asked, truth=truth, images=one, plans=[plan, plan])[0]
     ratio = s0.var(0, ddof=1) / detected["S0_noise_std"].values[0].astype(float) ** 2
     stated = detected.attrs["monte_carlo_fraction"]
     assert stated == pytest.approx(float(noise_ratio(detected).mean()))
@@ -135,9 +142,7 @@ def test_the_winds_of_a_newcomer_are_those_of_many_samples(prepared, number):
     found = {}
     for samples in (8, number, 8 * number):
         images = rendered(with_number(prepared.experiment, samples), prepared)
-        detected = call(
-            detect_images, prepared.experiment, images=images, plans=prepared.results["plans"]
-        )
+        detected = detect(prepared.experiment, prepared, images)
         wind = call(
             cross_flow_winds,
             prepared.experiment,
@@ -155,27 +160,23 @@ def test_the_winds_of_a_newcomer_are_those_of_many_samples(prepared, number):
     assert rms[8] > rms[number]
 
 
-def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared):
+@pytest.mark.parametrize("numbers", ["independent", "common"])
+def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared, numbers):
     """Winds of eight renderings of the same air without a detector, about their mean."""
-    asked = newcomer(detector=None, render={"samples_per_beam": 32}, retrieval={"methods": ["cc"]})
+    asked = newcomer(
+        detector=None,
+        render={"samples_per_beam": 32, "random_numbers": numbers},
+        retrieval={"methods": ["cc"]},
+    )
     plans, truth = prepared.results["plans"], prepared.results["truth"]
     winds, stated = [], []
     for seed in range(1, 9):
         one = reseeded(asked, seed)
-        scans = call(detect_images, one, images=rendered(one, prepared), plans=plans)
+        scans = detect(one, prepared, rendered(one, prepared))
         wind = call(cross_flow_winds, one, truth=truth, plans=plans, scans=scans, log=Log())
         winds.append(wind.isel(source=0, algorithm=0))
-        stated.append(
-            call(
-                simulation_noise,
-                one,
-                detected=scans,
-                plans=plans,
-                scans=scans,
-                wind=wind,
-                log=Log(),
-            )
-        )
+        more = {"detected": scans, "scans": scans, "plans": plans, "wind": wind, "log": Log()}
+        stated.append(call(simulation_noise, one, **more))
     valid = np.all([(wind["flag"] == 0).values for wind in winds], 0)
     assert valid.sum() > 20
     for name in ("v", "w"):
@@ -185,6 +186,44 @@ def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared
         # chi-square of 7 x vectors beside 8 x vectors, half of which overlap
         sigma = np.sqrt(2 / (7 * valid.sum() / 2) + 2 / (len(changes) / 2))
         assert np.log((changes**2).mean() / spread) == pytest.approx(0, abs=max(4 * sigma, 0.3))
+
+
+def test_common_numbers_state_the_error_that_images_do_not_share(prepared):
+    """Of 12 seeds, differences between images moved by the true wind about their mean; and fewer
+    samples are enough for the same fraction of the detector's noise."""
+    asked = newcomer(render={"samples_per_beam": 32, "random_numbers": "common"})
+    wind, dt = prepared.results["truth"].wind, asked.platform.dt
+    z, y = (wind[axis].values for axis in "zy")
+    there = np.meshgrid(z, y, indexing="ij")
+    there = [
+        (nodes + dt * wind[name].transpose("z", "y").values - nodes.min()) / (axis[1] - axis[0])
+        for nodes, name, axis in zip(there, ("w", "v"), (z, y), strict=True)
+    ]
+    differences, stated, errors, s0 = [], [], [], []
+    for seed in range(1, 13):
+        one = reseeded(asked, seed)
+        scans = detect(one, prepared, rendered(one, prepared))
+        first, second = (scan["S0"].values[0].astype(float) for scan in scans)
+        differences.append(
+            (map_coordinates(second, there, order=3, mode="nearest") - first) / 2**0.5
+        )
+        stated.append((scans[0]["S0_pair_stderr"].values[0].astype(float) ** 2)[3:-3, 3:-3])
+        errors.append(scans[0]["S0_stderr"].values[0].astype(float) ** 2)
+        s0.append(first)
+    seen = np.var(differences, 0, ddof=1)[3:-3, 3:-3]
+    assert np.mean(stated) == pytest.approx(seen.mean(), rel=0.25)
+    # by place: where shear deforms the air, and where it does not
+    large = np.mean(stated, 0) > np.median(np.mean(stated, 0))
+    for part in (large, ~large):
+        assert np.mean(stated, 0)[part].mean() == pytest.approx(seen[part].mean(), rel=0.4)
+    # of a pixel by itself the whole error is stated
+    assert np.mean(errors) == pytest.approx(np.var(s0, 0, ddof=1).mean(), rel=0.4)
+    assert seen.mean() < np.mean(errors) / 10
+    number, fewer = (
+        call(chosen_samples, newcomer(render={"random_numbers": numbers}), **needed(prepared))
+        for numbers in ("independent", "common")
+    )
+    assert fewer.reached and fewer.number < number.number / 5
 
 
 def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(prepared):

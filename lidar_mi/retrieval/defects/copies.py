@@ -1,0 +1,176 @@
+"""Copies of an image in the other one, at rest: lag, afterglow, blended or denoised frames."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from scipy.stats import t as student
+
+from lidar_mi.retrieval.correlation.motion import moved
+from lidar_mi.retrieval.defects.faint_pattern import standing, warped
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.windows import Windows, working
+
+FALSE_ALARM = 5e-3
+"""Probability that images without a copy count as having one, which costs time: it is removed."""
+# Fraction beyond which nothing is told of the other image, and fits until a copy is removed.
+_LARGEST, _FITS = 0.6, 4
+# Side of the blocks, px, whose sums are nearly independent, their least number, the masked rim.
+_BLOCK, _FEW_BLOCKS, _RIM = 16, 12, 4
+# Standard errors of the difference by which two estimates of one fraction may differ.
+_UNLIKE = 2.0
+# Robust standard deviations that a pixel's difference counts at most.
+_CLIPPED = 4.0
+
+
+class Copy(NamedTuple):
+    """What of the difference of two images, warped to mid-time, is a copy at rest.
+
+    Attributes
+    ----------
+    fraction, stderr : float
+        Of the other image's structure in image 2 (> 0) or in image 1 (< 0), after the flow has
+        taken its part, and its standard error from the scatter over the images.
+    degrees : int
+        Of freedom of that.
+    """
+
+    fraction: float = 0.0
+    stderr: float = 0.0
+    degrees: int = 0
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger one without a copy."""
+        if not self.stderr:
+            return 1.0
+        return float(2 * student.sf(abs(self.fraction) / self.stderr, self.degrees))
+
+    @property
+    def significant(self) -> bool:
+        """Whether there is a copy, at the rate of false alarms."""
+        return self.p_value < FALSE_ALARM
+
+    def __str__(self) -> str:
+        if not self.significant:
+            return ""
+        one, other = (1, 2) if self.fraction > 0 else (2, 1)
+        percent = f"{100 * abs(self.fraction):.1f} +- {100 * self.stderr:.1f} %"
+        return f"{percent} of image {other} is image {one}, at rest"
+
+
+def copy_at_rest(images: Sequence[torch.Tensor], found: Displacement, windows: Windows) -> Copy:
+    """The copy at rest in two images, from what the displacements between them do not explain.
+
+    If image 2 is (1 - a) of its own air and a of image 1, a flow d is retrieved that is a d too
+    slow. Warped to mid-time, with the mean m, the images then differ by
+
+        a ((m(x + d) + m(x - d)) / 2 - m(x)),
+
+    which is even in d, as no displacement is. It is the half sum of its part that is of one sign
+    along d and of the other across it, and of its isotropic part, which is also that of images of
+    different blur. Both are regressed on, besides m, the difference by contrast. The
+    coefficients have the covariance of the scores' scatter over blocks of 16 px (White 1980,
+    Econometrica 48, 817-838). Where they differ by more than `_UNLIKE` standard errors, the
+    directed one counts alone. To second order in d over the size of the structure.
+
+    Parameters
+    ----------
+    images : sequence of torch.Tensor, shape (z, y)
+        Two.
+    found : Displacement
+        A field fitted to the images as a whole.
+    windows : Windows
+    """
+    first, second, known, d = warped(images[:2], found, windows)
+    known[:_RIM] = known[-_RIM:] = False
+    known[:, :_RIM] = known[:, -_RIM:] = False
+    rows, columns = (n // _BLOCK for n in known.shape)
+    if rows * columns < _FEW_BLOCKS or known.double().mean() < 0.5:
+        return Copy()
+    difference = torch.where(known, second - first, 0.0)
+    limit = _CLIPPED * 1.4826 * difference[known].abs().median()
+    mean = (first + second) / 2
+    mean = mean - mean[known].mean()
+    across = torch.stack([-d[1], d[0]])
+    along, across = ((moved(mean, s) + moved(mean, -s)) / 2 for s in (d, across))
+    even = [along - across, along + across - 2 * mean, mean, difference.clamp(-limit, limit)]
+    fields = (torch.stack(even) * known)[:, : rows * _BLOCK, : columns * _BLOCK]
+    blocks = fields.reshape(4, rows, _BLOCK, columns, _BLOCK).movedim(3, 2).flatten(3).flatten(1, 2)
+    blocks = working(blocks.movedim(0, -1)).cpu()
+    terms, observed = blocks[..., :3], blocks[..., 3:]
+    number = len(blocks)
+    gram = (terms.mT @ terms).sum(0)
+    inverse = torch.linalg.pinv(gram, hermitian=True)
+    coefficients = inverse @ (terms.mT @ observed).sum(0)
+    scores = (terms.mT @ (observed - terms @ coefficients))[..., 0]
+    covariance = inverse @ (scores.mT @ scores) @ inverse * number / (number - 3)
+    value, covariance = coefficients[:2, 0], covariance[:2, :2]
+    weight = torch.tensor([1.0, 0.0]).to(value)
+    apart = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+    if (value[0] - value[1]).square() < _UNLIKE**2 * apart:
+        part = ((covariance[0, 0] - covariance[0, 1]) / apart).clamp(0.0, 1.0)
+        weight = torch.stack([1 - part, part])
+    stderr = (weight @ covariance @ weight).sqrt()
+    if not 0 < 2 * stderr < _LARGEST:  # slow air tells nothing
+        return Copy()
+    return Copy(float(2 * weight @ value), float(2 * stderr), number - 3)
+
+
+def without_copy(
+    estimate: Callable[..., Displacement],
+    found: Displacement,
+    images: Sequence[torch.Tensor],
+    windows: Windows,
+) -> tuple[Displacement, Copy, Sequence[torch.Tensor]]:
+    """A field from images without the copy at rest of one in the other.
+
+    A copy of fraction a is subtracted and the fit repeated, until none is left. The standard error
+    of a goes into the covariance: displacements err by as much of themselves.
+
+    Parameters
+    ----------
+    estimate : callable
+        From two images to the field.
+    found : Displacement
+        Of the images as they are.
+    images : sequence of torch.Tensor, shape (z, y)
+        Two.
+    windows : Windows
+
+    Returns
+    -------
+    found : Displacement
+        As it was if there is no copy, or if what is left is none.
+    copy : Copy
+    images : sequence of torch.Tensor
+        Without the copy.
+    """
+    copy = copy_at_rest(images, found, windows)
+    if not copy.significant:
+        return found, Copy(), images
+    total, part = 0.0, copy
+    for _ in range(_FITS):
+        step = max(-0.5, min(0.5, part.fraction))
+        total += step * (1 - abs(total))
+        if abs(total) > _LARGEST:
+            break
+        clean = _subtracted(images, total)
+        again = estimate(*clean)
+        part = copy_at_rest(clean, again, windows)
+        if abs(part.fraction) > 0.5 * part.stderr or again.covariance is None:
+            continue
+        if standing(clean, again, windows).fraction:
+            break
+        error = part.stderr**2 * again.d[:, None] * again.d
+        done = Copy(total, part.stderr * (1 - abs(total)), part.degrees)
+        return again._replace(covariance=again.covariance + error), done, clean
+    return found, copy, images
+
+
+def _subtracted(images: Sequence[torch.Tensor], fraction: float) -> list[torch.Tensor]:
+    """Images without a fraction of the other one: of image 1 in 2, or if negative of 2 in 1."""
+    first, second = map(working, images)
+    if fraction < 0:
+        return [(first + fraction * second) / (1 + fraction), second]
+    return [first, (second - fraction * first) / (1 - fraction)]

@@ -1,0 +1,131 @@
+"""A copy of one image in the other, at rest: detects a bias that no standard error states.
+
+Lag, afterglow, blended and denoised frames. Textures, noise and motions are drawn anew by seed.
+"""
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from lidar_mi.retrieval.defects.copies import Copy, copy_at_rest
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.options import WindowSizes
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+
+SHAPE = 96, 112
+SHIFT = -0.6, 1.4
+NOISE = 0.01
+
+
+def air(seed):
+    """Gaussian texture of 2 px at both times, by Fourier: exact."""
+    k = np.fft.fftfreq(192)
+    lengths = k[:, None] ** 2 + k**2
+    wave = np.fft.fft2(np.random.default_rng(seed).standard_normal((192, 192)))
+    wave = wave * np.exp(-2 * np.pi**2 * 4 * lengths)
+    phase = np.exp(-2j * np.pi * (k[:, None] * SHIFT[0] + k * SHIFT[1]))
+    first, second = (np.fft.ifft2(part).real for part in (wave, wave * phase))
+    cut = slice(40, 40 + SHAPE[0]), slice(40, 40 + SHAPE[1])
+    return [1 + 0.3 * part[cut] / first.std() for part in (first, second)]
+
+
+def pair(seed, fraction):
+    """Of image 2 (or if negative of image 1) a fraction is the other image."""
+    first, second = air(seed)
+    random = np.random.default_rng([seed, 1])
+    one, two = (NOISE * random.standard_normal(SHAPE) for _ in range(2))
+    first = first + one
+    if fraction < 0:
+        return [(1 + fraction) * first - fraction * (second + two), second + two]
+    return [first, (1 - fraction) * second + fraction * first + two]
+
+
+def true_displacement():
+    windows = Windows(SHAPE, 8, 16, 2)
+    d = torch.tensor(SHIFT, dtype=torch.float64)[:, None, None].expand(2, *windows.count)
+    zero = torch.zeros(windows.count)
+    covariance = torch.zeros(2, 2, *windows.count, dtype=torch.float64)
+    return Displacement(d, zero, zero.to(torch.int16), covariance), windows
+
+
+def found_in(images):
+    return copy_at_rest([torch.as_tensor(i) for i in images], *true_displacement())
+
+
+def retrieved(images):
+    axes = {
+        name: (name, 0.5 * np.arange(n), {"units": "m"})
+        for name, n in zip("zy", SHAPE, strict=True)
+    }
+    one, two = (xr.DataArray(image, axes, ("z", "y")) for image in images)
+    return retrieve_wind(one, two, 0.1, windows=WindowSizes(8, 16, 4))
+
+
+def normalised(wind):
+    valid = wind["flag"].values == 0
+    true = {"v": 5 * SHIFT[1], "w": 5 * SHIFT[0]}
+    return valid, np.stack(
+        [(wind[c].values - t)[valid] / wind[f"{c}_stderr"].values[valid] for c, t in true.items()]
+    )
+
+
+def test_images_without_a_copy_have_none():
+    """Of 40 pairs as many exceed two standard errors as Student's t lets (4.6 %, at most 3 sigma).
+
+    The same where image 2 has three times the noise or 5 % more contrast: no motion of either.
+    """
+    scores = []
+    for seed in range(400, 440):
+        images = pair(seed, 0.0)
+        if seed % 2:
+            images[1] = 1 + 1.05 * (images[1] - 1)
+            noise = np.random.default_rng([seed, 2]).standard_normal(SHAPE)
+            images[1] = images[1] + 2.8 * NOISE * noise
+        found = found_in(images)
+        scores.append(found.fraction / found.stderr)
+    assert np.mean(np.abs(scores) > 2) < 0.046 + 3 * np.sqrt(0.046 * 0.954 / 40)
+    assert 0.5 < np.mean(np.square(scores)) < 2.0
+
+
+@pytest.mark.parametrize("fraction", [0.02, -0.05])
+def test_fraction_is_found_after_the_flow_took_its_part(fraction):
+    """The even part is a for displacements that are a too slow, of either image."""
+    found = []
+    for seed in range(440, 452):
+        true, windows = true_displacement()
+        slow = true._replace(d=(1 - abs(fraction)) * true.d)
+        found.append(
+            copy_at_rest([torch.as_tensor(i) for i in pair(seed, fraction)], slow, windows)
+        )
+    mean = np.mean([one.fraction for one in found])
+    stderr = np.mean([one.stderr for one in found]) / len(found) ** 0.5
+    # second order in the displacement over the size of the structure
+    assert mean == pytest.approx(fraction, abs=4 * stderr + 0.2 * abs(fraction))
+
+
+def test_too_little_to_tell():
+    true, windows = true_displacement()
+    images = [torch.as_tensor(i) for i in pair(1, 0.2)]
+    hole = [torch.where(torch.arange(SHAPE[1]) < 80, torch.nan, i) for i in images]
+    assert copy_at_rest(hole, true, windows) == Copy()
+    assert not copy_at_rest(images, true._replace(d=0.01 * true.d), windows).significant
+
+
+@pytest.mark.parametrize("fraction", [0.02, 0.2, -0.1])
+def test_wind_is_that_of_the_air(fraction):
+    wind = retrieved(pair(460, fraction))
+    valid, error = normalised(wind)
+    assert valid.mean() > 0.95
+    assert np.mean(np.abs(error) > 4) < 0.01
+    # errors of one pair share that of the fraction: chi-square of one degree of freedom
+    assert 0.3 < np.mean(error**2) < 4.0
+    assert "at rest" in wind.attrs["copy_at_rest"]
+
+
+@pytest.mark.slow
+def test_two_percent_are_removed_or_within_the_errors():
+    """In 95 % of the seeds at most 1 % of the vectors are beyond four stated errors."""
+    beyond = [np.mean(np.abs(normalised(retrieved(pair(seed, 0.02)))[1]) > 4) for seed in range(20)]
+    assert np.mean(np.array(beyond) <= 0.01) >= 0.95
