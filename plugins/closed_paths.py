@@ -54,6 +54,13 @@ class OpenPath:
         """Length of a flight that consumes ``used`` of the excess length."""
         return used * (0.5 * used + self.distance) / (used + self.distance * one_plus_cosine)
 
+    def left(self, direction: Vector, gap: Float, whole: Float) -> Float:
+        """Excess length that a flight leaves which ends ``gap`` before it would close the path.
+
+        ``whole`` is the length of the flight that closes it.
+        """
+        return shortened(self.away * self.distance + direction * whole, direction, gap)
+
     def from_telescope(self, direction: Vector) -> Vector:
         """Direction from the vertex to where one from the telescope closes the path."""
         one_plus_cosine = 0.5 * dr.squared_norm(direction - self.away)
@@ -143,12 +150,40 @@ def closing_distance(offset: Vector, direction: Vector, path: Float) -> Float:
     return dr.select(excess > 0, 0.5 * excess * (path + length) / consumed, -1)
 
 
+def shortened(end: Vector, direction: Vector, gap: Float) -> Float:
+    """By how much a path is shortened by ending a flight earlier: gap + |end| - |end - gap d|.
+
+    ``end`` is the flight's end less the goal; without the difference of both distances.
+    """
+    both = dr.norm(end) + dr.norm(end - direction * gap)
+    return gap * (1 + (2 * dr.dot(direction, end) - gap) / both)
+
+
 def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[Float, Float]:
     """The closing distance of a flight from a point, and d(distance)/d(path)."""
     distance = closing_distance(origin - goal, direction, path)
     back = dr.normalize(goal - (origin + direction * distance))
     # a vertex farther by ds lengthens the path by ds less its component along the way back
     return distance, dr.rcp(1 - dr.dot(direction, back))
+
+
+def sample_ahead(most: Float, scale: Float, sample: Float) -> Float:
+    """A distance from 0 to ``most``, of a density proportional to 1 / (distance + scale)."""
+    x = _steps(most, scale) * sample
+    # exp(x) - 1, without cancellation
+    half = dr.tanh(0.5 * dr.minimum(x, 1))
+    return scale * dr.select(x < 1, 2 * half / (1 - half), dr.exp(x) - 1)
+
+
+def ahead_density(distance: Float, most: Float, scale: Float) -> Float:
+    """Of `sample_ahead`, per metre."""
+    return dr.rcp((distance + scale) * _steps(most, scale))
+
+
+def _steps(most: Float, scale: Float) -> Float:
+    """ln(1 + most / scale), without cancellation."""
+    ratio = most / scale
+    return dr.select(ratio < 1, 2 * dr.atanh(dr.minimum(ratio, 1) / (2 + ratio)), dr.log(1 + ratio))
 
 
 def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: Float) -> Float:

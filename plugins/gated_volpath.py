@@ -36,8 +36,9 @@ Both estimators connect every collision to a sampled point of the telescope, tes
 and multiply by the transmittance of all media on the way. They have the same expectation. In the
 gated estimator every sample belongs to a gate and has a range R in it. The last vertex of each
 scattering order is placed such that the whole path is 2 R long: on the ellipsoid whose foci are the
-vertex before it and the telescope point. Its direction is drawn preferably into the field of view;
-of two candidates one is selected in proportion to its contribution (Talbot, Cline & Egbert 2005).
+vertex before it and the telescope point. Of three directions, one from the phase function, one
+towards the field of view and one from the telescope, one is selected in proportion to its
+contribution (Talbot, Cline & Egbert 2005).
 With several ``candidates`` the path of single scattering is selected in the same way. Each
 candidate has its own ray of the laser and point of the telescope, and its place is stratified over
 the gate and the pulse. Gradients, and scenes with open surfaces between media, use one candidate.

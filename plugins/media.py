@@ -1,11 +1,13 @@
 """Walking a straight line through nested media: transmittance and analog collisions."""
 
+from collections.abc import Iterable
+
 import drjit as dr
 import mitsuba as mi
 
 from .bounds import UNIFORM, UNKNOWN, Bounds, leave, locate
 from .surfaces import Air
-from .variant_types import Float, Generator, Interaction, Mask, MediumPtr, Point, Vector
+from .variant_types import Float, Generator, Interaction, Mask, Medium, MediumPtr, Point, Vector
 
 # Optical depth along a segment by which the control variate may exceed the least extinction, and
 # the majorant over the largest difference of extinction and control. Both only concern efficiency.
@@ -32,6 +34,24 @@ def coefficients(
     """Scattering and extinction coefficient (m^-1) at an interaction."""
     scattering, _, extinction = medium.get_scattering_coefficients(mei, active)
     return scattering[channel], extinction[channel]
+
+
+def narrowest_peak(media: Iterable[Medium], wavelengths: Float) -> Float:
+    """The forward peak of the media's most forward-peaked phase function: a width of 1 - cos.
+
+    That of a cone which would have all light, were it everywhere as bright as ahead; 2 of isotropic
+    scattering. For guiding alone: where a phase function varies, that at the origin.
+    """
+    context, width = mi.PhaseFunctionContext(), 2.0
+    onward, beside = mi.Vector3f(0, 0, 1), dr.normalize(mi.Vector3f(1e-3, 0, 1))
+    with dr.suspend_grad():
+        mei = interaction(dr.zeros(mi.MediumPtr), mi.Point3f(0), onward, wavelengths, mi.Float(0))
+        for medium in media:
+            _, density = medium.phase_function().eval_pdf(context, mei, beside)
+            width = dr.minimum(width, dr.inv_two_pi / density)
+    width = mi.Float(width)
+    dr.make_opaque(width)
+    return width
 
 
 def transmittance(

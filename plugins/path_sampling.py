@@ -15,15 +15,18 @@ from .bodies import first_hit, slabs
 from .bounds import Bounds
 from .closed_paths import (
     OpenPath,
+    ahead_density,
     closed,
     closing_distance,
     near_density,
     quarter_turn,
+    sample_ahead,
     sample_near,
+    shortened,
 )
 from .gate_sampling import pulse_in_gate
 from .laser import channel_of
-from .media import coefficients, collision, interaction, transmittance
+from .media import coefficients, collision, interaction, narrowest_peak, transmittance
 from .mitsuba_tables import has_tables, off_the_poles
 from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import pair
@@ -50,18 +53,23 @@ Products: TypeAlias = Mapping[tuple[int, int], Float]
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
-# Fraction of first vertices sampled where isotropic scattering closes paths most often.
+# Of first vertices, the fraction sampled anywhere in front of the gate, and of the others that
+# sampled where isotropic scattering closes paths most often.
+EVEN_FRACTION = 0.3
 NEAR_FRACTION = 0.35
-# Of last flights, the fraction with directions sampled from the phase function, and the largest
-# fraction with directions sampled from the telescope.
-PHASE_FRACTION = 0.2
-BACK_FRACTION = 0.5
 # Of intermediate flights, the fraction with directions sampled from the phase function; the others
 # mostly stay in a field of view that is wider than the telescope's by this factor.
-PHASE_FLIGHT_FRACTION = 0.3
-WIDER = 1.6
-# Of intermediate flights, the fraction whose remaining path is sampled as that of first vertices.
-NEAR_FLIGHT_FRACTION = 0.3
+PHASE_FLIGHT_FRACTION = 0.4
+WIDER = 2.5
+# Of intermediate flights, the fraction that ends anywhere on the way to the gate, as likely in each
+# part of it; the others end in front of where the path would close.
+EVEN_FLIGHT_FRACTION = 0.6
+# Distances in front of that place are sampled evenly in their logarithm, beyond half the radius of
+# the field of view or, if that is less, this fraction of the width of the forward peak times the
+# way back through air: light scattered back is scattered forwards again on that way.
+NEAREST = 0.03
+# Least of them, over half the field's radius.
+LEAST_NEAREST = 1e-6
 # Russian roulette: probability of survival over the weight.
 ROULETTE_FACTOR = 30.0
 # Of the way to a surface, what is left out in front of it.
@@ -133,6 +141,7 @@ class Lidar:
             sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
             self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
+        self.peak = narrowest_peak(media_of(scene, sensor), self.wavelengths)
         # of each sample's beam, once they are emitted
         self.field_tan = sensor.field_tangent(mi.UInt32(0))
         # last vertices that were drawn in the field of view and are not in it: rounding alone
@@ -467,19 +476,25 @@ class Lidar:
         # scatter through the field, farther ones past it
         scale = 0.25 * path * self.field_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
-        # for phase functions with a stronger forward peak than the isotropic one
-        steps = dr.log((most + scale) / (least + scale))
-        far = (least + scale) * dr.exp(steps * choice.y) - scale
-        gap = dr.select(choice.x < NEAR_FRACTION, near, far)
+        # for phase functions with a stronger forward peak than the isotropic one, and for paths
+        # that go on
+        depth, nearest = most - least, least + self._nearest(scale, most)
+        ahead = least + sample_ahead(depth, nearest, choice.y)
+        gap = dr.select(choice.x < NEAR_FRACTION * (1 - EVEN_FRACTION), near, ahead)
+        gap = dr.select(choice.x > 1 - EVEN_FRACTION, dr.lerp(least, most, choice.y), gap)
         density = dr.lerp(
-            dr.rcp((gap + scale) * steps), near_density(gap, least, most, scale), NEAR_FRACTION
+            ahead_density(gap - least, depth, nearest),
+            near_density(gap, least, most, scale),
+            NEAR_FRACTION,
         )
-        # gap + |closure| - |closure - gap direction|, without the difference of both distances
-        closure = offset + direction * reach
-        both = path - reach + dr.norm(closure - direction * gap)
-        excess = gap * (1 + (2 * dr.dot(direction, closure) - gap) / both)
+        density = dr.lerp(density, dr.rcp(depth), EVEN_FRACTION)
+        excess = shortened(offset + direction * reach, direction, gap)
         flight = dr.select((path > 0) & (most > least), reach - gap, -1)
         return flight, excess, dr.rcp(density)
+
+    def _nearest(self, scale: Float, way: Float) -> Float:
+        """Distance from which on places in front of the one that closes a path are sampled."""
+        return dr.clip(NEAREST * self.peak * way, LEAST_NEAREST * scale, scale)
 
     def _half_field(self, axes: Frame, away: Vector) -> Float:
         """Tangent of half the widest angle between a direction and one of the field of view."""
@@ -506,27 +521,16 @@ class Lidar:
     ) -> tuple[Vector, Stokes, Float, Float]:
         """Direction, Stokes vector and length of the flight to the last vertex; its weight.
 
-        One of two candidates, selected by its contribution if there is no obstacle and the medium
-        is the same. The weight includes d(length)/d(path).
+        Of three candidates, one from the phase function, one towards the field of view and one from
+        the telescope, selected by its contribution if there is no obstacle and the medium is the
+        same. The weight includes d(length)/d(path).
         """
         phase, axes, path = medium.phase_function(), sample.axes, rest.distance + rest.excess
-        # sampling from the telescope is best for last vertices far off, in radii of its field
-        across = rest.field / self._half_fov() - 1
-        along = 0.5 * rest.excess / (rest.distance * self.field_tan)
-        far = dr.square(across) + dr.square(along)
-        backward = BACK_FRACTION * (1 - dr.rcp(1 + far))
-        strategy = rng.next_float32(active)
-        by_phase, by_back = strategy < PHASE_FRACTION, strategy > 1 - backward
-
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
         aimed = rest.sample(rest.excess, pair(rng))
-        inward = self._in_field(axes, rng)
-        first = dr.select(by_phase, drawn, dr.select(by_back, inward, aimed))
-        axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, rest.away))
-        # a quarter turn about the axis has the angle to it for which the first one was drawn
+        inward = rest.from_telescope(self._in_field(axes, rng))
         tried = []
-        for wo in (first, quarter_turn(axis, first)):
-            wo = dr.select(by_back, rest.from_telescope(wo), wo)
+        for wo in (drawn, aimed, inward):
             one_plus_cosine = rest.one_plus_cosine(wo)
             leg = rest.leg(rest.excess, one_plus_cosine)
             volume = dr.rcp(rest.slope(rest.excess, one_plus_cosine, leg))
@@ -534,7 +538,8 @@ class Lidar:
             # not from the end's coordinates, which are rounded to those of the world
             to_end = rest.away * rest.distance + wo * leg
             in_view = active & self._in_view(axes, to_end)
-            self._reject(active & by_back & ~in_view)
+            if wo is inward:
+                self._reject(active & ~in_view)
             # both legs meet the ellipsoid at the same angle
             from_telescope = dr.square(leg / (path - leg)) / self._field_solid_angle()
             from_telescope = dr.select(in_view, from_telescope, 0)
@@ -543,10 +548,7 @@ class Lidar:
             there = interaction(medium, end, wo, self.wavelengths, sample.time)
             back = dr.normalize(sample.aperture - end)
             received, back_pdf = self._scatter(medium, there, scattered, back, in_view)
-            # of all three strategies together (Veach & Guibas 1995, balance heuristic): none has a
-            # large weight where another one would have drawn the direction
-            density = PHASE_FRACTION * pdf + backward * from_telescope
-            density += (1 - PHASE_FRACTION - backward) * rest.density(rest.excess, wo)
+            density = pdf + rest.density(rest.excess, wo) + from_telescope
             # never 0 where there may be light: the medium may be a different one there
             target = (0.95 * received[0] + 0.05 * scattered[0] * back_pdf) * volume
             target = dr.select(in_view & (density > 0), target, 0)
@@ -570,35 +572,45 @@ class Lidar:
         phase, rest = medium.phase_function(), rest.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        # transmittances to the gate differ little: any part of the excess length is about as likely
         most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.field_tan
-        choice, near = pair(rng), sample_near(0, most, scale, pair(rng), rng.next_float32(active))
-        gap = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
-        gap_density = near_density(gap, 0, most, scale)
-        gap_density = 0.5 * dr.lerp(dr.rcp(most), gap_density, NEAR_FLIGHT_FRACTION)
-        used = rest.excess - 2 * gap
-        sample = pair(rng)
+        nearest = self._nearest(scale, rest.reach)
+        # transmittances to the gate differ little: any part of the way is about as likely
+        choice, sample = pair(rng), pair(rng)
+        even = choice.x < EVEN_FLIGHT_FRACTION
+        gap = dr.select(even, most * choice.y, sample_ahead(most, nearest, choice.y))
         mirrored = mi.Point2f(1 - sample.x, sample.y + 0.25)
-        # two candidates again, with opposite azimuth and complementary polar sample
+        used = rest.excess - 2 * gap
+        # two candidates, with opposite azimuth and complementary polar sample
         tried = []
         for wo in (
             dr.select(by_phase, drawn, rest.sample(used, sample)),
             dr.select(by_phase, quarter_turn(-mei.wi, drawn), rest.sample(used, mirrored)),
         ):
             one_plus_cosine = rest.one_plus_cosine(wo)
-            leg = rest.leg(used, one_plus_cosine)
+            # what is drawn after its direction is a length, so that it ends in the air
+            _, leaves = slabs(self.low, self.high, mei.p, wo)
+            whole = rest.leg(rest.excess, one_plus_cosine)
+            longest = dr.minimum(whole, leaves)
+            short = sample_ahead(longest, nearest, choice.y)
+            short = dr.select(even, longest * choice.y, short)
+            leg = dr.select(by_phase, longest - short, rest.leg(used, one_plus_cosine))
+            left = 0.5 * dr.select(by_phase, rest.left(wo, whole - longest + short, whole), 2 * gap)
             scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
-            density = dr.lerp(rest.density(used, wo), pdf, PHASE_FLIGHT_FRACTION)
-            density *= rest.slope(used, one_plus_cosine, leg) * gap_density
+            consumed = rest.excess - 2 * left
+            density = rest.density(consumed, wo)
+            density *= 0.5 * rest.slope(consumed, one_plus_cosine, leg)
+            density *= _even_or_ahead(left, most, nearest)
+            pdf *= _even_or_ahead(dr.select(by_phase, short, longest - leg), longest, nearest)
+            density = 2 * dr.lerp(density, pdf, PHASE_FLIGHT_FRACTION)
             end = mei.p + wo * leg
-            inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
+            inside = active & (leg > 0) & (left > 0) & dr.all((end > self.low) & (end < self.high))
             target = dr.select(inside & (density > 0), scattered[0], 0)
-            tried.append((target, density, (wo, scattered, leg)))
-        (wo, scattered, leg), weight = choose(rng, *tried)
+            tried.append((target, density, (wo, scattered, leg, 2 * left)))
+        (wo, scattered, leg, excess), weight = choose(rng, *tried)
         # the change of S0 goes into the weight, on which roulette is played
         factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
         weight = dr.select(factor > 0, weight / factor, 0)
-        return wo, _scaled(scattered, factor), leg, 2 * gap, weight
+        return wo, _scaled(scattered, factor), leg, excess, weight
 
     def _field_solid_angle(self) -> Float:
         cosine = dr.rsqrt(1 + dr.square(self.field_tan))
@@ -834,6 +846,12 @@ class Lidar:
 def _split(by_order: Orders | None, value: Float, order: UInt, row: UInt, active: Mask) -> None:
     if by_order is not None:
         by_order.add(value, order, row, active)
+
+
+def _even_or_ahead(distance: Float, most: Float, nearest: Float) -> Float:
+    """Density of where intermediate flights end in front of the place where paths close."""
+    ahead = ahead_density(distance, most, nearest)
+    return dr.lerp(ahead, dr.rcp(most), EVEN_FLIGHT_FRACTION)
 
 
 def add(total: Float, value: Float, cell: UInt, active: Mask = True) -> None:

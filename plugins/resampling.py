@@ -1,4 +1,4 @@
-"""One of two candidates, selected by contribution."""
+"""One of several candidates, selected by contribution."""
 
 from typing import Any, TypeAlias
 
@@ -7,22 +7,26 @@ import drjit as dr
 from .variant_types import Float, Generator, Mask
 
 Candidate: TypeAlias = tuple[Float, Float, tuple[Any, ...]]
-"""The target value, to which its contribution should be proportional, its density, and its values,
-one of which is returned."""
+"""The target value, to which its contribution should be proportional, the sum of the densities of
+all candidates at its place, and its values, one of which is returned."""
 
 
-def choose(rng: Generator, first: Candidate, second: Candidate) -> tuple[list[Any], Float]:
-    """One of two candidates and its weight (resampled importance sampling, Talbot et al. 2005).
+def choose(rng: Generator, *candidates: Candidate) -> tuple[Any, Float]:
+    """One of several candidates and its weight.
+
+    Resampled importance sampling (Talbot et al. 2005), of candidates whose densities may differ:
+    they share a place in proportion to these (balance heuristic; Veach & Guibas 1995).
 
     Returns the values of that candidate, and the weight that makes the choice unbiased.
     """
-    (target, density, one), (other_target, other_density, other) = first, second
-    weight = dr.select(target > 0, target / density, 0)
-    other_weight = dr.select(other_target > 0, other_target / other_density, 0)
-    total = weight + other_weight
-    second_chosen = rng.next_float32() * total >= weight
-    target = dr.select(second_chosen, other_target, target)
-    return _either(second_chosen, other, one), dr.select(target > 0, 0.5 * total / target, 0)
+    (target, density, values), *others = candidates
+    total = dr.select(target > 0, target / density, 0)
+    for other_target, other_density, other in others:
+        weight = dr.select(other_target > 0, other_target / other_density, 0)
+        total += weight
+        takes = rng.next_float32() * total < weight
+        values, target = _either(takes, other, values), dr.select(takes, other_target, target)
+    return values, dr.select(target > 0, total / target, 0)
 
 
 def _either(condition: Mask, yes: Any, no: Any) -> Any:

@@ -8,7 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from plugins.closed_paths import OpenPath
+from plugins.closed_paths import OpenPath, ahead_density, sample_ahead, shortened
+from plugins.random_numbers import generator
+from plugins.resampling import choose
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -111,3 +113,38 @@ def test_all_directions_into_view_are_drawn(case):
     assert in_view.sum() > 100
     density = np.array(open_path(*case).density(mi.Float(excess), mi.Vector3f(*wo)), float)
     assert (density[in_view] > 0).all()
+
+
+@pytest.mark.parametrize("gap", [1e-4, 0.1, 30.0])
+@pytest.mark.parametrize("cosine", [-0.9999, -0.5, 0.99])
+def test_a_shorter_flight_shortens_the_path(gap, cosine):
+    """Keeps its digits where both distances to the goal hardly differ."""
+    direction = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    end = np.array([0.0, 0.0, 520.0]) + 40 * direction
+    expected = gap + np.linalg.norm(end) - np.linalg.norm(end - gap * direction)
+    found = shortened(mi.Vector3f(end), mi.Vector3f(direction), mi.Float(gap))
+    np.testing.assert_allclose(np.array(found), expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize(("most", "scale"), [(100.0, 0.01), (0.5, 5.0), (10.0, 1e-5), (1e-5, 10.0)])
+def test_distances_ahead_have_their_density(most, scale):
+    number = (np.arange(1000) + 0.5) / 1000
+    drawn = np.array(sample_ahead(mi.Float(most), mi.Float(scale), mi.Float(number)), float)
+    # quantiles by the inverse of the density's integral, in double precision
+    expected = scale * np.expm1(np.log1p(most / scale) * number)
+    np.testing.assert_allclose(drawn, expected, rtol=1e-5)
+    density = np.array(ahead_density(mi.Float(drawn), mi.Float(most), mi.Float(scale)), float)
+    np.testing.assert_allclose(density * (drawn + scale) * np.log1p(most / scale), 1, rtol=1e-5)
+
+
+def test_one_of_several_candidates_is_unbiased():
+    """Of the densities 1, 2 x and 4 x^3 from 0 to 1, for targets unlike the integrand."""
+    number = 1_000_000
+    rng = generator(mi.UInt32(1), mi.UInt32(2), mi.UInt32(np.arange(number)))
+    tried = []
+    for power in (1.0, 0.5, 0.25):
+        place = mi.Float(np.array(rng.next_float32()) ** power)
+        tried.append((1 + place * place, 1 + 2 * place + 4 * place**3, (place,)))
+    (place,), weight = choose(rng, *tried)
+    found = np.array(weight, float) * np.exp(np.array(place, float))
+    assert abs(found.mean() - (np.e - 1)) < 4 * found.std() / np.sqrt(number)

@@ -4,6 +4,7 @@ Detects: 1 % of the signal in any gate of a dense slab (3 sigma of 0.3 % statist
 degree of polarisation, an order counted twice or left out, a standard error wrong by 10 %.
 """
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -80,6 +81,18 @@ def test_depolarisation_by_multiple_scattering(world, truth):
     spread = np.hypot(spread, 1.5 * found[:, 4] / found[:, 0])
     assert (np.abs(degree - reference) < 3 * spread).all()
     assert degree[0] > 0.95 and degree[-1] < 0.75
+
+
+@pytest.mark.parametrize("peak", [1e-4, 2.0])
+@pytest.mark.parametrize("case", [RAYLEIGH, FORWARD], ids=["rayleigh", "forward"])
+def test_a_wrong_forward_peak_guides_without_bias(world, truth, monkeypatch, case, peak):
+    """Flights are drawn for a phase function that is not the medium's."""
+
+    def wrong(*_):
+        return dr.opaque(mi.Float, peak)
+
+    monkeypatch.setattr("lidar_mi.plugins.path_sampling.narrowest_peak", wrong)
+    agree(gates(dense(world, case), spp=400_000, seed=8), *truth[case])
 
 
 def test_orders_sum_to_the_total_and_the_first_is_single_scattering(world):
