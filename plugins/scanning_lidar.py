@@ -274,7 +274,8 @@ def define() -> type:
             if wrong.size:
                 expected = "an angle above 0 and less than a half space, 1570.8 mrad"
                 fail(NAME, "fov_half_mrad", self.m_fov[int(wrong[0])], expected)
-            self.m_fov_tan = mi.Float(np.tan(fov))
+            # a list is copied to where kernels read it alike, an array stays where it is
+            self.m_fov_tan = mi.Float(np.tan(fov).tolist())
             self.m_fov_last = dr.opaque(mi.UInt32, fov.size - 1)
             dr.make_opaque(self.m_fov_tan)
             check_pose(self.m_pose, NAME)

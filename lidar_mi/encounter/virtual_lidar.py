@@ -335,7 +335,7 @@ class VirtualLidar:
         The pilot is of the nominal pose, so that images do not depend on the first pose.
         """
         experiment = self.experiment
-        settings = experiment.render.for_winds()
+        settings = experiment.render
         if settings.samples_per_beam != "auto":
             return settings
         plan = self.gates.plan()

@@ -70,8 +70,8 @@ class RenderSettings(Description):
     random_numbers: Literal["auto", "independent", "common"] = Field(
         "auto",
         description="of beams, gates and scans: their own, or the same in all, whose errors winds "
-        "hardly see; auto: common for winds from images, independent where photons are counted "
-        "and with analog sampling",
+        "hardly see; auto: common for winds from the images of an experiment, independent in "
+        "flights, where photons are counted, and with analog sampling",
     )
     candidates: Annotated[int, Within(1, 1024, "more cost time and hardly lower the noise")] = (
         Field(

@@ -8,7 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, PLACE, Scan, listed, seconds
+from lidar_mi.io.lines_of_sight.scan import (
+    ANGLES,
+    FIELDS,
+    PLACE,
+    TABLE,
+    Scan,
+    dated,
+    listed,
+    ratio_of_powers,
+    seconds,
+    toward_in_words,
+)
 from lidar_mi.io.text import read_text
 from lidar_mi.units import conversion
 
@@ -32,8 +43,9 @@ def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
     path : Path
     names : mapping
         Ours to those of the head, without unit; a minus sign before that of radial_velocity turns
-        its sign. Rows of the same time and angles are one line; time is ISO 8601 (UTC) or seconds
-        since 1970; ``snr`` may have the unit dB. Lines that begin with # are comments.
+        its sign, a plus sign retains it, whatever comments say of it. Rows of the same time and
+        angles are one line; time is ISO 8601 (UTC), seconds since 1970 or as of `dated`; ``snr``
+        may have the unit dB. Lines that begin with # are comments.
 
     Raises
     ------
@@ -52,9 +64,10 @@ def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
         raise InputError(f"{path}: not a table ({error}); expected a head and rows") from None
     heads = [_HEAD.fullmatch(str(name)) for name in table.columns]
     there = {head[1]: (k, head[2]) for k, head in enumerate(heads) if head}
-    columns = {}
+    columns: dict[str, np.ndarray] = {}
+    remarks: list[str] = []
     for ours, unit in _UNITS.items():
-        theirs = names.get(ours, ours).removeprefix("-").strip()
+        theirs = names.get(ours, ours).lstrip("+-").strip()
         if theirs not in there:
             if ours in _REQUIRED or ours in names:
                 raise InputError(
@@ -63,16 +76,26 @@ def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
                 )
             continue
         index, given = there[theirs]
-        columns[ours] = _values(table.iloc[:, index], ours, given, unit, path)
+        columns[ours], more = _values(table.iloc[:, index], ours, given, unit, path)
+        remarks += more
     if not len(table):
         raise InputError(f"{path}: no row below the head; expected one or more")
-    if names.get("radial_velocity", "").startswith("-"):
+    sign = names.get("radial_velocity", "")
+    comments = "; ".join(line for line in text.splitlines() if line.startswith("#"))
+    toward = not sign.startswith(("+", "-")) and toward_in_words(comments)
+    if toward:
+        remarks.append(
+            "a comment says that radial_velocity is positive toward the lidar: its sign is reversed"
+        )
+    if toward or sign.startswith("-"):
         columns["radial_velocity"] = -columns["radial_velocity"]
-    return _scan(columns, path)
+    return _scan(columns, path, remarks)
 
 
-def _values(cells, ours: str, unit: str | None, target: str, path: Path) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """A column as numbers in our unit; times as datetime64[ns]."""
+def _values(  # type: ignore[no-untyped-def]
+    cells, ours: str, unit: str | None, target: str, path: Path
+) -> tuple[np.ndarray, list[str]]:
+    """A column as numbers in our unit, times as datetime64[ns]; remarks."""
     import pandas as pd
 
     text = cells.str.strip()
@@ -82,7 +105,7 @@ def _values(cells, ours: str, unit: str | None, target: str, path: Path) -> np.n
         times = pd.to_datetime(text, errors="coerce", utc=True, format="ISO8601")
         bad = np.flatnonzero(times.isna().to_numpy())
         if not bad.size:
-            return times.dt.tz_localize(None).to_numpy().astype("datetime64[ns]")
+            return times.dt.tz_localize(None).to_numpy().astype("datetime64[ns]"), []
         unknown = times.isna().to_numpy()
     if unknown.any():
         row = int(np.flatnonzero(unknown)[0])
@@ -90,8 +113,10 @@ def _values(cells, ours: str, unit: str | None, target: str, path: Path) -> np.n
             f"{path}: {cells.name}: {text.iloc[row]!r} in row {row + 1} is not allowed; expected "
             f"{'a time (ISO 8601) or seconds' if ours == 'time' else 'a number'}"
         )
-    if ours == "snr" and unit == "dB":
-        return 10.0 ** (numbers / 10)
+    if ours == "snr":
+        return ratio_of_powers(numbers, unit or "", str(cells.name))
+    if ours == "time" and not unit:
+        return dated(numbers, str(cells.name), path)
     if unit:
         try:
             numbers = numbers * conversion(unit, target)
@@ -100,10 +125,10 @@ def _values(cells, ours: str, unit: str | None, target: str, path: Path) -> np.n
                 f"{path}: {cells.name}: unit {unit!r} is not allowed; expected {target} or a unit "
                 "that converts to it"
             ) from None
-    return seconds(numbers, np.datetime64("1970-01-01")) if ours == "time" else numbers
+    return (seconds(numbers, np.datetime64("1970-01-01")) if ours == "time" else numbers), []
 
 
-def _scan(columns: dict[str, np.ndarray], path: Path) -> Scan:
+def _scan(columns: dict[str, np.ndarray], path: Path, remarks: list[str]) -> Scan:
     """Rows to lines, in the order in which they begin, and gates."""
     keys = np.stack(
         [columns["time"].astype("int64"), *(_codes(columns[a]) for a in ("azimuth", "elevation"))],
@@ -136,7 +161,8 @@ def _scan(columns: dict[str, np.ndarray], path: Path) -> Scan:
         ranges,
         fields,
         {name: float(columns[name][0]) for name in PLACE if name in columns},
-        about={"kind": "table (CSV)"},
+        about={"kind": TABLE},
+        remarks=remarks,
     )
 
 

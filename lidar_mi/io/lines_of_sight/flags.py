@@ -51,6 +51,17 @@ class LineFlag(enum.IntFlag):
     """A target that stands, such as a building, is in the gate or before it."""
     REJECTED = 16
     """The lidar's own software rejects the value."""
+    REPEATED = 32
+    """The same number in all gates of the line, or in many cells: no measurement."""
+
+
+EXCESS = 4.0
+"""Times that a repeated number is more frequent than its neighbours."""
+LEAST_REPEATED = 40
+"""Cells that a repeated number has at least."""
+
+_LEAST_NOISE = 500  # gates: a tenth of uniform velocities is above 90 % of the largest, to 1.5 %
+_LEAST_GATES = 8  # whose velocities are not equal by chance
 
 
 def flags(
@@ -61,7 +72,7 @@ def flags(
     Parameters
     ----------
     scan : Scan
-        Reflections and overlapping gates that are found are added to its remarks.
+        Reflections and repeated numbers that are found are added to its remarks.
     min_cnr : float, optional
         dB; default: `MIN_CNR` of the kind of file.
     blind_range : float, optional
@@ -70,7 +81,7 @@ def flags(
     """
     kind = str(scan.about.get("kind", ""))
     given = blind_range is not None
-    limit = MIN_CNR.get(kind, MIN_CNR[""]) if min_cnr is None else min_cnr
+    limit = _limit(scan, min_cnr)
     blind = BLIND_RANGE.get(kind, BLIND_RANGE[""]) if blind_range is None else blind_range
     velocity, snr = scan.fields["radial_velocity"], scan.fields.get("snr")
     found = np.zeros(velocity.shape, np.uint16)
@@ -79,54 +90,128 @@ def flags(
     if snr is not None:
         # as the total power would be none: never written
         found[snr <= -1.0] |= LineFlag.MISSING.value
-        overlap = overlapping(scan, snr, limit)
+        overlap = overlapping(scan, snr, limit)[0]
         found[np.isfinite(velocity) & ~(snr >= 10 ** (limit / 10))] |= LineFlag.LOW_CNR.value
+        _nyquist_of_noise(scan, velocity[found == LineFlag.LOW_CNR.value])
     near = np.broadcast_to(scan.range < blind, velocity.shape).copy()
     if not given:
         near |= reflection(scan, overlap)
     found[near] |= LineFlag.BLIND_RANGE.value
     if snr is not None:
         found[hard_targets(scan, snr, found != 0, overlap)] |= LineFlag.HARD_TARGET.value
+    same = repeated(np.where(found == 0, velocity, np.nan))
+    if same.any():
+        number = velocity[same][0]
+        found[same] |= LineFlag.REPEATED.value
+        scan.remarks.append(
+            f"{int(same.sum())} cells in {int(same.any(1).sum())} lines repeat one number "
+            f"({number:g} m/s): flagged"
+        )
     if scan.rejected is not None:
         found[scan.rejected] |= LineFlag.REJECTED.value
     return found, {"min_cnr": limit, "blind_range": blind}
 
 
-def overlapping(scan: Scan, snr: np.ndarray, limit: float) -> float:
-    """How many neighbouring gates share their samples, from the correlation of the noise; 1: none.
+def _nyquist_of_noise(scan: Scan, noise: np.ndarray) -> None:
+    """Velocity beyond which those of the file fold: gates without a signal fill what is below."""
+    top = float(np.abs(noise).max()) if noise.size >= _LEAST_NOISE else 0.0
+    if top > 0 and 0.05 < np.mean(np.abs(noise) > 0.9 * top) < 0.2:
+        scan.about.setdefault("nyquist_velocity", top * (1 + 1 / noise.size))
 
-    Noise of gates of n samples that are one sample apart correlates by 1 - 1/n. If the file's
-    ranges say that the gates are adjacent, this is remarked.
+
+def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
+    """Ranges of gates that the file states to be adjacent although they share their samples.
+
+    The noise shows how many; ranges are corrected where it determines their whole number, or agrees
+    with that of the file.
+    """
+    snr = scan.fields.get("snr")
+    step = float(np.nanmedian(np.diff(scan.range)))
+    length = float(scan.about.get("gate_length", step))
+    if snr is None or step <= 0.7 * length:
+        return
+    count, error = overlapping(scan, snr, _limit(scan, min_cnr))
+    if count == 1.0:
+        return
+    said = (
+        f"noise of neighbouring gates correlates by {1 - 1 / count:.2f}, as of gates that overlap "
+        f"{count:.0f}-fold, but range has steps of {step:g} m for gates of {length:g} m"
+    )
+    if error < 1 / 6:
+        count = round(count)
+        scan.range = scan.range[:1] + step / count * np.arange(scan.range.size)
+        # adjacent gates are as long as their steps
+        scan.about.setdefault("gate_length", length)
+        scan.remarks.append(f"{said}: steps of {step / count:.3g} m are used (range_step)")
+    else:
+        scan.remarks.append(
+            f"{said}: ranges may be {count:.0f} times too long (range_step: '{step / count:.3g} m')"
+        )
+
+
+def overlapping(scan: Scan, snr: np.ndarray, limit: float) -> tuple[float, float]:
+    """How many neighbouring gates share their samples, and its standard error; 1: none.
+
+    From the correlation of the noise: gates of n samples that are one sample apart correlate by
+    1 - 1/n. The error is that of the lines' own estimates, 0 where the file's number agrees.
     """
     if scan.range.ndim > 1 or snr.shape[1] < 40:
-        return 1.0
+        return 1.0, 0.0
     # gates of the far half in which no line has a signal
     noise = np.where(snr > -1.0, snr, np.nan)[:, snr.shape[1] // 2 :]
     noise = noise[:, (noise < 10 ** (limit / 10)).all(0)]
     if noise.size < 400 or noise.shape[1] < 150:
-        return 1.0
+        return 1.0, 0.0
     # by structure functions, which offsets of the background do not change
-    far = np.mean([_structure(noise, lag) for lag in range(60, 80)])
+    far = np.mean([_structure(noise, lag) for lag in range(60, 80)], axis=0)
     first = _structure(noise, 1)
-    if not (far > 0 and first / far < 0.5):
-        return 1.0
-    count = float(far / first)
+    if not (far.sum() > 0 and first.sum() / far.sum() < 0.5):
+        return 1.0, 0.0
+    count = float(far.sum() / first.sum())
+    lines = len(noise)
+    error = np.inf
+    if lines > 2:
+        error = float(np.std(far - count * first) / first.mean() / math.sqrt(lines))
     # of as many samples as the file says, if the noise agrees
     samples = float(scan.about.get("samples_per_gate", np.nan))
-    count = samples if abs(count / samples - 1) < 0.3 else count
-    step = float(np.median(np.diff(scan.range)))
-    length = float(scan.about.get("gate_length", step))
-    if step > 0.7 * length:
-        scan.remarks.append(
-            f"noise of neighbouring gates correlates by {1 - first / far:.2f}, as of gates that "
-            f"overlap {count:.0f}-fold, but range has steps of {step:g} m for gates of {length:g} "
-            f"m: ranges may be {count:.0f} times too long (range_step: '{length / count:.3g} m')"
-        )
-    return count
+    return (samples, 0.0) if abs(count / samples - 1) < 0.3 else (count, error)
 
 
-def _structure(values: np.ndarray, lag: int) -> float:
-    return float(np.mean((values[:, lag:] - values[:, :-lag]) ** 2))
+def _limit(scan: Scan, min_cnr: float | None) -> float:
+    kind = str(scan.about.get("kind", ""))
+    return MIN_CNR.get(kind, MIN_CNR[""]) if min_cnr is None else min_cnr
+
+
+def repeated(velocity: np.ndarray) -> np.ndarray:
+    """Cells (lines, gates) that hold a number instead of a measurement, as of a blocked beam.
+
+    Either every gate of a line has the same velocity while other lines vary; or one velocity is
+    there `EXCESS` times as often as any of its neighbours. Of a smooth distribution with at most
+    `LEAST_REPEATED` / `EXCESS` cells at each velocity, the second happens by chance once in 1e8.
+    """
+    known = np.isfinite(velocity)
+    many = known.sum(1) >= _LEAST_GATES
+    low, high = (
+        np.where(many, f(np.where(known, velocity, one), axis=1), one)
+        for f, one in ((np.min, np.inf), (np.max, -np.inf))
+    )
+    constant = many & (low == high)
+    found = np.zeros(velocity.shape, bool)
+    if many.any() and (not constant[many].all() or np.unique(low[constant]).size == 1):
+        found |= constant[:, None] & known
+    values, counts = np.unique(np.round(velocity[known], 6), return_counts=True)
+    if values.size > 10:
+        top = int(counts.argmax())
+        near = counts[max(top - 10, 0) : top + 11].copy()
+        near[min(top, 10)] = 0
+        if counts[top] >= max(LEAST_REPEATED, EXCESS * near.max()):
+            found |= np.round(velocity, 6) == values[top]
+    return found
+
+
+def _structure(values: np.ndarray, lag: int) -> np.ndarray:
+    """Mean square difference of gates so many apart, (lines,)."""
+    return np.mean((values[:, lag:] - values[:, :-lag]) ** 2, axis=1)
 
 
 def reflection(scan: Scan, overlap: float = 1.0) -> np.ndarray:

@@ -12,7 +12,16 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, Scan, listed, part
+from lidar_mi.io.lines_of_sight.scan import (
+    ANGLES,
+    FIELDS,
+    Scan,
+    dated,
+    listed,
+    part,
+    ratio_of_powers,
+    toward_in_words,
+)
 from lidar_mi.io.netcdf import groups, load_variable, open_netcdf
 from lidar_mi.io.text import as_text
 from lidar_mi.units import conversion
@@ -48,6 +57,7 @@ NAMES = {
 """Ours, and those of the makers in lower case, the most telling first."""
 
 _UNITS = {name: unit for name, (unit, _) in FIELDS.items()} | {"range": "m", "altitude": "m"}
+_WORDS = ("long_name", "comment", "description", "note", "sign_convention", "positive")
 _NEVER = -9999.0  # ARM's missing value, which not every file declares
 _KINDS = (
     ("datastream", "sgp", "ARM"),
@@ -76,7 +86,7 @@ def read_netcdf_lines(path: Path, names: Mapping[str, str]) -> list[Scan]:
     path : Path
     names : mapping
         Ours to the file's, before those known; a minus sign before the name of radial_velocity
-        turns its sign.
+        turns its sign, a plus sign retains it, whatever the file says of it.
 
     Raises
     ------
@@ -125,6 +135,8 @@ def _about(root: xr.Dataset, path: Path) -> dict[str, str | float]:
     if not kind and "cfradial" in conventions.lower():
         kind = "CfRadial 2" if groups(path) else "CfRadial 1"
     about: dict[str, str | float] = {"kind": kind or "NetCDF"}
+    if texts.get("tilt"):
+        about["tilt"] = texts["tilt"]  # of a data set that was written
     for ours, theirs in (
         ("instrument", "instrument_name"),
         ("instrument", "serial_number"),
@@ -141,6 +153,7 @@ def _about(root: xr.Dataset, path: Path) -> dict[str, str | float]:
         ("pulses_per_line", "shots_per_profile"),
         ("velocity_resolution", "radial_velocity_resolution"),
         ("focus_range", "focus_range"),
+        ("nyquist_velocity", "nyquist_velocity"),
     ):
         try:
             about[ours] = float(texts[theirs].split()[0])
@@ -164,7 +177,7 @@ def _found(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
     found = {}
     for ours, known in NAMES.items():
         if ours in names:
-            found[ours] = names[ours].removeprefix("-").strip()
+            found[ours] = names[ours].lstrip("+-").strip()
             continue
         theirs = next((lower[name] for name in known if name in lower), None)
         if ours == "radial_velocity":
@@ -195,7 +208,7 @@ def _numbers(variable: xr.DataArray, ours: str, path: Path) -> np.ndarray:
     values = np.where(values == _NEVER, np.nan, values)
     unit = str(variable.attrs.get("units", "")).strip()
     if ours == "snr":
-        return _ratio(values, unit, str(variable.name))
+        return values
     wanted = "degree" if ours in ANGLES else _UNITS.get(ours)
     if wanted is None or unit.lower() in ("", "unitless", "none", "1"):
         return values
@@ -210,23 +223,18 @@ def _numbers(variable: xr.DataArray, ours: str, path: Path) -> np.ndarray:
         ) from None
 
 
-def _ratio(values: np.ndarray, unit: str, name: str) -> np.ndarray:
-    """A ratio of powers from dB, from SNR + 1 (intensity) or as it is."""
-    if unit.lower() == "db":
-        return 10.0 ** (values / 10)
-    return values - 1.0 if name.lower() == "intensity" else values
-
-
-def _times(data: xr.Dataset, name: str, reference: str, path: Path) -> np.ndarray:
+def _times(data: xr.Dataset, name: str, reference: str, path: Path) -> tuple[np.ndarray, list[str]]:
     variable = data[name]
     units = str(variable.attrs.get("units", ""))
+    if "since" not in units and variable.dtype.kind in "iuf" and units in ("", "1", "s"):
+        return dated(np.ravel(variable.values).astype(float), name, path)
     if reference:
         units = units.replace("time_reference", reference)
     # ARM: "seconds since 2019-10-15 00:00:00 0:00"
     attributes = variable.attrs | {"units": units.removesuffix(" 0:00")}
     try:
         raw = xr.Dataset({"t": ("n", np.ravel(variable.values), attributes)})
-        return xr.decode_cf(raw)["t"].values.astype("datetime64[ns]")
+        return xr.decode_cf(raw)["t"].values.astype("datetime64[ns]"), []
     except Exception as error:  # any exception of the libraries about units and calendars
         reason = next(iter(str(error).splitlines()), "")
         raise InputError(
@@ -262,16 +270,21 @@ def _flat(
     lines = data.sizes[line]
     ragged = _Ragged.of(data, path) if velocity.dims == ("n_points",) else None
     fields = {}
+    toward, remarks = _is_toward(velocity, names)
     for name in FIELDS:
         if found.get(name) in data.variables and data[found[name]].dims == velocity.dims:
             values = _numbers(data[found[name]], name, path)
+            if name == "snr":
+                unit = str(data[found[name]].attrs.get("units", ""))
+                values, more = ratio_of_powers(values, unit, found[name])
+                remarks += more
             if ragged is not None:
                 fields[name] = ragged.full(values)
             elif velocity.ndim == 2:
                 fields[name] = values if velocity.dims[0] == line else values.T
             else:
                 fields[name] = values[:, None]
-    if _is_toward(velocity, names):
+    if toward:
         fields["radial_velocity"] = -fields["radial_velocity"]
     gates = fields["radial_velocity"].shape[1]
     ranges = _numbers(data[found["range"]], "range", path)
@@ -290,24 +303,48 @@ def _flat(
             values = _numbers(data[found[name]], name, path)
             angles[name] = np.broadcast_to(values, (lines,)).copy()
     own: dict[str, Any] = dict(about)
+    for name in ("nyquist_velocity", "nyquist"):
+        if name in data.variables and data[name].dtype.kind in "iuf":
+            nyquist = np.unique(load_variable(data[name], path).values.astype(float))
+            # lines of several pulse rates fold at several speeds
+            if nyquist.size == 1 and nyquist[0] > 0:
+                own["nyquist_velocity"] = float(nyquist[0])
     if "range_gate_length" in data.variables:
         own["gate_length"] = float(np.ravel(load_variable(data["range_gate_length"], path))[0])
+    time, more = _times(data, found["time"], reference, path)
     scan = Scan(
-        _times(data, found["time"], reference, path),
+        time,
         angles,
         ranges,
         fields,
         dict(place),
         _rejected(data, velocity, path),
         own,
+        remarks + more,
     )
     return _apart(scan, data, path)
 
 
-def _is_toward(velocity: xr.DataArray, names: Mapping[str, str]) -> bool:
-    if names.get("radial_velocity", "").startswith("-"):
-        return True
-    return bool(velocity.attrs.get("standard_name") == TOWARD)
+def _is_toward(velocity: xr.DataArray, names: Mapping[str, str]) -> tuple[bool, list[str]]:
+    """Whether positive is toward the lidar, and a remark where only words say so, or contradict."""
+    sign = names.get("radial_velocity", "")
+    if sign.startswith(("+", "-")):
+        return sign.startswith("-"), []
+    standard = {TOWARD: True, AWAY: False}.get(str(velocity.attrs.get("standard_name", "")))
+    texts = {name: text for name in _WORDS if isinstance(text := velocity.attrs.get(name), str)}
+    words = toward_in_words("; ".join(texts.values()))
+    if words is None or words == standard or (standard is None and not words):
+        return bool(standard), []
+    said = "; ".join(text for text in texts.values() if toward_in_words(text) is not None)
+    if standard is None:
+        use = f"the sign is reversed (names: radial_velocity: '+{velocity.name}' retains it)"
+    else:
+        other = "+" if standard else "-"
+        use = (
+            "the standard name, which contradicts it, is used: which is right? (names: "
+            f"radial_velocity: '{other}{velocity.name}' for the words)"
+        )
+    return bool(words if standard is None else standard), [f"{velocity.name}: {said!r}: {use}"]
 
 
 def _rejected(data: xr.Dataset, velocity: xr.DataArray, path: Path) -> np.ndarray | None:

@@ -10,7 +10,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.lines_of_sight.csv_lines import read_csv_lines
 from lidar_mi.io.lines_of_sight.dataset import assembled
-from lidar_mi.io.lines_of_sight.flags import flags
+from lidar_mi.io.lines_of_sight.flags import correct_steps, flags
 from lidar_mi.io.lines_of_sight.halo import read_halo
 from lidar_mi.io.lines_of_sight.netcdf_scans import NAMES, is_lines, read_netcdf_lines
 from lidar_mi.io.lines_of_sight.scan import Scan, check
@@ -45,7 +45,8 @@ def read_lines_of_sight(
         Our name to the file's, where they differ: {"radial_velocity": "-v_los"}. Ours are time,
         azimuth, elevation, range, radial_velocity, snr, spectral_width, attenuated_backscatter,
         pitch, roll, latitude, longitude, altitude. A minus sign before the file's name reverses the
-        sign of a radial velocity that is positive toward the lidar.
+        sign of a radial velocity that is positive toward the lidar; a plus sign retains the sign
+        where the file says that it is.
     min_cnr : float, optional
         Least carrier-to-noise ratio, dB, of a velocity that is not flagged. Default: -21 dB, of
         WindCube -27 dB.
@@ -53,7 +54,8 @@ def read_lines_of_sight(
         Gates nearer than this are flagged, m. Default: 90 m of Halo Photonics and ARM, and gates
         that hold the reflection of the pulse, where a scan shows them.
     range_step : float, optional
-        Distance of neighbouring gates, m, where that of the file is wrong: gates that overlap.
+        Distance of neighbouring gates, m, where that of the file is wrong. Default: the file's,
+        unless the noise shows that gates overlap which it states to be adjacent.
 
     Returns
     -------
@@ -95,6 +97,8 @@ def read_lines_of_sight(
             if range_step is not None:
                 _step(scan, range_step)
             scan = check(scan, path)
+            if range_step is None:
+                correct_steps(scan, min_cnr)
             found, thresholds = flags(scan, min_cnr, blind_range)
             scans.append((path.name, scan, found))
     return assembled(scans, thresholds)

@@ -1,5 +1,6 @@
 """What a file of lines of sight holds, before it becomes the data set: arrays and remarks."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +20,8 @@ FIELDS = {
 ANGLES = {
     "azimuth": "azimuth of the line of sight, clockwise from north",
     "elevation": "elevation of the line of sight above the horizon",
-    "pitch": "pitch of the platform, as reported",
-    "roll": "roll of the platform, as reported",
+    "pitch": "pitch of the platform, as reported: positive with the front up",
+    "roll": "roll of the platform, as reported: positive with the right side down",
 }
 """Of a line, degrees."""
 
@@ -90,9 +91,56 @@ def check(scan: Scan, path: Path) -> Scan:
         scan.remarks.append(
             f"{lines - int(known.sum())} of {lines} lines have no time or direction"
         )
+    _level(scan)
     _wrap(scan)
     _check_ranges(scan.range, path)
     return scan
+
+
+TABLE = "table (CSV)"
+"""Kind of tables."""
+
+LEVEL = 0.02
+"""Degrees of pitch and roll below which a platform is level: 3 mm/s of w in wind of 10 m/s."""
+
+
+def _level(scan: Scan) -> None:
+    """Directions of the beam by the platform's pitch and roll, where their axes are known.
+
+    In tables azimuth and elevation are those of the platform, whose front is at azimuth 0: positive
+    pitch lifts it, positive roll lowers the right side. Of CfRadial they are those above the
+    horizon already. Makers do not document the axes of their sensors: a tilt is an error of what is
+    retrieved, which says so.
+    """
+    kind = str(scan.about.get("kind", ""))
+    known = {"pitch", "roll"} <= set(scan.angles)
+    if not known or kind.startswith("CfRadial") or "tilt" in scan.about:
+        return
+    pitch, roll = (np.deg2rad(np.nan_to_num(scan.angles[name])) for name in ("pitch", "roll"))
+    tilt = float(np.rad2deg(np.hypot(pitch, roll).max()))
+    if tilt < LEVEL:
+        return
+    scan.about["tilt"] = "applied" if kind == TABLE else "not applied"
+    if kind != TABLE:
+        return
+    azimuth, elevation = (np.deg2rad(scan.angles[name]) for name in ("azimuth", "elevation"))
+    right, front = np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation)
+    up = np.sin(elevation)
+    # about the front axis, then about the right one
+    right, up = right * np.cos(roll) + up * np.sin(roll), up * np.cos(roll) - right * np.sin(roll)
+    front, up = (
+        front * np.cos(pitch) - up * np.sin(pitch),
+        front * np.sin(pitch) + up * np.cos(pitch),
+    )
+    over = scan.angles["elevation"] > 90
+    slope = np.arctan2(up, np.hypot(right, front))
+    scan.angles["elevation"] = np.rad2deg(np.where(over, np.pi - slope, slope))
+    turn = np.arctan2(right, front) + np.where(over, np.pi, 0.0)
+    scan.angles["azimuth"] = np.rad2deg(turn)
+    scan.remarks.append(
+        f"pitch and roll of up to {tilt:.2f} degrees are applied, with the front of the "
+        "platform at azimuth 0"
+    )
 
 
 def part(scan: Scan, lines: slice | np.ndarray) -> Scan:
@@ -153,3 +201,99 @@ def seconds(values: np.ndarray, origin: np.datetime64) -> np.ndarray:
 def listed(names: Sequence[str], most: int = 8) -> str:
     """Names in a message."""
     return ", ".join(names[:most]) + (" ..." if len(names) > most else "") or "none"
+
+
+_SHORTEST_LINE = 1e-3  # s: tens of pulses
+_FIRST_SCAN = np.datetime64("1980-01-01", "s")
+_ENCODINGS = (
+    ("milliseconds since 1970", 1e-3, 0.0),
+    ("microseconds since 1970", 1e-6, 0.0),
+    ("nanoseconds since 1970", 1e-9, 0.0),
+    ("days since 1970", 86400.0, 0.0),
+    ("days of MATLAB (datenum)", 86400.0, 719529.0),
+    ("days of spreadsheets (since 1899-12-30)", 86400.0, 25569.0),
+    ("Julian days", 86400.0, 2440587.5),
+    ("seconds since 1904 (LabVIEW)", 1.0, 2082844800.0),
+)
+"""Of numbers that are no seconds since 1970: name, seconds of a unit, number of 1970-01-01."""
+
+
+def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[str]]:
+    """Times of numbers without a unit, and a remark if they are no seconds since 1970.
+
+    They are taken for these, unless they then lie in the future or are closer than lines can be:
+    then for the one other common encoding that gives dates from 1980 to today.
+
+    Raises
+    ------
+    InputError
+        No encoding, or more than one, is possible.
+    """
+    epoch = np.datetime64("1970-01-01", "s")
+    known = values[np.isfinite(values)]
+    step = float(np.median(np.diff(np.unique(known)))) if np.unique(known).size > 1 else np.inf
+    first, last = (
+        float((one - epoch) / np.timedelta64(1, "s"))
+        for one in (_FIRST_SCAN, np.datetime64("now") + np.timedelta64(1, "D"))
+    )
+
+    def possible(unit: float, zero: float, first: float) -> bool:
+        since = unit * (known - zero)
+        return bool(((since >= first) & (since <= last)).all()) and unit * step >= _SHORTEST_LINE
+
+    # those that begin with the measurement are seconds, too
+    if not known.size or possible(1.0, 0.0, -86400.0):
+        return seconds(values, epoch), []
+    others = [one for one in _ENCODINGS if possible(one[1], one[2], first)]
+    if len(others) != 1:
+        raise InputError(
+            f"{path}: {name}: {known[0]:.10g} without a unit is not allowed; expected seconds "
+            "since 1970, ISO 8601, or a unit"
+        )
+    text, unit, zero = others[0]
+    remark = f"{name}: {known[0]:.10g} is no time in seconds since 1970: read as {text}"
+    return seconds(unit * (values - zero), epoch), [remark]
+
+
+_TOWARD = r"(?:toward|approach|inbound|incoming)"
+_AWAY = r"(?:away|reced|outbound|outgoing|outward)"
+_SIGN = r"(?:positive|negative|(?<!\w)[+-]ve|(?<!\w)[><]\s*0)"
+_SAID = re.compile(
+    rf"(?P<sign>{_SIGN})[^.;,]*?(?P<way>{_TOWARD}|{_AWAY})"
+    rf"|(?P<way2>{_TOWARD}|{_AWAY})[^.;,]*?(?P<sign2>{_SIGN})",
+    re.IGNORECASE,
+)
+
+
+def toward_in_words(text: str) -> bool | None:
+    """Whether words say that a positive velocity is toward the lidar; None: nothing, or both.
+
+    >>> toward_in_words("Doppler velocity, positive towards the lidar")
+    True
+    """
+    said = set()
+    for one in _SAID.finditer(text):
+        sign, way = one["sign"] or one["sign2"], one["way"] or one["way2"]
+        positive = sign.lower().startswith(("positive", "+", ">"))
+        said.add((re.match(_TOWARD, way, re.IGNORECASE) is not None) == positive)
+    return said.pop() if len(said) == 1 else None
+
+
+_FILL = -100.0  # dB: below it a value stands for none
+
+
+def ratio_of_powers(values: np.ndarray, unit: str, name: str) -> tuple[np.ndarray, list[str]]:
+    """A ratio of powers from dB, from SNR + 1 (intensity) or as it is, and remarks.
+
+    Without a unit it is in dB if more than 1 % of the values are below -1: total power is positive.
+    """
+    unit = unit.strip().lower()
+    if unit.startswith(("db", "decibel")):
+        return 10.0 ** (values / 10), []
+    if unit in ("", "unitless", "none", "1"):
+        given = values[np.isfinite(values) & (values > _FILL)]
+        if given.size and np.mean(given < -1.0) > 0.01:
+            return 10.0 ** (values / 10), [
+                f"{name} has values below -1, which no ratio of powers has: read as dB"
+            ]
+    return (values - 1.0 if name.lower() == "intensity" else values), []

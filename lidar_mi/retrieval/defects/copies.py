@@ -15,6 +15,8 @@ FALSE_ALARM = 5e-3
 """Probability that images without a copy count as having one, which costs time: it is removed."""
 # Fraction beyond which nothing is told of the other image, and fits until a copy is removed.
 _LARGEST, _FITS = 0.6, 4
+# Blurred air in a vortex pair gives up to 0.007 where there is next to no noise.
+_LEAST = 0.01
 # Side of the blocks, px, whose sums are nearly independent, their least number, the masked rim.
 _BLOCK, _FEW_BLOCKS, _RIM = 16, 12, 4
 # Standard errors of the difference by which two estimates of one fraction may differ.
@@ -49,7 +51,7 @@ class Copy(NamedTuple):
     @property
     def significant(self) -> bool:
         """Whether there is a copy, at the rate of false alarms."""
-        return self.p_value < FALSE_ALARM
+        return abs(self.fraction) > _LEAST and self.p_value < FALSE_ALARM
 
     def __str__(self) -> str:
         if not self.significant:

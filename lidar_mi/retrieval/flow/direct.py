@@ -45,15 +45,16 @@ class Posterior(NamedTuple):
     Attributes
     ----------
     coefficients : torch.Tensor, shape (2, Z, Y)
-    whole : torch.Tensor, shape (2, 2, 7, Z, 4, Y)
-        That precision, a band.
+    whole, stiff : torch.Tensor, shape (2, 2, 7, Z, 4, Y)
+        That precision, and the prior's part of it: bands.
     root, before : Root
-        Of it, and of the prior's part of it.
+        Of both.
     prior : Prior
     """
 
     coefficients: torch.Tensor
     whole: torch.Tensor
+    stiff: torch.Tensor
     root: Root
     before: Root
     prior: Prior
@@ -68,6 +69,17 @@ class Posterior(NamedTuple):
     def response(self, gradients: torch.Tensor) -> torch.Tensor:
         """Changes of the coefficients by gradients (..., components, knots)."""
         return self.root.solve(gradients)
+
+    def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
+        """The prior's precision times coefficients (n, 2, Z, Y)."""
+        return torch.stack([_band(self.prior.mesh).apply(self.stiff, flow) for flow in flows])
+
+    def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
+        """Coefficients by gradients (n, 2, Z, Y), with the prior's precision times a strength."""
+        if strength == 1:
+            return self.root.solve(gradients)
+        (root,) = factored((self.whole + (strength - 1) * self.stiff)[None])
+        return root.solve(gradients)
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before."""
@@ -120,7 +132,7 @@ def solved(
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     whole = data_form(linear, mesh) + stiff
     root, before = factored(torch.stack([whole, stiff]))
-    return Posterior(coefficients + root.solve(gradient), whole, root, before, prior)
+    return Posterior(coefficients + root.solve(gradient), whole, stiff, root, before, prior)
 
 
 class PriorTerm(NamedTuple):

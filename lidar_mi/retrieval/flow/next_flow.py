@@ -61,6 +61,8 @@ class Flow:
     additional : torch.Tensor, shape (2, 2, *windows.count)
         Covariance in addition to the posterior's, px^2: of motion that the splines do not resolve
         (`components.differences`).
+    factor : torch.Tensor, shape (*windows.count)
+        Of the posterior covariance, by the error of the prior (`prior_check`).
     images : Images
         Their filter and noise.
     local : torch.Tensor, shape (z, y)
@@ -71,7 +73,7 @@ class Flow:
     settings : VariationalSettings
     offset : (float, float)
         Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
-        `additional`, `local`) has moved since.
+        `additional`, `factor`, `local`) has moved since.
     """
 
     coefficients: torch.Tensor
@@ -79,6 +81,7 @@ class Flow:
     energy: float
     before: torch.Tensor
     additional: torch.Tensor
+    factor: torch.Tensor
     images: Images
     local: torch.Tensor
     misfit: float
@@ -119,6 +122,7 @@ class Flow:
             prior=self.prior._replace(local=strength.exp()),
             before=interpolated(self.before, centres, _back(centres, self.offset)),
             additional=interpolated(self.additional, centres, _back(centres, self.offset)),
+            factor=interpolated(self.factor, centres, _back(centres, self.offset)),
             local=interpolated(self.local, pixels, _back(pixels, self.offset)),
             offset=(0.0, 0.0),
         )
@@ -130,6 +134,7 @@ def flow_of(
     images: Images,
     before: torch.Tensor,
     additional: torch.Tensor,
+    factor: torch.Tensor,
     windows: Windows,
     settings: VariationalSettings,
 ) -> Flow:
@@ -143,6 +148,7 @@ def flow_of(
         _energy(posterior.prior, posterior.coefficients),
         before,
         additional,
+        factor,
         images,
         images.weight / images.given_weight,
         _misfit(linear, torch.zeros_like(linear.slope), images),
@@ -256,7 +262,7 @@ def next_flow(
         return None
     at_centres = _of_centres(prior.mesh.axes, windows, coefficients)
     # errors learnt from other images follow the misfit of these
-    covariance = worse * _as_informed(ready, linear)
+    covariance = worse * placed.factor * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
     covariance = covariance + placed.additional

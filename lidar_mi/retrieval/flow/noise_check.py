@@ -101,8 +101,10 @@ def _density(field: torch.Tensor, use: torch.Tensor) -> tuple[torch.Tensor, str]
     for axis, name in enumerate(("columns", "rows")):
         along, across = lag[axis], lag[1 - axis]
         far = (along.abs() >= _FAR) & (along.abs() <= field.shape[axis] // 2)
-        profile = covariance.movedim(axis, 0)[far].mean(0)
         outside = (across.abs() > 2 * _LINE) & (across.abs() < field.shape[1 - axis] // 2)
+        if int(outside.sum()) <= 2 * _LINE or not bool(far.any()):
+            continue
+        profile = covariance.movedim(axis, 0)[far].mean(0)
         mean, scatter = profile[outside].mean(), profile[outside].std()
         if profile[0] - mean < _SIGNIFICANT * scatter:
             continue

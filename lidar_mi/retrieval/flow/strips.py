@@ -5,7 +5,6 @@ hardly depends on what lies beyond the strip. Strips extend along y over the who
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -53,8 +52,7 @@ class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, with the posterior's precision there.
 
     `stiff` is the prior's part of it, `both` all of it: bands. `images` is the
-    likelihood that they are of, and its mesh. `response` gives the changes of the coefficients
-    by gradients (n, components, knots) of the log-likelihood, to `StripSettings.loose`.
+    likelihood that they are of, and its mesh.
     """
 
     coefficients: torch.Tensor
@@ -63,7 +61,22 @@ class Posterior(NamedTuple):
     prior: Prior
     images: tuple[Linear, Mesh]
     settings: VariationalSettings
-    response: Callable[[torch.Tensor], torch.Tensor]
+    inverse: "Inverse"
+
+    def response(self, gradients: torch.Tensor) -> torch.Tensor:
+        """Changes of the coefficients by gradients (n, components, knots), to a loose tolerance."""
+        return self.inverse(gradients, self.settings.strips.loose)
+
+    def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
+        """The prior's precision times coefficients (n, 2, Z, Y)."""
+        return _band(self.prior).apply(self.stiff, flows)
+
+    def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
+        """Coefficients by gradients (n, 2, Z, Y), with the prior's precision times a strength."""
+        inverse = self.inverse
+        if strength != 1:
+            inverse = _inverse(self.both + (strength - 1) * self.stiff, self.prior, self.settings)
+        return inverse(gradients, self.settings.strips.tolerance)
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow.
@@ -153,19 +166,33 @@ def solved(
     flow beyond it held (additive Schwarz method; Toselli & Widlund 2005, Domain Decomposition
     Methods, chapter 2).
     """
-    solver = settings.strips
-    whole = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     both = data_form(linear, mesh) + stiff
-    cut = strips(mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
+    inverse = _inverse(both, prior, settings)
+    # a loose solution suffices: the next round takes another step
+    (change,) = inverse(gradient[None], settings.strips.tolerance)
+    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, inverse)
+
+
+Inverse = Callable[[torch.Tensor, float], torch.Tensor]
+"""Solutions of a system for right hand sides (n, 2, Z, Y), to a tolerance."""
+
+
+def _band(prior: Prior) -> Band:
+    return Band(*(axis.knots for axis in prior.mesh.axes))
+
+
+def _inverse(both: torch.Tensor, prior: Prior, settings: VariationalSettings) -> Inverse:
+    solver, whole = settings.strips, _band(prior)
+    cut = strips(prior.mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
     some = _grouped(cut, solver.solved_at_once)
     roots = mapped(lambda part: _root(both, part), some)
 
     def inverse(part: tuple[list[Strip], Factor], right: torch.Tensor) -> torch.Tensor:
         members, root = part
         band = Band(root.root.shape[-1] // 2, whole.columns)
-        right = torch.stack([right[..., s.knots, :] for s in members], 1).to(root.root)
-        return band.solve(root, right).to(coefficients)
+        rights = torch.stack([right[..., s.knots, :] for s in members], 1).to(root.root)
+        return band.solve(root, rights).to(right)
 
     def preconditioned(right: torch.Tensor) -> torch.Tensor:
         total = torch.zeros_like(right)
@@ -175,15 +202,12 @@ def solved(
                 total[..., strip.knots, :] += part
         return total
 
-    def response(right: torch.Tensor, tolerance: float) -> torch.Tensor:
+    def solved_to(right: torch.Tensor, tolerance: float) -> torch.Tensor:
         return conjugate_gradients(
             lambda c: whole.apply(both, c), right, preconditioned, tolerance, solver.steps
         )
 
-    # a loose solution suffices: the next round takes another step
-    (change,) = response(gradient[None], solver.tolerance)
-    loose = partial(response, tolerance=solver.loose)
-    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, loose)
+    return solved_to
 
 
 def _root(both: torch.Tensor, part: list[Strip]) -> Factor:

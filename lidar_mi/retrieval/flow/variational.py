@@ -20,6 +20,7 @@ from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.noise_check import variance_by_coloured_noise
 from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
+from lidar_mi.retrieval.flow.prior_check import prior_check
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, check_between
@@ -206,6 +207,13 @@ def variational_and_flow(
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
+    factor = torch.ones(windows.count).to(covariance)
+    if isinstance(posterior, direct.Posterior | strips.Posterior):
+        check = prior_check(posterior, linear, mesh)
+        factor = check.factor(centres).to(covariance)
+        # a weaker prior is one that images remove less of
+        before = min(check.ratio, 1.0) * before
+    covariance = factor * covariance
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
     # what the splines do not resolve is not in the posterior, nor noise that is not white
@@ -244,7 +252,7 @@ def variational_and_flow(
     result = result._replace(flag=flag)
     if bare.double().mean() > 0.5 or not (keep and isinstance(posterior, direct.Posterior)):
         return result, None
-    return result, flow_of(posterior, linear, images, before, additional, windows, settings)
+    return result, flow_of(posterior, linear, images, before, additional, factor, windows, settings)
 
 
 def _solver(axes: Sequence[Axis], settings: VariationalSettings) -> Solver:

@@ -13,6 +13,9 @@ from lidar_mi.errors import InputError
 
 _OUT_OF_PLANE = 0.05  # sine of the angle of a line with the plane: 3 degrees
 _PAUSE = 10  # times the time from line to line
+STANDING = ("step", "point", "stop")
+"""In the name of a scan whose beam stands while it measures, as `Step` and `Stepped` of Halo."""
+
 _LEAST_LINES = 8
 _LEAST_GATES = 4
 
@@ -35,8 +38,12 @@ class PlaneScan:
         Away from the lidar, m/s; NaN: not usable.
     variance : (lines, gates) array
         Of the noise, (m/s)^2.
-    span : float
-        Angle that the beam moves through in the time of a line, rad.
+    step : float
+        Angle from line to line, rad.
+    sweeps : bool
+        Whether the beam moves through this angle while it measures; else it stands.
+    clock : float
+        Resolution of the times if it is coarser than the lines, s; 0: finer.
     azimuth : float
         Of the y axis, degrees.
     sweep : int
@@ -51,10 +58,17 @@ class PlaneScan:
     ranges: np.ndarray
     velocity: np.ndarray
     variance: np.ndarray
-    span: float
+    step: float
+    sweeps: bool
+    clock: float
     azimuth: float
     sweep: int
     stated: Literal["gates", "least", "none"]
+
+    @property
+    def span(self) -> float:
+        """Angle that the beam moves through in the time of a line, rad."""
+        return self.step if self.sweeps else 0.0
 
     def at(self, seconds: float) -> np.datetime64:
         """Time of day of so many seconds after the start."""
@@ -86,7 +100,11 @@ def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan]
     scans, lost, few = [], int((~known).sum()), "0 lines and 0 gates"
     for number in np.unique(sweep):
         whole = np.flatnonzero(sweep == number)
-        for part in _passes(*(lines[name].values[whole] for name in ("elevation", "time"))):
+        one = lines.isel(time=whole)
+        # in the plane, where an azimuth that turns at the zenith is no turn
+        azimuth, elevation = (np.deg2rad(one[name].values) for name in ("azimuth", "elevation"))
+        forward = np.cos(elevation) * np.cos(azimuth - common)
+        for part in _passes(np.arctan2(np.sin(elevation), forward), one["time"].values):
             index = whole[part]
             here = usable[index]
             if here.any(1).sum() < _LEAST_LINES or here.any(0).sum() < _LEAST_GATES:
@@ -103,11 +121,16 @@ def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan]
     return scans, [remark] if lost else []
 
 
-def _passes(elevation: np.ndarray, time: np.ndarray) -> list[slice]:
-    """Parts (in the order of time) in which the elevation rises, or falls, without a pause."""
-    steps, seconds = np.diff(elevation), np.diff(time) / np.timedelta64(1, "s")
+def _passes(angle: np.ndarray, time: np.ndarray) -> list[slice]:
+    """Parts (in the order of time) in which the angle rises, or falls, without a pause."""
+    if len(angle) < 2:
+        return [slice(None)]
+    steps, seconds = np.diff(angle), np.diff(time) / np.timedelta64(1, "s")
     signs = np.sign(np.where(np.abs(steps) > 0.2 * np.median(np.abs(steps)), steps, 0.0))
-    pause = seconds > _PAUSE * np.median(seconds)
+    # times of a clock are late by up to its resolution
+    clock = _clock(seconds)
+    usual = (seconds.sum() / seconds.size) if clock else np.median(seconds)
+    pause = seconds - clock > _PAUSE * usual
     starts, way = [0], 0.0
     for k in np.flatnonzero(pause | (signs != 0)):
         if pause[k] or (way and signs[k] != way):
@@ -115,11 +138,37 @@ def _passes(elevation: np.ndarray, time: np.ndarray) -> list[slice]:
             way = 0.0
         else:
             way = signs[k]
-    ends = [*starts[1:], len(elevation)]
+    ends = [*starts[1:], len(angle)]
     # an angle that jitters by more than its steps turns all the time
-    if len(elevation) < _LEAST_LINES * len(starts):
+    if len(angle) < _LEAST_LINES * len(starts):
         return [slice(None)]
     return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
+
+
+def _clock(steps: np.ndarray) -> float:
+    """Resolution of times in which several lines are equal, s; 0: none are.
+
+    Lines that are there twice are not: a clock repeats a fifth of all times or more.
+    """
+    positive = steps[steps > 0]
+    if not positive.size or np.mean(steps == 0) < 0.2:
+        return 0.0
+    return float(positive.min())
+
+
+def _regular(seconds: np.ndarray, clock: float) -> np.ndarray:
+    """Times of lines from those of a clock that cuts them off, s: evenly spaced lines.
+
+    Where no even spacing is within the clock's resolution, lines are evenly spread over each time.
+    """
+    number = np.arange(len(seconds))
+    slope, start = np.polyfit(number, seconds, 1)
+    even = start + slope * number
+    if np.abs(even - seconds).max() <= clock:
+        return np.asarray(even + clock / 2)
+    _, first, counts = np.unique(seconds, return_index=True, return_counts=True)
+    within = (number - np.repeat(first, counts) + 0.5) / np.repeat(counts, counts)
+    return np.asarray(seconds + clock * within)
 
 
 def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: float) -> PlaneScan:
@@ -153,6 +202,10 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
     velocity = np.where(np.isfinite(variance), velocity, np.nan)
     time = lines["time"].values
     seconds = (time - time.min()) / np.timedelta64(1, "s")
+    clock = _clock(np.diff(seconds))
+    if clock:
+        seconds = _regular(seconds, clock)
+    words = str(lines.attrs.get("scan_type", "")).lower()
     return PlaneScan(
         time.min(),
         seconds[order],
@@ -161,6 +214,8 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
         velocity,
         variance,
         float(np.median(np.diff(angle[order]))),
+        not any(one in words for one in STANDING),
+        clock,
         float(np.rad2deg(along) % 360),
         number,
         stated,

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -21,7 +22,7 @@ from lidar_mi.retrieval.line_vortices.fit import Air, Assumptions, Fit, fitted, 
 from lidar_mi.retrieval.line_vortices.scan_plane import PlaneScan, plane_scans
 from lidar_mi.retrieval.line_vortices.track import tracked
 from lidar_mi.retrieval.line_vortices.turbulence import LENGTHS
-from lidar_mi.retrieval.line_vortices.window import Window, window_of
+from lidar_mi.retrieval.line_vortices.window import CELL, Window, window_of
 
 Kind = Literal["pair", "single"]
 
@@ -200,6 +201,14 @@ def _scan(
     length = min(LENGTHS, key=lambda one: abs(math.log(one / seen.air.length)))
     starts = [one.vortices for one in seen.candidates]
     fit, others = fitted(window, starts, Air(seen.air.sigma, length), given)
+    if scan.sweeps and scan.step * window.lines.ranges.mean() > CELL:
+        # lines so far apart that it matters whether the beam moves while it measures
+        standing = replace(scan, sweeps=False)
+        still = _window(standing, lidar, np.concatenate([one.vortices for one in seen.candidates]))
+        if still is not None:
+            other, more = fitted(still, [fit.state.vortices, *starts], fit.air, given)
+            if other.log_likelihood > fit.log_likelihood:
+                scan, window, fit, others = standing, still, other, more
     if scan.stated != "gates":
         left = residuals(window, fit, given)
         window = window.with_noise_of(left, limited=scan.stated == "least")

@@ -112,7 +112,7 @@ def window_of(
     step = float(np.median(np.diff(scan.ranges)))
     thin = max(1, int(np.floor(0.5 * lidar.gate_length / step + 0.01)))
     gates = gates[gates.size % thin // 2 :: thin]
-    fine = max(scan.span, 1e-9) * (ranges[0] + ranges[1]) / 2
+    fine = max(scan.step, 1e-9) * (ranges[0] + ranges[1]) / 2
     many = max(1, round(cell / fine), int(np.ceil(lines.size * gates.size / MOST_CELLS)))
     starts = np.arange(0, lines.size - many // 2, many)
     part = np.ix_(lines, gates)
@@ -133,7 +133,9 @@ def window_of(
     turn = np.gradient(angle)
     rate = np.gradient(time) / np.where(np.abs(turn) > 1e-9, turn, np.inf)
     return Window(
-        lines_of(time, angle, counts * scan.span, rate, scan.ranges[gates], lidar),
+        lines_of(
+            time, angle, (counts - 1) * scan.step + scan.span, rate, scan.ranges[gates], lidar
+        ),
         line,
         gate,
         mean[line, gate],

@@ -44,6 +44,8 @@ class WindFlag(enum.IntFlag):
     """No residual and no stated noise tells the error."""
     UNCERTAIN = 16
     """The standard error of the horizontal wind is above `MAX_STDERR`."""
+    FOLDED = 32
+    """Velocities fold, and another wind would give the same ones."""
 
 
 @dataclass(eq=False)

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.lines_of_sight.folding import ambiguous, unfolded
 from lidar_mi.retrieval.lines_of_sight.outliers import (
     LIMIT,
     refitted,
@@ -46,14 +47,17 @@ def fit_winds_to_lines(
     r"""Profiles of the wind from lines of sight: one for each scan, or for each interval.
 
     At each height the wind is the average along the path of the lines' gates through the air.
-    Outlying lines are masked. Standard errors contain noise and turbulence: lines of one scan see
-    different air.
+    Outlying lines are masked, folded velocities are unfolded. Standard errors contain noise and
+    turbulence, as lines of one scan see different air; that of w also contains a tilt that was
+    not applied. A divergence D of the horizontal wind is not in it: it shifts w by
+    r cos^2(el) D / (2 sin el).
 
     Parameters
     ----------
     lines : xr.Dataset
         As of `read_lines_of_sight`; gates with a flag are not used. A variable
-        ``radial_velocity_stderr`` (m s-1), if there is one, states the noise of every gate.
+        ``radial_velocity_stderr`` (m s-1), if there is one, states the noise of every gate; the
+        attribute ``nyquist_velocity`` (m s-1) the velocities beyond which they fold.
     interval : float, optional
         Duration over which each profile is averaged, s. Default: a profile for every scan.
     height_step : float, optional
@@ -98,20 +102,39 @@ def fit_winds_to_lines(
     usable = (lines["flag"].values == 0) & np.isfinite(lines["radial_velocity"].values)
     stated = _stated(lines, noise)
     step = _height_step(lines, height_step)
-    profiles = []
+    profiles: list[Profile] = []
+    remarks: list[str] = []
+    tilt = _tilt(lines)
     for index in _scans(lines, interval):
         one = lines.isel(time=index)
         cells = _cells(one, usable[index], step)
         if cells is not None:
             # small matrices
             with threadpool_limits(1, "blas"):
-                profiles.append(_profile(one, cells, stated[index], lengths))
+                profiles.append(_profile(one, cells, stated[index], lengths, remarks))
     if not profiles:
         raise InputError(
             "lines: no scan has three valid lines that are not in one plane; expected a VAD, "
             f"DBS or PPI (this is {lines.attrs.get('scan', 'unknown')})"
         )
-    return profile_dataset(profiles, lines.attrs)
+    if tilt > 0:
+        for profile in profiles:
+            # its direction is not known
+            profile.covariance[:, 2, 2] += tilt**2 * (profile.wind[:, :2] ** 2).sum(1)
+        remarks.append(
+            f"pitch and roll of up to {np.rad2deg(tilt):.2f} degrees are not applied: the error of "
+            "w contains them"
+        )
+    said = [one for one in (lines.attrs.get("remarks", ""), *dict.fromkeys(remarks)) if one]
+    return profile_dataset(profiles, {**lines.attrs, "remarks": "\n".join(said)})
+
+
+def _tilt(lines: xr.Dataset) -> float:
+    """Largest tilt that was not applied to the directions, rad."""
+    if "not applied" not in str(lines.attrs.get("tilt", "")):
+        return 0.0
+    pitch, roll = (np.deg2rad(np.nan_to_num(lines[name].values)) for name in ("pitch", "roll"))
+    return float(np.hypot(pitch, roll).max())
 
 
 def _check(
@@ -211,9 +234,13 @@ def _cells(scan: xr.Dataset, usable: np.ndarray, step: float | None) -> _Cells |
 
 
 def _profile(
-    scan: xr.Dataset, cells: _Cells, stated: np.ndarray, lengths: Sequence[float]
+    scan: xr.Dataset,
+    cells: _Cells,
+    stated: np.ndarray,
+    lengths: Sequence[float],
+    remarks: list[str],
 ) -> Profile:
-    """The wind at all heights of a scan."""
+    """The wind at all heights of a scan; what is unusual is added to the remarks."""
     azimuth, elevation = np.deg2rad(scan["azimuth"].values), np.deg2rad(scan["elevation"].values)
     design = np.stack(
         [
@@ -223,7 +250,8 @@ def _profile(
         ],
         axis=-1,
     )
-    velocity = scan["radial_velocity"].values.astype(float)
+    # of all usable cells
+    velocity = scan["radial_velocity"].values.astype(float)[cells.line, cells.gate]
     seconds = (scan["time"].values - scan["time"].values[0]) / np.timedelta64(1, "s")
     count = cells.heights.size
     found = Profile(
@@ -236,7 +264,16 @@ def _profile(
         *(np.zeros(count, int) for _ in range(4)),
     )
     members = [np.flatnonzero(cells.level == k) for k in range(count)]
-    keep = _kept(members, design[cells.line], velocity[cells.line, cells.gate], cells.stride)
+    nyquist = _nyquist(scan)
+    folding = unfolded(members, design[cells.line], velocity, nyquist)
+    if folding is not None:
+        velocity = folding.velocity
+        count = int((folding.folds != 0).sum())
+        remarks.append(
+            f"velocities fold at {folding.interval / 2:.1f} m/s: {count} of {velocity.size} are "
+            "unfolded"
+        )
+    keep = _kept(members, design[cells.line], velocity, cells.stride)
     levels: dict[int, tuple[Level, float]] = {}
     for k, index in enumerate(members):
         used = index[keep[index]]
@@ -244,6 +281,7 @@ def _profile(
         if found.outliers[k] > index.size / 3:
             found.flag[k] |= WindFlag.OUTLIERS.value
         line, gate = cells.line[used], cells.gate[used]
+        ranges = scan["range"].values[gate]
         found.condition[k] = _condition(design[line])
         if not found.condition[k] < 1e6 or index.size < MIN_FRACTION * cells.all[k]:
             found.flag[k] |= WindFlag.TOO_FEW_LINES.value
@@ -251,19 +289,31 @@ def _profile(
         if found.condition[k] > MAX_CONDITION:
             found.flag[k] |= WindFlag.ILL_CONDITIONED.value
         here, noise = design[line], stated[line, gate]
-        speed = velocity[line, gate]
+        speed = velocity[used]
         uniform, *_ = np.linalg.lstsq(here, speed, rcond=None)
         if used.size > 3:
             left = speed - here @ uniform
             found.residual[k] = math.sqrt(float(left @ left) / (used.size - 3))
         moved = np.outer(seconds[line] - seconds.mean(), [uniform[0], uniform[1], 0.0])
-        places = here * scan["range"].values[gate][:, None] - moved
+        if ambiguous(here, uniform, nyquist):
+            found.flag[k] |= WindFlag.FOLDED.value
+        places = here * ranges[:, None] - moved
         levels[k] = _level(here, places, speed, noise)
         found.wind[k] = uniform
     _add_errors(found, levels, cells.stride, lengths)
+    if folding is not None and folding.variance > 0:
+        for k in levels:
+            used = members[k][keep[members[k]]]
+            found.covariance[k] += folding.wind_error(used, design[cells.line[used]])
     variance = found.covariance[:, 0, 0] + found.covariance[:, 1, 1]
     found.flag[variance > MAX_STDERR**2] |= WindFlag.UNCERTAIN.value
     return found
+
+
+def _nyquist(scan: xr.Dataset) -> float | None:
+    """Velocity beyond which those of a data set fold, m/s; None: unknown, or one for each file."""
+    stated = scan.attrs.get("nyquist_velocity")
+    return float(stated) if isinstance(stated, int | float) and stated > 0 else None
 
 
 def _kept(

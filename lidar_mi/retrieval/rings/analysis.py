@@ -18,7 +18,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.alignment import aligned, crests
 from lidar_mi.retrieval.rings.centre import ring_centre
-from lidar_mi.retrieval.rings.frames import checked, inside
+from lidar_mi.retrieval.rings.frames import checked, few_levels, inside
 from lidar_mi.retrieval.rings.pattern import (
     Pattern,
     Profile,
@@ -84,7 +84,7 @@ class Rings(Tabular):
         tan(tilt of the camera) over the focal length. 0, as the ellipticity, where the
         detected rings do not determine it.
     doubt : str
-        Why another spacing is possible; empty if the image excludes it.
+        Why another spacing is possible, or the lines may not be those of the light; empty: neither.
     r2, profile : arrays
         Common part of all sectors, mean over circles, for the image; without their backgrounds.
     """
@@ -257,7 +257,7 @@ def analyse_rings(
         uneven=fit.uneven,
         ellipticity=fit.geometry.ellipticity,
         tilt=fit.geometry.tilt,
-        doubt=doubt,
+        doubt="; ".join(one for one in (doubt, few_levels(values)) if one),
         r2=fit.sectors.r2,
         profile=fit.sectors.profile,
     )

@@ -1,5 +1,7 @@
 """Checks of images before their analysis: finite and not saturated."""
 
+import math
+
 import numpy as np
 import torch
 from scipy.ndimage import rank_filter
@@ -15,6 +17,7 @@ from lidar_mi.retrieval.threads import mapped
 PLATEAU = 1e-3
 EXCESS = 4.0
 MOST_SPOTS = 0.02  # of the pixels may be hot, dead or in bright patches
+MOST_LEVELS = 64  # of an image that may be quantised: above, a ring's slope has ten or more
 SPOT = 6.0  # standard deviations
 # Of the pixels those in every seventh run of so many are looked at first: whole lines of the cache,
 # and a prime, so that it follows no column.
@@ -91,6 +94,31 @@ def _check(image: torch.Tensor, name: str, saturation: float | None) -> None:
                 f"{name}: saturated, {count} pixels share the highest value "
                 f"{float(top):g}; expected an exposure within the camera's range"
             )
+
+
+def few_levels(image: np.ndarray) -> str:
+    """Why an image is quantised too coarsely to measure rings; empty: it is not.
+
+    Rounding to steps q is like uniform noise of variance q^2 / 12 where the noise before it has a
+    standard deviation of q / 2 or more: then all moments of the sum are those of independent
+    numbers to 1 % (Widrow & Kollar 2008, Quantization Noise, chapter 4). Below, crests are flat and
+    slopes are steps, which is structure. Counts of single photons have coarser steps, but the
+    variance of these: their mean times q.
+    """
+    values = np.unique(image)
+    if values.size > MOST_LEVELS:
+        return ""
+    step = float(np.diff(values).min()) if values.size > 1 else 0.0
+    # of neighbours along rows and columns, by second differences: slopes of rings cancel
+    square = [np.diff(image, 2, axis).clip(-1e6 * step, 1e6 * step) ** 2 / 6 for axis in (0, 1)]
+    noise = float(np.mean([one.mean() for one in square]))
+    counted = step * float((image - values[0]).mean())
+    if noise >= min((step / 2) ** 2, 0.5 * counted):
+        return ""
+    return (
+        f"{values.size} grey levels, {step:g} apart, with noise of {math.sqrt(noise) / step:.2f} "
+        "steps: flat crests are taken for lines"
+    )
 
 
 def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tensor:

@@ -13,6 +13,7 @@ from PIL import Image
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.analysis import analyse_rings
+from lidar_mi.retrieval.rings.frames import few_levels
 from tests.support import ring_reference as reference
 
 LABORATORY = Path(__file__).parents[4] / "shared" / "data" / "fringes"
@@ -170,3 +171,21 @@ def test_arguments():
         analyse_rings(np.zeros((2, 30, 30)))
     with pytest.raises(InputError, match=r"centre: .900.0, 3.0. px"):
         analyse_rings(split_rings((300, 400), (190.0, 160.0), 8000.0, (0.5,)), (900.0, 3.0))
+
+
+def test_few_grey_levels_are_doubted():
+    """Thresholded and posterised pictures, whose flat crests look like split lines; not counts."""
+    y, x = np.mgrid[:240, :320].astype(float)
+    order = ((x - 163.3) ** 2 + (y - 118.6) ** 2) / 6500
+    light = 1 / (1 + 60 * np.sin(np.pi * (order - 0.37)) ** 2)
+    for seed in range(2):
+        frame = np.random.default_rng(seed).poisson(400 * light + 20).astype(float)
+        for coarse in (frame > 150, np.round(frame / 120)):
+            assert "grey levels" in analyse_rings(coarse.astype(float)).doubt
+        for fine in (frame, np.round(frame / 20)):
+            found = analyse_rings(fine)
+            assert found.doubt == ""
+            off = (found.fraction[0] - 0.37) / found.fraction_std[0]
+            assert len(found.fraction) == 1 and abs(off) < 4
+        # single photons have few levels, and the variance of counts
+        assert few_levels(np.random.default_rng(seed).poisson(2 * light + 0.1)) == ""

@@ -1,0 +1,151 @@
+"""Radial velocities that fold: known up to a multiple of twice the Nyquist velocity."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+_FASTEST = 80.0  # m/s: of the winds that are searched
+_LINES = 8  # of a level that tells folding from outliers
+_ROUNDS = 8
+_FALSE = 1e-6  # probability that outliers cluster at the multiples
+_WIND = 15.0  # m/s: spread of a component of the wind before the scan
+
+
+@dataclass(frozen=True, eq=False)
+class Unfolded:
+    """A scan without folds.
+
+    Attributes
+    ----------
+    velocity : (n,) array
+        m/s.
+    interval, variance : float
+        Twice the Nyquist velocity, m/s, and the variance of its error; 0 where it is stated.
+    folds : (n,) array
+        How many intervals were added.
+    """
+
+    velocity: np.ndarray
+    interval: float
+    variance: float
+    folds: np.ndarray
+
+    def wind_error(self, index: np.ndarray, design: np.ndarray) -> np.ndarray:
+        """Covariance (3, 3) of the wind of some cells by the error of the interval."""
+        shift, *_ = np.linalg.lstsq(design, self.folds[index], rcond=None)
+        return self.variance * np.outer(shift, shift)
+
+
+def unfolded(
+    members: Sequence[np.ndarray], design: np.ndarray, velocity: np.ndarray, nyquist: float | None
+) -> Unfolded | None:
+    """Velocities of a scan without folds; None: nothing shows that they fold.
+
+    Each level has the wind of the largest mean of cos(2 pi (v - d.m) / interval), the likelihood of
+    folded velocities (von Mises), refined by least squares; of an unknown Nyquist velocity together
+    with the interval, which begins as the range of all velocities. They fold if residuals of the
+    cells beyond half an interval cluster at its multiples: among m uniform ones the count within 5
+    standard deviations s is binomial with p = 10 s / interval; false alarms 1e-6 a scan.
+
+    Parameters
+    ----------
+    members : sequence of (k,) arrays of int
+        Cells of each level.
+    design : (n, 3) array
+        Unit vectors.
+    velocity : (n,) array
+        m/s.
+    nyquist : float, optional
+        m/s.
+    """
+    interval = 2 * nyquist if nyquist else float(np.ptp(velocity)) if velocity.size else 0.0
+    if not interval > 0:
+        return None
+    levels = [index for index in members if _directions(design[index]) >= _LINES]
+    levels = [index for index in levels if _suspicious(design[index], velocity[index], interval)]
+    if not levels:
+        return None
+    folds = np.zeros(len(velocity))
+    for index in levels:
+        wind = _likeliest(design[index], velocity[index], interval)
+        folds[index] = np.round((design[index] @ wind - velocity[index]) / interval)
+    left, size, variance = np.zeros(len(velocity)), interval / 40, 0.0
+    every = np.concatenate(levels)
+    for _ in range(_ROUNDS):
+        if nyquist is None:
+            near = np.abs(left) < 5 * size
+            pairs = [_beside(design[i], velocity[i], folds[i], near[i]) for i in levels]
+            speed, number = (np.concatenate(one) for one in zip(*pairs, strict=True))
+            square = float(number @ number)
+            if not square > 0:
+                return None
+            interval = float(-(number @ speed) / square)
+            rest = speed + interval * number
+            variance = float(rest @ rest) / max(rest.size - 3 * len(levels) - 1, 1) / square
+            if not interval > 0:
+                return None
+        for index in levels:
+            d, v = design[index], velocity[index]
+            near = np.abs(left[index]) < 5 * size
+            wind, *_ = np.linalg.lstsq(d[near], (v + folds[index] * interval)[near], rcond=None)
+            folds[index] = np.round((d @ wind - v) / interval)
+            left[index] = v + folds[index] * interval - d @ wind
+        size = max(1.4826 * float(np.median(np.abs(left[every]))), 1e-3 * interval)
+    far = every[folds[every] != 0]
+    chance = 10 * size / interval
+    count = int((np.abs(left[far]) < 5 * size).sum())
+    if not (chance < 0.5 and scipy.stats.binom.sf(count - 1, far.size, chance) < _FALSE):
+        return None
+    return Unfolded(velocity + folds * interval, interval, variance, folds)
+
+
+def _directions(design: np.ndarray) -> int:
+    return len(np.unique(np.round(design, 2), axis=0))
+
+
+def _suspicious(design: np.ndarray, velocity: np.ndarray, interval: float) -> bool:
+    """Whether a wind leaves residuals as large as folds do."""
+    wind, *_ = np.linalg.lstsq(design, velocity, rcond=None)
+    return bool(np.abs(velocity - design @ wind).max() > interval / 8)
+
+
+def _likeliest(design: np.ndarray, velocity: np.ndarray, interval: float) -> np.ndarray:
+    """Of horizontal winds on a grid an eighth of the interval apart along the lines."""
+    slant = float(np.hypot(design[:, 0], design[:, 1]).max())
+    step = interval / (8 * max(slant, 1e-3))
+    side = step * np.arange(-np.ceil(_FASTEST / step), np.ceil(_FASTEST / step) + 1)
+    winds = np.stack([*map(np.ravel, np.meshgrid(side, side)), np.zeros(side.size**2)])
+    winds = winds[:, np.hypot(winds[0], winds[1]) <= _FASTEST + step]
+    phase = 2 * np.pi / interval * (velocity[:, None] - design @ winds)
+    return winds[:, int(np.cos(phase).mean(0).argmax())]
+
+
+def _beside(
+    design: np.ndarray, velocity: np.ndarray, folds: np.ndarray, near: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities and folds less what a wind explains of them (Frisch and Waugh 1933)."""
+    both = np.column_stack([velocity, folds])[near]
+    basis, _ = np.linalg.qr(design[near])
+    rest = both - basis @ (basis.T @ both)
+    return rest[:, 0], rest[:, 1]
+
+
+def ambiguous(design: np.ndarray, wind: np.ndarray, nyquist: float | None) -> bool:
+    """Whether few lines measure the same velocities, folded, in another wind that is as likely.
+
+    Of winds that are normal with 15 m/s a component, the other has a tenth of the probability or
+    more.
+    """
+    if nyquist is None or _directions(design) >= _LINES:
+        return False
+    slant = np.hypot(design[:, 0], design[:, 1])
+    inclined = design[slant > 0.1 * slant.max()]
+    # opposite lines fold by opposite numbers: any line of the horizontal ones
+    alias = 2 * nyquist * inclined[:, :2] / (slant[slant > 0.1 * slant.max()] ** 2)[:, None]
+    others = np.concatenate([wind[:2] + alias, wind[:2] - alias])
+    same = (2 * nyquist) * np.round((others - wind[:2]) @ design[:, :2].T / (2 * nyquist))
+    exact = np.abs((others - wind[:2]) @ design[:, :2].T - same).max(1) < 0.05 * nyquist
+    more = (others**2).sum(1) - (wind[:2] ** 2).sum()
+    return bool((exact & (more < 2 * _WIND**2 * np.log(10))).any())
