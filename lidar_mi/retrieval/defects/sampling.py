@@ -99,17 +99,21 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
       two values are equal. Differences of a log-concave distribution, in steps of the values'
       resolution, have p_0 <= p_1^2 / p_2 (Keilson & Gerber 1971, J. Am. Stat. Assoc. 66, 386), so
       that p follows from the differences that are not zero, in tiles of 24 px.
-    - *No picture*: constant areas of an image that end in a step, of more than 1.5 times what a
-      tenth of the differences of neighbours exceed. Neither noise nor a lens or beam makes one.
+    - *No picture*: constant areas of an image that end in a step, of more than one level and 1.5
+      times what a tenth of the differences of neighbours exceed. Neither noise nor a lens or beam
+      makes one.
     - *Repeated*: lines that are equal to the next one to the bit; or tiles in which more neighbours
-      are equal than p allows (gates on a grid by nearest neighbours).
+      are equal than p allows (gates on a grid by nearest neighbours). Smooth air in whole numbers
+      has equal neighbours where it changes by less than one level per pixel: next to them are
+      differences of one level. Where those are the majority, neighbours and single lines that are
+      equal do not count.
     - *Periodic*: statistics of lines (`_statistics`) have a period of up to 32 px with the same
       phase in all images: interpolated (Gallagher 2005, Proc. Canadian Conf. Computer and Robot
       Vision, 65-72), interlaced, mosaics, blocks of a codec. Without one an ordinate of the
       periodogram over the mean of its neighbours has an F distribution (Fisher 1929, Proc. R. Soc.
       Lond. A 125, 54-59). Lines of one kind are used alone where the period is whole and at most 4.
 
-    Values at the ends of an image's range are left to the test of saturation.
+    Areas at an image's largest value are left to the test of saturation.
 
     Parameters
     ----------
@@ -118,13 +122,14 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
     """
     values = [image.detach().cpu().numpy() for image in images]
     names = "xzy"[-values[0].ndim :]
-    steps, first, middle = ([number] * len(names) for number in (1, 0, 0.0))
+    steps, first, middle = [1] * len(names), [0] * len(names), [0.0] * len(names)
     hidden = np.zeros((len(values), *values[0].shape), bool)
     spoilt, said = False, []
     for axis, name in enumerate(names):
-        repeats = np.stack([_repeats(v, axis) for v in values]).all(0)
+        repeats = np.logical_and.reduce([_repeats(v, axis) for v in values])
         if repeats.mean() <= _MANY:
-            lines = 1 + np.flatnonzero(repeats)
+            coarse = np.logical_or.reduce([_coarse(v, axis) for v in values])
+            lines = 1 + np.flatnonzero(repeats & ~coarse)
             hidden[(slice(None),) * (1 + axis) + (lines,)] = True
             said += [f"{len(lines)} lines repeat the one before along {name}"] * bool(len(lines))
             continue
@@ -178,7 +183,7 @@ def _hidden(values: Sequence[np.ndarray], false_alarm: float) -> tuple[np.ndarra
 
 def _ranks(values: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Values by their number among all; -1 at the ends of an image's range or if not finite."""
-    known = [np.isfinite(v) for v in values]
+    known = [np.asarray(np.isfinite(v)) for v in values]
     levels = np.unique(np.concatenate([v[k] for v, k in zip(values, known, strict=True)]))
     found = []
     for v, k in zip(values, known, strict=True):
@@ -238,25 +243,32 @@ def _without_picture(values: np.ndarray) -> np.ndarray:
     """Constant areas that end in a step, and their rim."""
     none = np.zeros(values.shape, bool)
     finite = np.isfinite(values)
-    core = ndimage.grey_opening((_constant(values) & finite).astype(np.uint8), _BLANK - 2) > 0
+    # areas at the largest value are saturated
+    inside = finite & (values < values[finite].max(initial=-np.inf))
+    core = ndimage.grey_opening((_constant(values) & inside).astype(np.uint8), _BLANK - 2) > 0
     if not core.any():
         return none
     cube = np.ones((3,) * values.ndim)
-    area = ndimage.binary_dilation(core, cube) & finite
-    known = np.where(finite & ~area, values, np.nan)
+    # pixels around a core have its value, so that areas of different values do not mix
+    label, number = ndimage.label(core)
+    label = np.where(finite, ndimage.grey_dilation(label, 3), 0)
+    known = np.where(label == 0, values, np.nan)
     differences = [np.abs(np.diff(known, axis=axis)).ravel() for axis in range(values.ndim)]
     typical = (
         np.nanquantile(np.concatenate(differences), 0.9) if np.isfinite(known).any() else np.inf
     )
-    label, number = ndimage.label(area)
     wide = ndimage.grey_dilation(label, 3)
     rim = (wide > 0) & (label == 0) & finite
-    level = ndimage.maximum(values, label, np.arange(1, number + 1))
-    off = np.abs(values - np.r_[0.0, level][wide])
+    own = np.r_[0.0, ndimage.maximum(values, label, np.arange(1, number + 1))][wide]
+    levels = np.unique(values[finite])
+    off = np.abs(values - own)
+    levels_off = np.abs(np.searchsorted(levels, values) - np.searchsorted(levels, own))
     index = np.unique(wide[rim])
-    step = np.zeros(number + 1)
-    step[index] = ndimage.median(off, np.where(rim, wide, 0), index) if len(index) else 0.0
-    found = (step > _STEP * typical)[label] & (label > 0)
+    step, steps = np.zeros((2, number + 1))
+    if len(index):
+        step[index] = ndimage.median(off, np.where(rim, wide, 0), index)
+        steps[index] = ndimage.median(levels_off, np.where(rim, wide, 0), index)
+    found = ((step > _STEP * typical) & (steps > 1))[label] & (label > 0)
     for one in np.unique(values[found]):
         found |= ndimage.binary_propagation(found & (values == one), mask=values == one)
     return ndimage.binary_dilation(found, cube)
@@ -268,6 +280,19 @@ def _repeats(values: np.ndarray, axis: int) -> np.ndarray:
     known = np.isfinite(lines).all(1)
     same = (lines[1:] == lines[:-1]).all(1) & known[1:]
     return same & (np.ptp(np.where(np.isfinite(lines[1:]), lines[1:], 0.0), 1) > 0)
+
+
+def _coarse(values: np.ndarray, axis: int) -> np.ndarray:
+    """Which lines and the next one lie between others that differ by one level or less.
+
+    Smooth air in whole numbers repeats lines by chance.
+    """
+    levels = np.unique(values, return_inverse=True)[1].reshape(values.shape)
+    lines = np.moveaxis(levels, axis, 0).reshape(values.shape[axis], -1)
+    steps = np.abs(np.diff(lines, axis=0))
+    above = np.pad(steps, ((1, 1), (0, 0)))
+    beside = np.concatenate([above[:-2], above[2:]], 1)
+    return (beside > 1).sum(1) <= (beside == 1).sum(1)
 
 
 def _statistics(lines: np.ndarray) -> list[np.ndarray]:
@@ -336,8 +361,7 @@ def _period(images: Sequence[np.ndarray], axis: int, false_alarm: float) -> tupl
         peak = strong & (ratio == ndimage.maximum_filter1d(ratio, 2 * _LEAKED + 1))
         if peak.any():
             best = np.flatnonzero(peak)[0]
-            energy = number == 0
-            periods.append((1 / _refined(one, best, size), pair[0] if energy else None))
+            periods.append((1 / _refined(one, best, size), pair[0] if number == 0 else None))
     if not periods:
         return 0.0, 0
     period, energy = max(periods, key=lambda found: found[0])
@@ -381,5 +405,13 @@ def _gridded(rank: np.ndarray, known: np.ndarray) -> np.ndarray:
         equal = ndimage.uniform_filter((both & (steps == 0)).astype(float), size) / number
         chance = _chance(steps, both)
         scatter = np.sqrt(chance / (number * np.prod(size)))
-        found |= (equal > _GRIDDED) & (equal > 2 * chance + 5 * scatter) & (number > 0.25)
+        beside = both & (steps != 0)
+        pairs = both & (steps == 0)
+        beside &= np.roll(pairs, 1, axis) | np.roll(pairs, -1, axis)
+        more, single = (
+            ndimage.uniform_filter((beside & part).astype(float), size)
+            for part in (np.abs(steps) > 1, np.abs(steps) == 1)
+        )
+        excess = (equal > _GRIDDED) & (equal > 2 * chance + 5 * scatter) & (number > 0.25)
+        found |= excess & (more > 2 * single)
     return found

@@ -21,7 +21,8 @@ def outstanding(volume: torch.Tensor, false_alarm: float = FALSE_ALARM) -> torch
     Of normal differences with the local scale (1.48 median absolute values over 12^3 voxels, at
     least half of that of the volume) none does at the rate of false alarms; and air that a beam
     resolves rises by less than half of the range of its neighbours. Where more than 5 % stand out,
-    the air is of such voxels. A cluster is found up to 12 voxels among the 26.
+    the air is of such voxels. A cluster is found up to 12 voxels among the 26. Corners of constant
+    areas of 3^3 voxels, as saturated ones, do not stand out.
 
     Parameters
     ----------
@@ -49,23 +50,11 @@ def outstanding(volume: torch.Tensor, false_alarm: float = FALSE_ALARM) -> torch
         values, footprint=around
     )
     found = known & (np.abs(height) > limit * scale) & (np.abs(height) > _UNRESOLVED * size)
+    constant = (size == 0) & (height == 0)
+    found &= ~ndimage.binary_dilation(constant, np.ones((3, 3, 3)))
     if found.sum() > _MOST * known.sum():
         found[:] = False
     return torch.as_tensor(found, device=volume.device)
-
-
-def without(volume: torch.Tensor, strange: torch.Tensor) -> torch.Tensor:
-    """A volume with the mean of those around in place of voxels, by a Gaussian of one voxel."""
-    if not bool(strange.any()):
-        return volume
-    values, masked = volume.detach().cpu().double().numpy(), strange.cpu().numpy()
-    use = np.isfinite(values) & ~masked
-    mean, weight = (
-        ndimage.gaussian_filter(part, 1.0, mode="nearest")
-        for part in (np.where(use, values, 0.0), use.astype(float))
-    )
-    whole = np.where(masked, mean / np.maximum(weight, 1e-9), values)
-    return torch.as_tensor(whole, device=volume.device)
 
 
 def _medians(values: np.ndarray) -> np.ndarray:

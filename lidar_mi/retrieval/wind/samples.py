@@ -48,7 +48,7 @@ def at_windows(
     It is interpolated linearly between vectors that are a sample or a stride apart. A vector has
     the flags of the nearest one.
     """
-    axes: Sequence[str] = [name for name in found["v"].dims if name in coords]
+    axes: Sequence[str] = [str(name) for name in found["v"].dims if name in coords]
     at = {name: xr.DataArray(np.asarray(coords[name][1]), dims=name) for name in axes}
     near = found["flag"].interp(at, method="nearest", kwargs={"fill_value": "extrapolate"})
     wind = found.drop_vars("flag").interp(at)

@@ -136,9 +136,17 @@ def retrieve_wind_volume(
         one, two, *others = (samples_of(volume, structure) for volume in stack)
         noise = samples_of(level, structure) if isinstance(level, xr.DataArray) else level
         sizes = sizes_of_samples(windows, structure)
-        options = {"validation": validation, "settings": settings, "device": device}
         wind = retrieve_wind_volume(
-            one, two, dt, method, windows=sizes, noise=noise, more=others, **options
+            one,
+            two,
+            dt,
+            method,
+            windows=sizes,
+            validation=validation,
+            noise=noise,
+            more=others,
+            settings=settings,
+            device=device,
         )
         return at_windows(wind, centres(stack[0], frame, "window"), structure, windows)
     seen = structure.masked(raw)

@@ -175,3 +175,16 @@ def test_smoke_in_empty_air_is_a_picture():
         images.append(np.round(200 * np.exp(-((r / 15) ** 4)) * air(1, 1, time)))
     assert np.mean(images[0] == 0) > 0.3
     assert not found(images).hidden.any()
+
+
+@pytest.mark.parametrize("levels", [20, 60, 255])
+@pytest.mark.parametrize("width", [8.0, 24.0])
+def test_smooth_smoke_in_few_levels_is_a_picture(levels, width):
+    """Without noise: neighbours, lines and areas are equal where it changes by less than a level."""
+    z, y = np.indices(SHAPE)
+    images = []
+    for time in (0.0, 1.0):
+        r = np.hypot(z - 40 - MOTION[0] * time, y - 60 - MOTION[1] * time)
+        images.append(np.round(levels * (0.2 + 0.8 * np.exp(-0.5 * (r / width) ** 2))))
+    assert np.mean(np.diff(images[0]) == 0) > 0.1
+    assert not found(images).hidden.any()
