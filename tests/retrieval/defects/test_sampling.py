@@ -180,7 +180,7 @@ def test_smoke_in_empty_air_is_a_picture():
 @pytest.mark.parametrize("levels", [20, 60, 255])
 @pytest.mark.parametrize("width", [8.0, 24.0])
 def test_smooth_smoke_in_few_levels_is_a_picture(levels, width):
-    """Without noise: neighbours, lines and areas are equal where it changes by less than a level."""
+    """Without noise: neighbours and lines are equal where it changes by less than a level."""
     z, y = np.indices(SHAPE)
     images = []
     for time in (0.0, 1.0):
