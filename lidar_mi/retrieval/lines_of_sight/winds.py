@@ -33,6 +33,7 @@ _MOST = 24  # numbers of a level: more lines are averaged with their neighbours
 _MOST_LINES = 120  # whose correlation is computed
 _ROUNDS = 5  # of the search for outliers
 _LEAST_SPREAD = 0.02  # m/s: rounding of the velocities
+_IN_ONE_PLANE = 1e6  # condition number of the directions, beyond the rounding of their angles
 
 
 @checked_arguments
@@ -79,8 +80,8 @@ def fit_winds_to_lines(
     Raises
     ------
     InputError
-        A data set without lines of sight, numbers out of range, lines that look in one direction or
-        in one plane only.
+        A data set without lines of sight, numbers out of range, valid lines in one direction or in
+        one plane only at every height.
 
     Examples
     --------
@@ -112,10 +113,11 @@ def fit_winds_to_lines(
             # small matrices
             with threadpool_limits(1, "blas"):
                 profiles.append(_profile(one, cells, stated[index], lengths, remarks))
-    if not profiles:
+    if not any((one.condition < _IN_ONE_PLANE).any() for one in profiles):
         raise InputError(
-            "lines: no scan has three valid lines that are not in one plane; expected a VAD, "
-            f"DBS or PPI (this is {lines.attrs.get('scan', 'unknown')})"
+            "lines: no height has three valid lines that are not in one plane (scan: "
+            f"{lines.attrs.get('scan', 'unknown')}; {usable.sum()} of {usable.size} velocities are "
+            "valid); expected a VAD, DBS or PPI"
         )
     if tilt > 0:
         for profile in profiles:
@@ -283,7 +285,7 @@ def _profile(
         line, gate = cells.line[used], cells.gate[used]
         ranges = scan["range"].values[gate]
         found.condition[k] = _condition(design[line])
-        if not found.condition[k] < 1e6 or index.size < MIN_FRACTION * cells.all[k]:
+        if not found.condition[k] < _IN_ONE_PLANE or index.size < MIN_FRACTION * cells.all[k]:
             found.flag[k] |= WindFlag.TOO_FEW_LINES.value
             continue
         if found.condition[k] > MAX_CONDITION:
