@@ -136,9 +136,8 @@ def _words_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[s
     field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     members = get_args(field.annotation) if field else ()
     kind = members[0] if members else None
-    if not isinstance(kind, enum.EnumType):
-        return []
-    return [str(one) for one in kind.__members__.values()]
+    words: tuple[Any, ...] = tuple(kind) if isinstance(kind, enum.EnumType) else ()
+    return [str(one) for one in words]
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
