@@ -27,6 +27,7 @@ from lidar_mi.retrieval.lines_of_sight.profiles import (
     WindFlag,
     profile_dataset,
 )
+from lidar_mi.retrieval.lines_of_sight.tilt import unapplied_tilt
 
 _BLOCK = 5  # levels that share their turbulence
 _MOST = 24  # numbers of a level: more lines are averaged with their neighbours
@@ -105,7 +106,7 @@ def fit_winds_to_lines(
     step = _height_step(lines, height_step)
     profiles: list[Profile] = []
     remarks: list[str] = []
-    tilt = _tilt(lines)
+    tilt = unapplied_tilt(lines)
     for index in _scans(lines, interval):
         one = lines.isel(time=index)
         cells = _cells(one, usable[index], step)
@@ -129,14 +130,6 @@ def fit_winds_to_lines(
         )
     said = [one for one in (lines.attrs.get("remarks", ""), *dict.fromkeys(remarks)) if one]
     return profile_dataset(profiles, {**lines.attrs, "remarks": "\n".join(said)})
-
-
-def _tilt(lines: xr.Dataset) -> float:
-    """Largest tilt that was not applied to the directions, rad."""
-    if "not applied" not in str(lines.attrs.get("tilt", "")):
-        return 0.0
-    pitch, roll = (np.deg2rad(np.nan_to_num(lines[name].values)) for name in ("pitch", "roll"))
-    return float(np.hypot(pitch, roll).max())
 
 
 def _check(

@@ -64,6 +64,17 @@ def test_a_beam_that_stands_is_told_from_one_that_sweeps(tmp_path, sweep):
     assert np.sqrt(np.mean(np.square(off))) < 2
 
 
+@pytest.mark.parametrize("applied", [True, False])
+def test_a_tilt_that_is_not_applied_is_remarked(tmp_path, applied):
+    lines = rhi(tmp_path / "a.csv", 0, np.arange(3.0, 16), 0.4 * np.arange(13))
+    lines = lines.assign_attrs(tilt="applied" if applied else "not applied").assign_coords(
+        pitch=("time", np.full(13, 0.3)), roll=("time", np.full(13, 0.4))
+    )
+    remark = "pitch and roll of up to 0.50 degrees are not applied: 8.7 m of position per km"
+    found = lm.fit_vortices_to_lines(lines, kind="single", false_alarm=1e-9)
+    assert (remark in found.attrs["remarks"]) != applied
+
+
 def test_a_scan_whose_name_says_so_stands(tmp_path):
     lines = rhi(tmp_path / "a.csv", 0, np.arange(3.0, 16), 0.4 * np.arange(13))
     for name, span in (("Stepped - overlapping", 0.0), ("csm", np.deg2rad(1.0))):

@@ -83,6 +83,7 @@ FAMILIES = {
 }
 
 
+@pytest.mark.slow
 def test_stated_errors_hold_over_families_of_wind():
     """Of all families together 68 and 95 % are within 1 and 1.96 standard errors, to 5 points.
 
@@ -99,6 +100,7 @@ def test_stated_errors_hold_over_families_of_wind():
     assert one == pytest.approx(0.683, abs=0.05) and two == pytest.approx(0.95, abs=0.05)
 
 
+@pytest.mark.slow
 def test_stated_errors_hold_where_the_length_of_the_turbulence_is_known():
     z = normalised(PPI, lambda seed: made.turbulent(seed, 0.8, 400.0), 16, length_scale=400.0)
     assert (np.abs(z) < 1).mean() == pytest.approx(0.683, abs=0.1)
