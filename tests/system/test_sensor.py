@@ -7,6 +7,7 @@ do not look at the same air."""
 import json
 import math
 import shutil
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -20,7 +21,7 @@ from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.measure import measured
+from lidar_mi.experiment.measure import judged
 from lidar_mi.experiment.preflight import check
 from lidar_mi.experiment.run import prepare, run
 from lidar_mi.experiment.schema import reading as config
@@ -441,10 +442,12 @@ def test_points_are_counted_as_each_table_means_them():
     """Lines of sight for velocities along them; windows that do not overlap for vectors."""
     metrics = {"sensor.lines_retrieved": 15, "sensor.vectors": 1000}
     tables = read_requirements()
-    for application, points in (("disturbance", 15), ("flight_control", 62)):
-        found = measured(changed(), metrics, tables[application, "landing"])
-        assert found["points_per_slab"] == points  # (2 / 8)^2 of 1000
-        assert found["range"] == 150 and found["error_u"] is None
+    results = {"requirements": tables, "truth": SimpleNamespace(wind={"u"})}
+    for table, findings in judged(changed(), results, metrics):
+        found = {row.quantity: row.measured for row in findings}
+        # (2 / 8)^2 of 1000
+        assert found["points_per_slab"] == (15 if table.application == "disturbance" else 62)
+        assert found["range"] == 150 and np.isnan(found.get("error_u", np.nan))
 
 
 @pytest.mark.parametrize(
