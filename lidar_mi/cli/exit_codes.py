@@ -7,13 +7,17 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
 from lidar_mi.cli.terminal import errors
 from lidar_mi.errors import InputError, Stopped, causes, is_interrupt, notes, one_line
 
+if TYPE_CHECKING:
+    import xarray as xr
+
+NOTHING_FOUND = 1
 BAD_INPUT = 2
 BY_SIGNAL = 128
 """Plus the number of the signal."""
@@ -30,9 +34,9 @@ _USAGE_ERROR = typer.BadParameter.__mro__[1]
 def exit_by(app: Callable[..., int | None]) -> None:
     """Run a typer app; errors and signals are reported in one line.
 
-    Exit code 2: bad input, a disk or a file that fails, too little memory, equations that have no
-    solution. Exit code 128 + n: signal n (Ctrl-C, SIGTERM, SIGHUP). Characters that the terminal
-    has not are printed as escapes.
+    Exit code 1: `end_without_result`. Exit code 2: bad input, a disk or a file that fails, too
+    little memory, equations that have no solution. Exit code 128 + n: signal n (Ctrl-C, SIGTERM,
+    SIGHUP). Characters that the terminal has not are printed as escapes.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -52,6 +56,23 @@ def exit_by(app: Callable[..., int | None]) -> None:
             raise
         _fail("; ".join([message, *notes(error)]), BAD_INPUT)
     sys.exit(code or 0)
+
+
+def end_without_result(reason: str, found: "xr.DataArray") -> NoReturn:
+    """End a command whose result has no valid value, with the reasons that its flags give.
+
+    Parameters
+    ----------
+    reason : str
+    found : xr.DataArray
+        Flags with the CF attributes ``flag_masks`` and ``flag_meanings``; none is 0.
+    """
+    masks, names = found.attrs["flag_masks"], found.attrs["flag_meanings"].split()
+    counts = (
+        (name, int((found & int(mask) != 0).sum())) for name, mask in zip(names, masks, strict=True)
+    )
+    said = ", ".join(f"{name} {count}" for name, count in counts if count)
+    _fail(f"{reason} (flags: {said})", NOTHING_FOUND)
 
 
 def _message(error: BaseException) -> str | None:

@@ -164,7 +164,11 @@ Electrons = Annotated[
     ),
 ]
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace a file even if it is no result of lidar-mi.")
+    bool,
+    typer.Option(
+        "--overwrite",
+        help="Replace a file that does not say that lidar-mi wrote it, as tables do not.",
+    ),
 ]
 
 MinCnr = Annotated[

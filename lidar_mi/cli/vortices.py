@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lidar_mi.cli.exit_codes import end_without_result
 from lidar_mi.cli.options import LineNames, MinCnr, Overwrite, names_of, quantity
 from lidar_mi.cli.terminal import output, print_remarks, print_table
 
@@ -85,7 +86,12 @@ def vortices(
     name: LineNames = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Find the vortices of a wake in vertical slices of a Doppler lidar, with their errors."""
+    """Find the vortices of a wake in vertical slices of a Doppler lidar, with their errors.
+
+    Exit code 1: no scan has valid vortices; the file says why.
+    """
+    import numpy as np
+
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.line_vortices import draw_line_vortices
     from lidar_mi.io.csv_file import write_csv
@@ -116,7 +122,8 @@ def vortices(
             notice=notice,
         )
     print_remarks(found.attrs["remarks"])
-    _show(found)
+    if np.isfinite(found["y"]).any():
+        _show(found)
     if out.suffix.lower() == ".nc":
         write_netcdf(found.assign_attrs(software=f"lidar-mi {__version__}"), out)
     else:
@@ -124,6 +131,10 @@ def vortices(
     output.print(f"vortices {out}")
     write_png(draw_line_vortices(lines, found, files[0].name), figure)
     output.print(f"figure   {figure}")
+    if not (found["flag"] == 0).any():
+        end_without_result(
+            f"no valid vortices, number of scans {found.sizes['scan']}", found["flag"]
+        )
 
 
 def _show(found: "xr.Dataset") -> None:

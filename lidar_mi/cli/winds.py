@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lidar_mi.cli.exit_codes import end_without_result
 from lidar_mi.cli.options import LineNames, MinCnr, Overwrite, names_of, quantity
 from lidar_mi.cli.terminal import output, print_remarks, print_table
 
@@ -57,7 +58,10 @@ def winds(
     name: LineNames = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Retrieve profiles of the wind from scans of a Doppler lidar, with their errors."""
+    """Retrieve profiles of the wind from scans of a Doppler lidar, with their errors.
+
+    Exit code 1: no wind is valid; the file says why.
+    """
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.wind_profile import draw_wind_profiles
     from lidar_mi.io.csv_file import write_csv
@@ -85,15 +89,18 @@ def winds(
         noise=quantity("--noise", noise, "m/s", "0.1 m/s"),
         length_scale=quantity("--length-scale", length_scale, "m", "200 m"),
     )
-    _show(found)
+    valid = int((found["flag"] == 0).sum())
+    if valid:
+        _show(found)
     if out.suffix.lower() == ".nc":
         write_netcdf(found.assign_attrs(software=f"lidar-mi {__version__}"), out)
     else:
         write_csv(out, found)
     output.print(f"winds    {out}")
-    if (found["flag"] == 0).any():
-        write_png(draw_wind_profiles(found, files[0].name), figure)
-        output.print(f"figure   {figure}")
+    if not valid:
+        end_without_result(f"no valid wind of {found['flag'].size}", found["flag"])
+    write_png(draw_wind_profiles(found, files[0].name), figure)
+    output.print(f"figure   {figure}")
 
 
 def _show(found: "xr.Dataset") -> None:

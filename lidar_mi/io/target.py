@@ -29,7 +29,7 @@ def check_target(
     inputs : iterable of path
         Input files, which are never replaced, under any name.
     overwrite : bool
-        Replace a file that is no result of lidar-mi.
+        Replace a file that does not say that lidar-mi wrote it, as tables (.csv) do not.
     suffixes : sequence of str
         Of the formats that the command writes; none: whatever the name, the format is one.
 
@@ -51,8 +51,8 @@ def check_target(
         raise InputError(f"{path}: is an input; expected another file (-o FILE)")
     if not overwrite and not software(path).startswith(_OURS):
         raise InputError(
-            f"{path}: is no result of lidar-mi; expected another file (-o FILE), or --overwrite to "
-            "replace it"
+            f"{path}: exists, and does not say that lidar-mi wrote it (tables do not); expected "
+            "--overwrite to replace it, or another file (-o FILE)"
         )
     _check_suffix(path, suffixes)
 

@@ -54,7 +54,7 @@ def test_no_ordinary_file_is_never_a_target(tmp_path):
 def test_foreign_files_are_replaced_only_on_request(tmp_path, content):
     path = tmp_path / "theirs"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"is no result of lidar-mi; .*--overwrite"):
+    with pytest.raises(InputError, match=r"does not say that lidar-mi wrote it .*--overwrite"):
         check_target(path)
     check_target(path, overwrite=True)
     assert path.read_bytes() == content
@@ -71,5 +71,5 @@ def test_our_images_are_recognised(tmp_path):
     write_png(Figure(), tmp_path / "ours.png")
     check_target(tmp_path / "ours.png")
     Figure().savefig(tmp_path / "theirs.png")
-    with pytest.raises(InputError, match="no result"):
+    with pytest.raises(InputError, match="does not say"):
         check_target(tmp_path / "theirs.png")

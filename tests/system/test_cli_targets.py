@@ -30,6 +30,16 @@ def test_a_result_of_ours_is_replaced(images, lidar_mi):
     assert (images / "w.nc").stat().st_ino != before
 
 
+def test_a_table_of_ours_is_replaced_on_request(images, lidar_mi):
+    """A table has no place for the name of its program: the message says what to do."""
+    assert lidar_mi(*RETRIEVE, "-o", "two.csv")[0] == 0
+    code, _, err = lidar_mi(*RETRIEVE, "-o", "two.csv")
+    assert code == 2 and "(tables do not); expected --overwrite to replace it" in " ".join(
+        err.split()
+    )
+    assert lidar_mi(*RETRIEVE, "-o", "two.csv", "--overwrite")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("command", "target"),
     [
@@ -54,7 +64,10 @@ def test_an_input_is_never_replaced(images, lidar_mi, command, target):
 )
 @pytest.mark.parametrize(
     ("target", "says"),
-    [("notes.txt", "is no result of lidar-mi"), ("/dev/null", "is no ordinary file")],
+    [
+        ("notes.txt", "exists, and does not say that lidar-mi wrote it"),
+        ("/dev/null", "is no ordinary file"),
+    ],
 )
 def test_foreign_files_are_kept(images, lidar_mi, command, target, says):
     (images / "notes.txt").write_text("mine")

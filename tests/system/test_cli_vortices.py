@@ -71,3 +71,24 @@ def test_bad_input_is_one_line(folder, arguments, message):
     done = shell("vortices", *arguments, cwd=folder)
     assert done.returncode == 2 and message in words_of(done.stderr)
     assert done.stderr.count("\n") <= 2
+
+
+@pytest.mark.parametrize(
+    ("name", "elevation", "code", "message"),
+    [
+        ("stare", np.full(40, 90.0), 2, "scan 0 looks in one direction; expected an RHI"),
+        ("calm", 3 + 0.3 * np.arange(40), 1, "no valid vortices, number of scans 1 (flags: no_w"),
+    ],
+)
+def test_a_scan_without_vortices_says_why(tmp_path, name, elevation, code, message):
+    random, rows = np.random.default_rng(0), ["time,azimuth,elevation,range,radial_velocity"]
+    for k, degrees in enumerate(elevation):
+        rows += [
+            f"{0.1 * k:.1f},90,{degrees},{r},{0.1 * random.standard_normal():.3f}"
+            for r in range(405, 900, 30)
+        ]
+    (tmp_path / f"{name}.csv").write_text("\n".join(rows))
+    done = shell("vortices", f"{name}.csv", cwd=tmp_path)
+    assert done.returncode == code and message in words_of(done.stderr)
+    # a scan without a wake has its score and false-alarm probability in the file
+    assert (tmp_path / "vortices.nc").exists() == (name == "calm")

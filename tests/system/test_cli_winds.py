@@ -43,8 +43,10 @@ def test_no_figure_without_a_valid_wind(tmp_path):
     """Lines that are all vertical say nothing of the horizontal wind."""
     (tmp_path / "up.hpl").write_text(made.halo_text(made.lines(elevation=89.9)))
     done = shell("winds", "up.hpl", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert " 0 of " in words_of(done.stdout) and "figure" not in done.stdout
+    assert done.returncode == 1, done.stderr
+    reasons = "(flags: ill_conditioned 17, uncertain 17)"
+    assert words_of(done.stderr) == f"lidar-mi: no valid wind of 17 {reasons}"
+    assert "figure" not in done.stdout and "valid" not in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"up.hpl", "winds.nc"}
 
 
@@ -56,13 +58,21 @@ def test_no_figure_without_a_valid_wind(tmp_path):
         (("vad.hpl", "--noise", "fast"), "--noise: 'fast' is not allowed"),
         (("vad.hpl", "-o", "vad.hpl"), "vad.hpl: is an input"),
         (("vad.hpl", "-o", "winds.txt"), "winds.txt: .txt is not allowed; expected .nc or .csv"),
-        (("vad.hpl", "--min-cnr", "90"), "no scan has three valid lines"),
+        (
+            ("vad.hpl", "--min-cnr", "90"),
+            "three valid lines that are not in one plane (scan: ppi; 0",
+        ),
+        (
+            ("stare.hpl",),
+            "not in one plane (scan: stare; 102 of 120 velocities are valid); expected",
+        ),
     ],
 )
 def test_bad_input_is_one_line(scan, tmp_path, arguments, message):
+    (tmp_path / "stare.hpl").write_text(made.halo_text(made.lines(elevation=90.0)))
     done = shell("winds", *arguments, cwd=tmp_path)
     assert done.returncode == 2 and message in words_of(done.stderr)
-    assert done.stderr.count("\n") == 1
+    assert done.stderr.count("\n") == 1 and not (tmp_path / "winds.nc").exists()
 
 
 def test_many_profiles_are_drawn_as_maps():

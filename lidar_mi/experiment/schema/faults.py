@@ -1,6 +1,7 @@
 """Faults that pydantic finds in a description, in words of who wrote it."""
 
 import difflib
+import enum
 import re
 from collections.abc import Iterator
 from typing import Any, get_args, get_origin
@@ -70,7 +71,11 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     elif fault["type"] in ("tuple_type", "list_type"):
         count = _length_at(model, fault["loc"])
         example = ", ".join([str(value)] * count) if isinstance(value, str | int | float) else ""
-        expected = "a list in brackets" + (f": [{example}]" if example else "")
+        words = _words_at(model, fault["loc"])
+        if words and value not in words:
+            expected = f"a list in brackets of {', '.join(words)}"
+        else:
+            expected = "a list in brackets" + (f": [{example}]" if example else "")
     elif fault["type"] == "too_short":
         expected = f"{fault['ctx']['min_length']} or more"
     else:
@@ -124,6 +129,15 @@ def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:
         if get_origin(one) is tuple and Ellipsis not in get_args(one):
             return len(get_args(one))
     return 1
+
+
+def _words_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """The words that members of the list at a location may be; empty: others than words."""
+    field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
+    members = get_args(field.annotation) if field else ()
+    kind = members[0] if members else None
+    words: tuple[Any, ...] = tuple(kind) if isinstance(kind, enum.EnumType) else ()
+    return [str(one) for one in words]
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

@@ -28,6 +28,7 @@ RESERVED_NAMES = (
 """Names of files in the folder of a study or a run, which no variant may have."""
 
 _LONGEST_NAME = 255
+_PICTURES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".fits", ".pgm")
 _OF_A_CAMPAIGN = ("sweep", "sample", "members")
 
 
@@ -176,6 +177,11 @@ def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
         raise InputError(
             f"{path}: a wake, not an experiment; expected a YAML file that says wake: "
             f"{{file: {path}}}"
+        )
+    if path.suffix.lower() in _PICTURES:
+        raise InputError(
+            f"{path}: a picture, not an experiment; expected lidar-mi info {path}, or lidar-mi "
+            "retrieve with two images of the same air"
         )
     data = read_yaml(path, "an experiment file")
     if not isinstance(data, dict):

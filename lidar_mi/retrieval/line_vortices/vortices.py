@@ -23,6 +23,7 @@ from lidar_mi.retrieval.line_vortices.scan_plane import PlaneScan, plane_scans
 from lidar_mi.retrieval.line_vortices.track import tracked
 from lidar_mi.retrieval.line_vortices.turbulence import LENGTHS
 from lidar_mi.retrieval.line_vortices.window import CELL, Window, window_of
+from lidar_mi.retrieval.lines_of_sight.tilt import unapplied_tilt
 
 Kind = Literal["pair", "single"]
 
@@ -149,6 +150,12 @@ def fit_vortices_to_lines(
         lidar = lidar_of(one, pulse_length, gate_length)
         scans, more = plane_scans(at_the_echo(one, lidar), noise)
         remarks += more
+        tilt = unapplied_tilt(one)
+        if tilt > 0:
+            remarks.append(
+                f"pitch and roll of up to {np.rad2deg(tilt):.2f} degrees are not applied: "
+                f"{1000 * tilt:.1f} m of position per km of range, not in the errors"
+            )
         for k, scan in enumerate(scans):
             if notice is not None:
                 notice("fitting vortices", (number + k / len(scans)) / len(sets))

@@ -27,12 +27,14 @@ from lidar_mi.retrieval.lines_of_sight.profiles import (
     WindFlag,
     profile_dataset,
 )
+from lidar_mi.retrieval.lines_of_sight.tilt import unapplied_tilt
 
 _BLOCK = 5  # levels that share their turbulence
 _MOST = 24  # numbers of a level: more lines are averaged with their neighbours
 _MOST_LINES = 120  # whose correlation is computed
 _ROUNDS = 5  # of the search for outliers
 _LEAST_SPREAD = 0.02  # m/s: rounding of the velocities
+_IN_ONE_PLANE = 1e6  # condition number of the directions, beyond the rounding of their angles
 
 
 @checked_arguments
@@ -79,8 +81,8 @@ def fit_winds_to_lines(
     Raises
     ------
     InputError
-        A data set without lines of sight, numbers out of range, lines that look in one direction or
-        in one plane only.
+        A data set without lines of sight, numbers out of range, valid lines in one direction or in
+        one plane only at every height.
 
     Examples
     --------
@@ -104,7 +106,7 @@ def fit_winds_to_lines(
     step = _height_step(lines, height_step)
     profiles: list[Profile] = []
     remarks: list[str] = []
-    tilt = _tilt(lines)
+    tilt = unapplied_tilt(lines)
     for index in _scans(lines, interval):
         one = lines.isel(time=index)
         cells = _cells(one, usable[index], step)
@@ -112,10 +114,11 @@ def fit_winds_to_lines(
             # small matrices
             with threadpool_limits(1, "blas"):
                 profiles.append(_profile(one, cells, stated[index], lengths, remarks))
-    if not profiles:
+    if not any((one.condition < _IN_ONE_PLANE).any() for one in profiles):
         raise InputError(
-            "lines: no scan has three valid lines that are not in one plane; expected a VAD, "
-            f"DBS or PPI (this is {lines.attrs.get('scan', 'unknown')})"
+            "lines: no height has three valid lines that are not in one plane (scan: "
+            f"{lines.attrs.get('scan', 'unknown')}; {usable.sum()} of {usable.size} velocities are "
+            "valid); expected a VAD, DBS or PPI"
         )
     if tilt > 0:
         for profile in profiles:
@@ -127,14 +130,6 @@ def fit_winds_to_lines(
         )
     said = [one for one in (lines.attrs.get("remarks", ""), *dict.fromkeys(remarks)) if one]
     return profile_dataset(profiles, {**lines.attrs, "remarks": "\n".join(said)})
-
-
-def _tilt(lines: xr.Dataset) -> float:
-    """Largest tilt that was not applied to the directions, rad."""
-    if "not applied" not in str(lines.attrs.get("tilt", "")):
-        return 0.0
-    pitch, roll = (np.deg2rad(np.nan_to_num(lines[name].values)) for name in ("pitch", "roll"))
-    return float(np.hypot(pitch, roll).max())
 
 
 def _check(
@@ -283,7 +278,7 @@ def _profile(
         line, gate = cells.line[used], cells.gate[used]
         ranges = scan["range"].values[gate]
         found.condition[k] = _condition(design[line])
-        if not found.condition[k] < 1e6 or index.size < MIN_FRACTION * cells.all[k]:
+        if not found.condition[k] < _IN_ONE_PLANE or index.size < MIN_FRACTION * cells.all[k]:
             found.flag[k] |= WindFlag.TOO_FEW_LINES.value
             continue
         if found.condition[k] > MAX_CONDITION:

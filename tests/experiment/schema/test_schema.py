@@ -282,7 +282,15 @@ FAULTS = [
     ("retrieval.methods=[cc, cc]", "retrieval: methods: 'cc' twice is not allowed; expected each"),
     ("retrieval.blur=-1", "retrieval.blur: -1 m is not allowed; expected 'beam' or 0 to 1000 m"),
     ("retrieval.methods=[]", "retrieval.methods: [] is not allowed; expected 1 or more"),
-    ("retrieval.methods=cc", "retrieval.methods: 'cc' is not allowed; expected a list in brackets"),
+    (
+        "retrieval.methods=cc",
+        "retrieval.methods: 'cc' is not allowed; expected a list in brackets: [cc]",
+    ),
+    (
+        "retrieval.methods=piv",
+        "retrieval.methods: 'piv' is not allowed; expected a list in brackets of cc, ws, multipass,"
+        " variational, vortex_fit",
+    ),
     ("wake.centre=3 m", "wake.centre: '3 m' is not allowed; expected a list in brackets: [3 m, 3"),
     ("name=a/b", "name: 'a/b' is not allowed; expected at most 100 letters, digits"),
     ("name=..", "name: '..' is not allowed; expected at most 100 letters, digits"),
@@ -536,6 +544,13 @@ def test_a_key_that_is_there_twice_is_a_fault(write):
 def test_a_wake_is_no_experiment(tmp_path):
     with pytest.raises(InputError, match=r"wake.nc: a wake, not .* wake: \{file: .*wake.nc\}$"):
         load(tmp_path / "wake.nc")
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.TIF", "a.exr"])
+def test_a_picture_is_called_one(tmp_path, name):
+    (tmp_path / name).write_bytes(b"\x89PNG\xff")
+    with pytest.raises(InputError, match=r"a picture, not an experiment; .* info .* retrieve"):
+        load(tmp_path / name)
 
 
 def test_a_scene_is_no_experiment(tmp_path):

@@ -83,6 +83,7 @@ FAMILIES = {
 }
 
 
+@pytest.mark.slow
 def test_stated_errors_hold_over_families_of_wind():
     """Of all families together 68 and 95 % are within 1 and 1.96 standard errors, to 5 points.
 
@@ -99,6 +100,7 @@ def test_stated_errors_hold_over_families_of_wind():
     assert one == pytest.approx(0.683, abs=0.05) and two == pytest.approx(0.95, abs=0.05)
 
 
+@pytest.mark.slow
 def test_stated_errors_hold_where_the_length_of_the_turbulence_is_known():
     z = normalised(PPI, lambda seed: made.turbulent(seed, 0.8, 400.0), 16, length_scale=400.0)
     assert (np.abs(z) < 1).mean() == pytest.approx(0.683, abs=0.1)
@@ -207,16 +209,13 @@ def test_what_tells_no_wind_is_refused_or_flagged():
     stare, _ = made.scan(made.calm, np.zeros(9), 90.0, RANGES, 2.0 * np.arange(9))
     plane, _ = made.scan(made.calm, np.full(9, 30.0), np.linspace(5, 80, 9), RANGES, np.arange(9.0))
     for lines in (stare, plane):
-        try:
-            winds = lm.fit_winds_to_lines(lines)
-        except lm.InputError as error:
-            assert "in one plane" in str(error)
-        else:
-            assert (winds["flag"].values & WindFlag.TOO_FEW_LINES).all()
-            assert np.isnan(winds["u"]).all()
-    noise, _ = made.scan(made.calm, ranges=RANGES, noise=30.0, **VAD)
+        with pytest.raises(
+            lm.InputError, match=r"not in one plane .* 90 of 90 velocities are valid"
+        ):
+            lm.fit_winds_to_lines(lines)
+    noise, _ = made.scan(made.calm, ranges=RANGES[:3], noise=30.0, **VAD)
     assert (lm.fit_winds_to_lines(noise)["flag"].values & WindFlag.UNCERTAIN).all()
-    narrow, _ = made.scan(made.calm, 0.4 * np.arange(12), 3.0, RANGES, np.arange(12.0))
+    narrow, _ = made.scan(made.calm, 0.4 * np.arange(12), 3.0, RANGES[:3], np.arange(12.0))
     assert (lm.fit_winds_to_lines(narrow)["flag"].values & WindFlag.ILL_CONDITIONED).all()
     flagged = stare.assign(flag=stare["flag"] + 1)
     with pytest.raises(lm.InputError, match="three valid lines"):

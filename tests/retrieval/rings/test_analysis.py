@@ -173,6 +173,7 @@ def test_arguments():
         analyse_rings(split_rings((300, 400), (190.0, 160.0), 8000.0, (0.5,)), (900.0, 3.0))
 
 
+@pytest.mark.slow
 def test_few_grey_levels_are_doubted():
     """Thresholded and posterised pictures, whose flat crests look like split lines; not counts."""
     y, x = np.mgrid[:240, :320].astype(float)
