@@ -6,7 +6,6 @@ What else makes the images differ is estimated from what the fit leaves (`compon
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -210,9 +209,8 @@ def variational_and_flow(
     factor = torch.ones(windows.count).to(covariance)
     if isinstance(posterior, direct.Posterior | strips.Posterior):
         check = prior_check(posterior, linear, mesh)
-        factor = check.factor(centres).to(covariance)
-        # a weaker prior is one that images remove less of
-        before = min(check.ratio, 1.0) * before
+        # never narrower: what a prior is too wide by hides noise that is understated about vortices
+        factor = check.factor(centres).to(covariance).clamp(min=1.0)
     covariance = factor * covariance
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
@@ -227,22 +225,6 @@ def variational_and_flow(
         finer = finer + coloured.to(finer)
     additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
     covariance = covariance + additional
-    if bool((coloured > 0).double().mean() > 0.5) and len(settings.noise_rounds[-1]) > 1:
-        again = variational_and_flow(
-            stack,
-            windows,
-            min_correlation,
-            noise,
-            blur,
-            spacing,
-            replace(
-                settings, noise_rounds=(*settings.noise_rounds[:-1], settings.noise_rounds[-1][:-1])
-            ),
-            keep=keep,
-        )
-        assert again[0].covariance is not None
-        if again[0].covariance.diagonal().mean() < covariance.diagonal().mean():
-            return again
     said = {"noise_of_lines": lines} if lines else {}
     result = result._replace(covariance=covariance, attributes=said)
     if bare is None:
