@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from lidar_mi.atmosphere.line import Line, backscatter_line
-from lidar_mi.atmosphere.molecules import standard_atmosphere
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.rendering.fringes import scene_dict
@@ -36,7 +36,7 @@ FORWARD = (
 def compare(repeats: int = 5, width: int = 960, height: int = 780, samples: int = 16) -> Comparison:
     """Paths per second, time at equal noise, velocity error of single precision."""
     use_variant(VARIANT)
-    pressure, temperature = standard_atmosphere(8500.0)
+    pressure, temperature, _ = standard_atmosphere(8500.0)
     line = backscatter_line(WAVELENGTH, temperature, pressure)
     etalon, camera = Etalon(), FringeCamera(width=width, height=height)
     paths = samples * width * height

@@ -94,7 +94,7 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     [
         (
             {"look_ahead": "9 m"},
-            "encounter.look_ahead: 9 m is not allowed; expected more than 16.5 m",
+            "encounter.look_ahead: 9 m is not allowed; expected more than 15 m",
         ),
         ({"look_ahead": "7 m"}, "encounter.look_ahead: 7 m is not allowed"),
         ({"control": {"latency": "2 s"}}, "encounter.look_ahead: 75 m is not allowed"),

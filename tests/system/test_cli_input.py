@@ -234,7 +234,7 @@ def bad(*arguments, says):
         bad("info", "dust", "--altitude", "1 km", says=["--altitude", "dust", "molecules"]),
         bad("info", "dust", "--wavelength", "green", says=["--wavelength", "'green'", "532 nm"]),
         bad("info", "dust", "--wavelength", "355 nm", says=["355 nm", "'dust'", "532 to 1064"]),
-        bad("info", "molecules", "--altitude", "99 km", says=["altitude", "99000", "81020"]),
+        bad("info", "molecules", "--altitude", "99 km", says=["altitude", "99000", "80000"]),
         bad("info", "numbers.txt", says=["numbers.txt", "# name"]),
         bad("aerosol", "smog", says=["aerosol", "'smog'", "spheroids"]),
         bad("aerosol", "soot", "--wavelength", "5 um", says=["wavelength", "5000 nm", "'soot'"]),
