@@ -64,7 +64,7 @@ def bad(*arguments, says):
         bad("run", "slab.xml", says=["slab.xml", "scene", "lidar-mi render slab.xml"]),
         bad("run", "tiny.yaml", "--set", "scan.range=1e9", says=["scan.range", "100000"]),
         bad("run", "none.yaml", says=["none.yaml", "no such file", "wake_backscatter"]),
-        bad("run", "text.exr", says=["text.exr", "holds no keys"]),
+        bad("run", "text.exr", says=["text.exr", "a picture, not an experiment"]),
         bad("run", "wake.yaml", says=["text.nc", "not NetCDF"]),
         bad("run", "cut.yaml", says=["cut.nc", "damaged"]),
         bad("run", "tiny.yaml", "-o", ".", says=["is no run folder", "-o DIR"]),
