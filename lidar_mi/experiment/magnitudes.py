@@ -18,34 +18,37 @@ class Usual(NamedTuple):
 
 
 _PULSES = "micropulse lidars have 5 uJ, the largest lidars of stations 1 J"
-_WAVELENGTHS = "from excimer to CO2 lasers"
 _DIVERGENCES = "from lidars in orbit to laser diodes of ceilometers and cars"
+_RANGES = "lidars on aircraft look 30 m to 20 km ahead"
+_DEPTHS = "from detectors of 10 GHz to those of ceilometers"
 _TELESCOPES = "from 2 cm of a wind lidar to 4 m of an observatory's telescope"
+# of the backscatter and of the Doppler lidar
+_OF_A_LIDAR = (
+    Usual("wavelength", "m", 240e-9, 11e-6, "from excimer to CO2 lasers"),
+    Usual("pulse_energy", "J", 1e-8, 2.0, _PULSES),
+    Usual("pulse_duration", "s", 1e-10, 1e-6, "from microchip lasers to coherent lidars"),
+    Usual("beam_radius", "m", 5e-4, 0.5, "from a laser without expander to lidars in orbit"),
+    Usual("divergence_full", "rad", 1e-5, 0.1, _DIVERGENCES),
+    Usual("fov_half", "rad", 1e-5, 0.1, _DIVERGENCES),
+)
 USUAL = (
-    Usual("lidar.wavelength", "m", 240e-9, 11e-6, _WAVELENGTHS),
-    Usual("lidar.pulse_energy", "J", 1e-8, 2.0, _PULSES),
-    Usual("lidar.pulse_duration", "s", 1e-10, 1e-6, "from microchip lasers to coherent lidars"),
-    Usual("lidar.beam_radius", "m", 5e-4, 0.5, "from a laser without expander to lidars in orbit"),
-    Usual("lidar.divergence_full", "rad", 1e-5, 0.1, _DIVERGENCES),
+    *(
+        one._replace(key=f"{section}.{one.key}")
+        for section in ("lidar", "doppler.lidar")
+        for one in _OF_A_LIDAR
+    ),
     Usual("lidar.aperture_radius", "m", 5e-3, 2.0, _TELESCOPES),
-    Usual("lidar.fov_half", "rad", 1e-5, 0.1, _DIVERGENCES),
-    Usual("scan.range", "m", 1.0, 3e4, "lidars on aircraft look 30 m to 20 km ahead"),
-    Usual("scan.thickness", "m", 0.01, 1e3, "from detectors of 10 GHz to those of ceilometers"),
+    Usual("doppler.lidar.telescope_area", "m^2", 1e-4, 13.0, _TELESCOPES),
+    Usual("scan.range", "m", 1.0, 3e4, _RANGES),
+    Usual("doppler.lidar.range", "m", 1.0, 3e4, _RANGES),
+    Usual("scan.thickness", "m", 0.01, 1e3, _DEPTHS),
+    Usual("doppler.lidar.range_bin", "m", 0.01, 1e3, _DEPTHS),
     Usual("platform.speed", "m/s", 10.0, 700.0, "from gliders to supersonic airliners"),
     Usual("platform.dt", "s", 1e-4, 30.0, "from bursts of pulses to slow scans"),
     Usual("wake.vortex_pair.circulation", "m^2/s", 5.0, 1200.0, "an A380 at landing has 700 m^2/s"),
     Usual("wake.vortex_pair.separation", "m", 2.0, 90.0, "an A380 at landing has 63 m"),
     Usual("wake.vortex_pair.core_radius", "m", 0.05, 15.0, "1 to 5 % of the wing span, later 15 %"),
     Usual("wake.turbine.wind_speed", "m/s", 2.0, 35.0, "from cut-in to beyond cut-out"),
-    Usual("doppler.lidar.wavelength", "m", 240e-9, 11e-6, _WAVELENGTHS),
-    Usual("doppler.lidar.pulse_energy", "J", 1e-8, 2.0, _PULSES),
-    Usual("doppler.lidar.pulse_duration", "s", 1e-10, 1e-6, "from microchip to coherent lidars"),
-    Usual("doppler.lidar.beam_radius", "m", 5e-4, 0.5, "from no expander to lidars in orbit"),
-    Usual("doppler.lidar.divergence_full", "rad", 1e-5, 0.1, _DIVERGENCES),
-    Usual("doppler.lidar.telescope_area", "m^2", 1e-4, 13.0, _TELESCOPES),
-    Usual("doppler.lidar.fov_half", "rad", 1e-5, 0.1, _DIVERGENCES),
-    Usual("doppler.lidar.range", "m", 1.0, 3e4, "lidars on aircraft look 30 m to 20 km ahead"),
-    Usual("doppler.lidar.range_bin", "m", 0.01, 1e3, "from detectors of 10 GHz to ceilometers"),
 )
 """Nothing outside is known of instruments, aircraft and wakes; 0 and infinity are idealisations."""
 
