@@ -73,10 +73,7 @@ def better_elsewhere(
     wide = torch.stack([torch.stack([excess(z, y) for y in shifts]) for z in shifts])
     misfit = wide[1:-1, 1:-1]
     least = misfit.clone()
-    for before, after in (
-        (wide[:-2, 1:-1], wide[2:, 1:-1]),
-        (wide[1:-1, :-2], wide[1:-1, 2:]),
-    ):
+    for before, after in ((wide[:-2, 1:-1], wide[2:, 1:-1]), (wide[1:-1, :-2], wide[1:-1, 2:])):
         bottom = torch.minimum(before, after) > misfit
         bend = torch.where(bottom, before + after - 2 * misfit, torch.inf)
         least -= (after - before).square() / (8 * bend)

@@ -106,7 +106,7 @@ def particles(seed, random, lost):
         return np.einsum("nz,ny,n->zy", *along, 50 * places[:, 2])
 
     first = new()
-    second = first + (*SHIFT, 0)
+    second = first + np.array([*SHIFT, 0])
     gone = random.random(number) < lost
     second[gone] = new()[gone]
     return [seen(part) + 10 + white(random, 3.0) for part in (first, second)]

@@ -44,7 +44,9 @@ def texture(seed):
     parts = [np.fft.ifft2(part).real for part in (wave, wave * phase)]
     cut = slice(30, 30 + SHAPE[0]), slice(30, 30 + SHAPE[1])
     return [
-        torch.as_tensor(1 + 0.3 * part[cut] / parts[0].std() + NOISE * random.standard_normal(SHAPE))
+        torch.as_tensor(
+            1 + 0.3 * part[cut] / parts[0].std() + NOISE * random.standard_normal(SHAPE)
+        )
         for part in parts
     ]
 
