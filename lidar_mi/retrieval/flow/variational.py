@@ -210,7 +210,7 @@ def variational_and_flow(
     factor = torch.ones(windows.count).to(covariance)
     if isinstance(posterior, direct.Posterior | strips.Posterior):
         check = prior_check(posterior, linear, mesh)
-        # never narrower: what a prior is too wide by hides noise that is understated about vortices
+        # never narrower: one ratio scatters by half in flows of few vortices
         factor = check.factor(centres).to(covariance).clamp(min=1.0)
     covariance = factor * covariance
     score = agreement(linear, windows)
