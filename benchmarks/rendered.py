@@ -141,6 +141,7 @@ def sensor(pair: Pair, samples: int, methods: Sequence[str]) -> Experiment:
                 "height": extent[1],
             },
             "spacing": SPACING,
+            "extinction": {"molecules": 0},
         },
         platform={"dt": DT},
         detector={},

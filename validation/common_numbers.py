@@ -46,7 +46,9 @@ BASE = {
 def _air(extinction: float, orders: int) -> dict:
     """A medium extinction, /m, half of it around the wake, and the orders that are followed."""
     return {
-        "wake": {"extinction": {"background": extinction / 2, "maximum": extinction}},
+        "wake": {
+            "extinction": {"background": extinction / 2, "maximum": extinction, "molecules": 0}
+        },
         "render": {"max_order": orders},
     }
 

@@ -17,6 +17,7 @@ from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.preflight import check as preflight
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.truth.clear_air import site_altitude
 from lidar_mi.progress import Notice
 from lidar_mi.units import shown
 
@@ -174,8 +175,11 @@ def _first_slab(experiment: Experiment) -> Experiment:
     scan = experiment.scan.model_copy(
         update={"range": encounter.look_ahead, "thickness": gates.depth}
     )
+    site = experiment.site.model_copy(
+        update={"altitude": site_altitude(experiment.site, encounter)}
+    )
     # the preflight of a run then covers the instrument of the flight, too
-    changes = {"encounter": None, "platform": platform, "scan": scan}
+    changes = {"encounter": None, "platform": platform, "scan": scan, "site": site}
     ranged = at_the_slabs(experiment, gates)
     return ranged.model_copy(update=changes).read_from(experiment.folder)
 

@@ -20,6 +20,7 @@ from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.experiment.truth.clear_air import clear_air
 from lidar_mi.experiment.truth.flows import analytic_axes
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import beam_reach
@@ -312,9 +313,8 @@ def air_of(experiment: Experiment, gates: Gates) -> Air:
         wake.texture.outer_scale,
         experiment.seed,
     )
-    return Air(
-        along_path, texture, wake.extinction.background, wake.extinction.molecules, gates, margin
-    )
+    clear = call(clear_air, experiment).extinction
+    return Air(along_path, texture, wake.extinction.background, clear, gates, margin)
 
 
 def _extended(axis: np.ndarray, margin: float) -> np.ndarray:

@@ -27,7 +27,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.device import on_its_device
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.reading import load_experiment
-from lidar_mi.experiment.stages.rendering import PILOT_SEED, environment_extinction
+from lidar_mi.experiment.stages.rendering import PILOT_SEED
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.instrument.products import with_products
@@ -314,7 +314,7 @@ class VirtualLidar:
             air,
             plan,
             lidar,
-            environment_extinction(wake),
+            wake.extinction.background + self.air.molecules,
             *scatterer(scattering, experiment.folder, lidar.wavelength),
             settings,
             molecules(self.air.molecules, lidar.wavelength, scattering.band),

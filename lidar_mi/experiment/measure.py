@@ -33,8 +33,10 @@ from lidar_mi.assessment.metrics.velocities import velocity_metrics
 from lidar_mi.assessment.metrics.volume import volume_metrics
 from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
 from lidar_mi.assessment.metrics.winds import cross_flow_metrics, sweep_metrics, true_wind_metrics
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.light_budget import backscatter_fractions
 
 _NO_SKILL = "{} has no skill: its error equals the spread of the wind"
 
@@ -52,6 +54,12 @@ def measure(
         Duration of the steps.
     """
     metrics: dict[str, float] = {}
+    if experiment.imaged_wake and "images" in results:
+        taken = {"truth": results["truth"], "air": results["air"]}
+        fractions = call(backscatter_fractions, experiment, **taken, clear_air=results["clear_air"])
+        metrics |= {
+            f"backscatter.fraction.{name}": value for name, value in fractions._asdict().items()
+        }
     if "wind" in results:
         metrics |= _images(results)
     if "wind_volume" in results:

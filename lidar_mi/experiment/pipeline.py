@@ -72,6 +72,7 @@ from lidar_mi.experiment.stages.vortices import (
     image_vectors,
 )
 from lidar_mi.experiment.stages.winds import check_windows, cross_flow_winds
+from lidar_mi.experiment.truth.clear_air import ClearAir, clear_air
 from lidar_mi.experiment.truth.extinction import Truth, true_air
 from lidar_mi.experiment.truth.flows import Flows, read_flows
 from lidar_mi.experiment.truth.passing_wake import PassingWake
@@ -148,6 +149,7 @@ STAGES = (
     # the truth, the scans, the air
     Stage("footprint", Footprint, preflight=True),
     Stage("flows", read_flows, has_wake, preflight=True, timing="truth"),
+    Stage("clear_air", clear_air, has_wake, preflight=True),
     Stage("truth", true_air, preflight=True, timing="truth"),
     Stage("plans", scan_plans, preflight=True, timing="truth"),
     Stage("air", scattering_air, has_wake, preflight=True),
@@ -211,6 +213,7 @@ class Results(TypedDict, total=False):
 
     footprint: Footprint
     flows: Flows
+    clear_air: ClearAir
     truth: Truth
     plans: list[ScanPlan]
     air: Scatterer

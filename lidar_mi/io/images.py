@@ -298,10 +298,12 @@ def read_noise(
     if not _is_exr(path):
         return None
     layers, layer = read_layers(path)[1], layer or default_layer(path)
-    transport = {"gate000.S0", "gate000.S0_stderr", "Y"}
-    if layer in ("Y", "Y_noisy") and transport <= set(layers):
+    # of random numbers that both images of a pair share: what the other does not have
+    own = "gate000.S0_pair_stderr"
+    error = own if own in layers else "gate000.S0_stderr"
+    if layer in ("Y", "Y_noisy") and {"gate000.S0", error, "Y"} <= set(layers):
         signal, stderr, scaled = (
-            read_image(path, name, spacing) for name in ("gate000.S0", "gate000.S0_stderr", "Y")
+            read_image(path, name, spacing) for name in ("gate000.S0", error, "Y")
         )
         noise = (scaled * stderr / signal.where(signal > 0)).fillna(0.0)
         if layer == "Y_noisy" and "Y_noise_std" in layers:

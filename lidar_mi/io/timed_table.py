@@ -1,4 +1,4 @@
-"""Tables of numbers in time, from CSV or NetCDF: trajectories, a scanner's directions."""
+"""Tables of numbers in time or by altitude, from CSV or NetCDF: trajectories, soundings."""
 
 import csv
 import re
@@ -19,8 +19,10 @@ TIME = "t"
 _HEAD = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?\s*")
 
 
-def read_timed_table(path: str | Path, units: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Columns of a table by their names, in SI units, and the time ``t``.
+def read_timed_table(
+    path: str | Path, units: Mapping[str, str], axis: str = TIME
+) -> dict[str, np.ndarray]:
+    """Columns of a table by their names, in SI units, and the time ``t`` or another axis.
 
     A CSV file has a head with names and units, "t (s), roll (deg)", and lines that begin with #
     are comments; a NetCDF file has variables of one dimension with the attribute ``units``. Without
@@ -32,24 +34,26 @@ def read_timed_table(path: str | Path, units: Mapping[str, str]) -> dict[str, np
         NetCDF by its suffix (.nc, .nc4, .cdf), else CSV.
     units : mapping of str to str
         Names of columns and their SI units. Those of the file that are not asked for are ignored.
+    axis : str
+        The column that increases: the time, or one of ``units``.
 
     Returns
     -------
     dict of str to (n,) array
-        ``t`` and what of the columns there is.
+        The axis and what of the columns there is.
 
     Raises
     ------
     InputError
-        A file that cannot be read, no ``t``, none of the columns, fewer than two times, a unit that
-        does not convert, a value that is no finite number, times that do not increase.
+        A file that cannot be read, no axis, none of the columns, fewer than two rows, a unit that
+        does not convert, a value that is no finite number, an axis that does not increase.
     """
     path = Path(path)
-    wanted = {TIME: "s", **units}
+    wanted = {TIME: "s", **units} if axis == TIME else dict(units)
     read = _netcdf if path.suffix in (".nc", ".nc4", ".cdf") else _csv
     found = read(path, wanted)
-    if TIME not in found or len(found) == 1:
-        missing = TIME if TIME not in found else f"all of {', '.join(units)}"
+    if axis not in found or len(found) == 1:
+        missing = axis if axis not in found else f"all of {', '.join(units)}"
         raise InputError(f"{path}: {missing} missing; expected columns {', '.join(wanted)}")
     table = {}
     for name, (values, unit) in found.items():
@@ -60,15 +64,15 @@ def read_timed_table(path: str | Path, units: Mapping[str, str]) -> dict[str, np
                 "finite numbers"
             )
         table[name] = values * _factor(unit, wanted[name], name, path)
-    time = table[TIME]
-    if len(time) < 2:
-        raise InputError(f"{path}: {len(time)} rows; expected two or more")
-    back = np.flatnonzero(~(np.diff(time) > 0))
+    along, unit = table[axis], wanted[axis]
+    if len(along) < 2:
+        raise InputError(f"{path}: {len(along)} rows; expected two or more")
+    back = np.flatnonzero(~(np.diff(along) > 0))
     if back.size:
         row = int(back[0]) + 1
         raise InputError(
-            f"{path}: t: {time[row]:.15g} s in row {row + 1} after {time[row - 1]:.15g} s is not "
-            "allowed; expected times that increase"
+            f"{path}: {axis}: {along[row]:.15g} {unit} in row {row + 1} after "
+            f"{along[row - 1]:.15g} {unit} is not allowed; expected values that increase"
         )
     return table
 

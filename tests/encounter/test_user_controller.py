@@ -66,6 +66,6 @@ def test_its_name_stands_where_the_autopilot_s_does():
     assert flight.series.attrs["controller"] == "half"
     shown = str(flight)
     assert "half, no preview" in shown and "autopilot" not in shown
-    assert "with half, but no preview, by" in flight.answer[0]
+    assert "degrees (half, no preview)" in flight.answer[0]
     assert name_of(functools.partial(late)) == "late"
     assert "autopilot" in str(fly(None))

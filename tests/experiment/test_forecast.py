@@ -18,7 +18,7 @@ from lidar_mi.experiment.memory import PER_ADVECTED, Footprint
 from lidar_mi.experiment.preflight.check import duration, sections
 from lidar_mi.experiment.stages.brightness import check_brightness, overlap
 from lidar_mi.experiment.stages.timed_beams import timed_plans
-from lidar_mi.experiment.truth.extinction import make_truth
+from lidar_mi.experiment.truth.extinction import Truth, make_truth
 from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.experiment.truth.in_time import air_in_time, values_of_states
 from lidar_mi.instrument.lidar import BackscatterLidar
@@ -37,8 +37,8 @@ def planned(**changes):
 
 def brightness(experiment, extinction, plan):
     air = xr.DataArray(np.full((1, 5, 5), extinction), dims=("x", "y", "z"))
-    mapping = experiment.wake.extinction
-    call(check_brightness, experiment, mapping=mapping, extinction=air, plan=plan, albedo=1.0)
+    mapping, truth = experiment.wake.extinction, Truth((air, air), (air, air), xr.Dataset())
+    call(check_brightness, experiment, mapping=mapping, truth=truth, plan=plan, albedo=1.0)
 
 
 def forecast(experiment, beams, in_states=0):

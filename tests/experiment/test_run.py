@@ -115,6 +115,8 @@ def test_nodes_that_single_precision_cannot_hold(tmp_path):
     data["retrieval"] |= {"stride": 8}
     found = lm.run(check(data), tmp_path / "out", notice=lambda text, fraction: None)
     assert found.wind["flag"].dtype.kind == "u"
-    true = found.wind["v_true"].sel(source=["extinction", "backscatter"])
-    assert true.notnull().all()
+    wind = found.wind.sel(source=["extinction", "backscatter"])
+    # the truth stands where a vector was found: in all places but a few without an error
+    assert (wind["v_true"].notnull() == wind["v"].notnull()).all()
+    assert float(wind["v_true"].notnull().mean()) > 0.95
     assert (found.scans[1]["y"] == found.truth.wind["y"].values).all()

@@ -8,6 +8,7 @@ TINY = """\
 name: tiny
 wake:
   vortex_pair: {circulation: 150, separation: 16 m, core_radius: 2 m, width: 30 m, height: 20 m}
+  extinction: {molecules: 0}
 render: {samples_per_beam: 4, max_order: 1}
 retrieval: {methods: [cc]}
 """

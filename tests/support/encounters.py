@@ -16,7 +16,13 @@ def small_encounter(seed=1, path=None, wake=None, render=None, control=None, **c
         "wake_backscatter",
         **{
             "seed": seed,
-            "wake": {"file": None, "time": None, "vortex_pair": pair, "spacing": "1 m"}
+            "wake": {
+                "file": None,
+                "time": None,
+                "vortex_pair": pair,
+                "spacing": "1 m",
+                "extinction": {"molecules": 0},
+            }
             | (wake or {}),
             "lidar": {"pulse_duration": "10 ns"},
             "render": {"samples_per_beam": 32, "max_order": 1, "variant": "llvm_ad_mono"}

@@ -37,7 +37,8 @@ FIGURES = {
 
 
 def small(name="small", **wake):
-    """A vortex pair seen by 61 x 41 beams in single scattering, as a dictionary."""
+    """A vortex pair seen by 61 x 41 beams in single scattering, as a dictionary; no molecules."""
+    wake["extinction"] = {"molecules": 0} | wake.get("extinction", {})
     pair = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}
     return {
         "name": name,

@@ -36,7 +36,10 @@ from lidar_mi.rendering import batches
 
 SETTINGS = {
     "name": "faults",
-    "wake": {"vortex_pair": {"separation": 16, "core_radius": 2, "width": 30, "height": 20}},
+    "wake": {
+        "vortex_pair": {"separation": 16, "core_radius": 2, "width": 30, "height": 20},
+        "extinction": {"molecules": 0},
+    },
     "render": {"samples_per_beam": 4, "max_order": 1, "samples_per_pass": 1024},
     "retrieval": {"methods": ["cc"], "stride": 8},
 }

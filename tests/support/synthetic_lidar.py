@@ -17,7 +17,7 @@ def encounter_keys(**encounter):
     pair = {"circulation": 350, "separation": 30, "core_radius": 3, "width": 100, "height": 70}
     return {
         "name": "flight",
-        "wake": {"vortex_pair": pair, "spacing": 1},
+        "wake": {"vortex_pair": pair, "spacing": 1, "extinction": {"molecules": 0}},
         "encounter": {"look_ahead": "75 m"}
         | encounter
         | {"path": path | encounter.get("path", {})},

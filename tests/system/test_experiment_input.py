@@ -66,7 +66,7 @@ def test_beams_wider_than_a_template_are_reported(tmp_path, quick):
     warnings = [text for text in warnings if text not in untrusted and "masked pixels" not in text]
     assert len(warnings) == 3
     assert "beams are 10 m wide at 5001" in warnings[0] and "template of 4 m" in warnings[0]
-    assert "backscatter, cc: no vector is valid; " in warnings[1] and "flag low_" in warnings[1]
+    assert "backscatter, cc: no vector is valid; 100 % have the flag " in warnings[1]
     # a few samples of a beam of 5 km
     assert "render.samples_per_beam: no vector is valid, and noise of the images" in warnings[2]
     assert metrics["backscatter.cc.valid_fraction"] == 0

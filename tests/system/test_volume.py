@@ -65,7 +65,7 @@ def test_the_whole_chain(tmp_path, air):
     assert wind.attrs["Conventions"] == "CF-1.11" and {"u_stderr", "w_true"} <= set(wind)
     # a 1 m grid has little texture, yet most of the wind is found
     key = "backscatter.correlation"
-    assert metrics[f"{key}.valid_fraction"] > 0.9
+    assert metrics[f"{key}.valid_fraction"] > 0.85
     for name in "vw":
         assert metrics[f"{key}.rmse_{name}"] < 0.25 * metrics[f"true_wind.rms_{name}"]
     # a telescope 30 m nearer is no wind: 30 m seen as 1 % of spread would be 2.5 m/s at the rim

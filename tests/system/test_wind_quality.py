@@ -105,15 +105,14 @@ def test_winds_from_backscatter(demo):
 
 
 def test_every_step_of_the_instrument_costs(demo):
-    """Extinction, the same blurred by the beam, with photon noise: each is a poorer image of the
-    same air, so over all vectors each gives worse winds. The noise costs little at 64 photons:
-    0.5 % a pixel against a texture of 10 %."""
+    """Extinction, the same blurred by the beam, rendered: over all vectors the blur costs, and the
+    rendering, whose random numbers all beams share, changes the winds by less than 3 %."""
     for name in ("v", "w"):
         ideal, blurred, observed = (
             demo.metrics[f"{source}.cc.all.rmse_{name}"]
             for source in ("extinction", "extinction_blurred", "backscatter")
         )
-        assert ideal < blurred < observed < 1.1 * blurred
+        assert ideal < blurred and observed == pytest.approx(blurred, rel=0.03)
         assert demo.metrics[f"extinction_without_texture.cc.all.rmse_{name}"] > 2 * observed
 
 

@@ -16,6 +16,20 @@ def compliance(judged: Judged, speed: float, legend: str) -> Tables | None:
     legend : str
         How the sensor's properties were measured.
     """
+    flown = [one for one in judged if one[0].applies_at(speed)]
+    if not flown:
+        return None
+    of_flight = " of flight control" if speed else ""
+    return compared(
+        f"Compliance with the requirements{of_flight}",
+        f"{legend} A margin is the distance from the limit, as a fraction of it. Phases of flight "
+        "at another air speed are not assessed.",
+        flown,
+    )
+
+
+def compared(heading: str, legend: str, judged: Judged) -> Tables:
+    """A table of every phase, row by row, with its verdict as the title."""
     tables = [
         (
             f"{table.title}, {table.phase}: {_VERDICTS[fulfilled(findings)]}",
@@ -26,14 +40,5 @@ def compliance(judged: Judged, speed: float, legend: str) -> Tables | None:
             ],
         )
         for table, findings in judged
-        if table.applies_at(speed)
     ]
-    if not tables:
-        return None
-    of_flight = " of flight control" if speed else ""
-    return Tables(
-        f"Compliance with the requirements{of_flight}",
-        f"{legend} A margin is the distance from the limit, as a fraction of it. Phases of flight "
-        "at another air speed are not assessed.",
-        tables,
-    )
+    return Tables(heading, legend, tables)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from lidar_mi.assessment.digits import fixed, percent, three
 from lidar_mi.assessment.metrics.encounter import AFTER, LEAST_REMOVED, MODES, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK, ACCEPTED_RATIO
-from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, fulfilled
+from lidar_mi.assessment.metrics.requirements import Judged
 from lidar_mi.assessment.report.encounter_loads import loads_answer
 from lidar_mi.tables import Table
 
@@ -122,7 +122,7 @@ def encounter_summary(
 
 def encounter_chapter(
     metrics: Mapping[str, float],
-    judged: Sequence[tuple[RequirementTable, Sequence[Finding]]],
+    judged: Judged,
     drawn: "Sequence[Drawn]",
     film: "Film | None" = None,
     controller: str = "",
@@ -339,21 +339,15 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
     ]
 
 
-def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> "Tables":
-    from lidar_mi.assessment.report.page import Tables
+def _verdict(judged: Judged) -> "Tables":
+    from lidar_mi.assessment.report.compliance import compared
 
-    words = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
-    tables = []
-    for table, findings in judged:
-        rows = [(row[0], "", list(row[1:])) for row in as_rows(list(findings))]
-        title = f"{table.title}, {table.phase}: {words[fulfilled(list(findings))]}"
-        tables.append((title, ["required", "in flight", "margin", ""], rows))
-    return Tables(
-        heading="Requirements, as measured in flight",
-        legend="Range: distance of the aircraft to the slab when its estimate is delivered. "
+    return compared(
+        "Requirements, as measured in flight",
+        "Range: distance of the aircraft to the slab when its estimate is delivered. "
         "Errors of v and w are those of valid vectors against the truth; a lidar "
         "without Doppler measurements has no u.",
-        tables=tables,
+        judged,
     )
 
 

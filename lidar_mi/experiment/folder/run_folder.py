@@ -380,6 +380,9 @@ def _inputs(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
     paths = table_files(experiment.scattering, search_path)
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, search_path, "wake.file")
+    if experiment.site.sounding:
+        key = "site.sounding"
+        paths[key] = find_file(experiment.site.sounding, search_path, key)
     air = experiment.encounter.air if experiment.encounter else None
     if air is not None and air.volume is not None:
         key = "encounter.air.volume.file"

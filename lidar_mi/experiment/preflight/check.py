@@ -23,10 +23,13 @@ from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_remarks import window_reach
-from lidar_mi.experiment.stages.light_budget import light_budget
+from lidar_mi.experiment.stages.light_budget import (
+    backscatter_fractions,
+    fractions_in_words,
+    light_budget,
+)
 from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
-from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.experiment.truth.in_time import values_of_states
 from lidar_mi.instrument.doppler import DopplerLidar, photons
@@ -35,7 +38,6 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.scan_timing import Schedule
 from lidar_mi.progress import Notice, without_warnings
 from lidar_mi.rendering.memory import ceiling
-from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.rendering.samples import Samples
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.units import shown
@@ -84,10 +86,9 @@ def sections(
         if sampled and asked.detector:
             needed = {name: results[name] for name in ("truth", "plans", "air", "flows")}
             chosen = call(chosen_samples, asked, **needed, log=Log(notice))
-        truth, plan, air = results["truth"], results["plans"][0], results["air"]
-        yield from _backscatter(asked, asked.imaged_wake, truth, plan, air, chosen)
+        yield from _backscatter(asked, asked.imaged_wake, results, chosen)
         if asked.scan.timing:
-            schedule = scan_schedule(asked.scan, plan, prepared.search_path)
+            schedule = scan_schedule(asked.scan, results["plans"][0], prepared.search_path)
             yield "scan of the backscatter lidar", _timing(asked, schedule)
     if asked.fringes:
         yield _doppler(asked.fringes)
@@ -116,13 +117,9 @@ def sections(
 
 
 def _backscatter(
-    asked: Experiment,
-    wake: Wake,
-    truth: Truth,
-    plan: ScanPlan,
-    air: Scatterer,
-    chosen: Samples | None,
+    asked: Experiment, wake: Wake, results: Results, chosen: Samples | None
 ) -> Iterator[Section]:
+    truth, plan = results["truth"], results["plans"][0]
     wind, extinction = truth.wind, truth.extinction[0]
     rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
     rows += [(name, _span(wind[name].values, "m/s")) for name in ("u", "v", "w") if name in wind]
@@ -151,7 +148,7 @@ def _backscatter(
         ("samples per beam", _samples(asked, chosen)),
         ("time between the images", f"{platform.dt:g} s"),
         ("second image", _second(asked, wake)),
-        *_light(asked, truth, plan, air),
+        *_light(asked, results),
     ]
     if not asked.volume:
         rows += _displacements(asked, wind, plan)
@@ -178,16 +175,19 @@ def _samples(asked: Experiment, chosen: Samples | None) -> str:
     return f"{number}, orders 1 to {asked.render.max_order}"
 
 
-def _light(
-    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
-) -> list[tuple[str, str]]:
+def _light(asked: Experiment, results: Results) -> list[tuple[str, str]]:
     """What scatters, how much of it arrives, and with how much noise."""
     kind = asked.scattering
-    light = call(light_budget, asked, truth=truth, plan=plan, air=air)
+    truth, plan, air = results["truth"], results["plans"][0], results["air"]
+    clear = results["clear_air"]
+    light = call(light_budget, asked, truth=truth, plan=plan, air=air, clear_air=clear)
+    fractions = call(backscatter_fractions, asked, truth=truth, air=air, clear_air=clear)
     named = kind.aerosol or kind.table
     what = f"{kind.phase} {named}" if named else kind.phase.replace("_", "-")
     rows = [
         ("scattering", f"{what}, lidar ratio {light.lidar_ratio:.3g} sr"),
+        ("molecules", clear.origin),
+        ("backscatter in the gates", fractions_in_words(fractions, kind)),
         ("overlap with the field of view", f"{light.overlap:.1%}"),
         ("two-way transmittance", f"{light.transmittance:.1%}"),
     ]

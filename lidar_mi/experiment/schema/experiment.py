@@ -17,6 +17,7 @@ from lidar_mi.experiment.schema.retrieval import Retrieval
 from lidar_mi.experiment.schema.scattering import Scattering
 from lidar_mi.experiment.schema.section import Section
 from lidar_mi.experiment.schema.sensor import Sensor
+from lidar_mi.experiment.schema.site import Site
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.instrument.detector import Detector
@@ -28,7 +29,7 @@ from lidar_mi.tables import Table, Tabular
 from lidar_mi.units import AS_GIVEN, Within
 
 # keys of the backscatter lidar, which observes a wake
-BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
+BACKSCATTER = ("platform", "site", "lidar", "detector", "scan", "scattering", "render", "retrieval")
 
 
 NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
@@ -68,6 +69,7 @@ class Experiment(Tabular, Section):
         description="the Doppler lidar; {} for the paper's, kind: coherent for one on the ground",
     )
     platform: Platform = Platform()
+    site: Site = Site()
     lidar: BackscatterLidar = BackscatterLidar()
     detector: Detector | None = Field(None, description="adds a noisy image and its winds")
     scan: Scan = Scan()
@@ -207,12 +209,12 @@ class Experiment(Tabular, Section):
         phase = self.scattering.phase
         if (
             self.imaged_wake
-            and self.imaged_wake.extinction.molecules
+            and self.imaged_wake.extinction.molecules not in ("auto", 0)
             and phase in ("isotropic", "henyey_greenstein")
         ):
             raise ValueError(
                 f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which "
-                "is unpolarised; expected 0"
+                "is unpolarised; expected auto or 0"
             )
         return self
 

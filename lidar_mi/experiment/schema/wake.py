@@ -148,12 +148,14 @@ class ExtinctionMapping(Section):
         quantity("1.8 / km"),
         description="at the largest tracer concentration (or speed); above the background",
     )
-    molecules: Annotated[Extinction, Within(0, 0.1, "air at the ground has 0.03 / m at 100 nm")] = (
-        Field(
-            0.0,
-            description="extinction by clear air, added in slab and environment; it has no texture "
-            "and scatters in scattering.band",
-        )
+    molecules: (
+        Literal["auto"]
+        | Annotated[Extinction, Within(0, 0.1, "air at the ground has 0.03 / m at 100 nm")]
+    ) = Field(
+        "auto",
+        description="extinction by clear air, added in slab and environment; it has no texture "
+        "and scatters in scattering.band. auto: that of the site at the laser's wavelength, or 0 "
+        "where scattering.phase is no aerosol or table, or has molecules as a part; 0: none",
     )
     stretch: Annotated[Number, Within(1, 100, "1 is linear; 100 is a step")] = Field(
         2.0, description="contrast of thin tracer; 1 = linear"

@@ -3,11 +3,11 @@
 import math
 
 import numpy as np
-import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.memory import most_samples
 from lidar_mi.experiment.schema.wake import ExtinctionMapping
+from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
@@ -25,7 +25,7 @@ def check_brightness(
     render: RenderSettings,
     detector: Detector | None,
     mapping: ExtinctionMapping,
-    extinction: xr.DataArray,
+    truth: Truth,
     plan: ScanPlan,
     albedo: float,
 ) -> None:
@@ -37,14 +37,14 @@ def check_brightness(
         Too few samples contribute: free flights that end elsewhere, or a field of view that
         contains hardly any of the beam; or light too weak for its error in single precision.
     """
-    inside = float(np.median(extinction.values))
+    inside = float(np.median(truth.extinction[0].values))
     if not inside > 0:
         raise InputError(
             "wake.extinction.background: 0 is not allowed with a wake that fills less than half "
             "of the image; expected more, so that pixels have light and errors"
         )
     length, distance = float(np.median(plan.gate_length())), float(np.median(plan.ranges()[0]))
-    around = mapping.background + mapping.molecules
+    around = mapping.background + truth.molecules
     arriving = math.exp(-min(around * plan.gate_start, 300))
     light = lidar.aperture_area / distance**2 * albedo * inside * length / (4 * math.pi)
     if light * arriving**2 < SINGLE:
@@ -55,7 +55,7 @@ def check_brightness(
         )
     beams = len(plan.y) * len(plan.z)
     samples = most_samples(render, detector, beams, plan.gate_count)
-    least = least_samples(lidar, render, mapping, extinction, plan)
+    least = least_samples(lidar, render, mapping, truth, plan)
     if samples < least:
         key, value = "lidar.fov_half", shown(lidar.fov_half, "mrad")
         if render.estimator == "analog":
@@ -73,7 +73,7 @@ def least_samples(
     lidar: BackscatterLidar,
     render: RenderSettings,
     mapping: ExtinctionMapping,
-    extinction: xr.DataArray,
+    truth: Truth,
     plan: ScanPlan,
 ) -> int:
     """Samples per beam of which `CONTRIBUTIONS` bring light to a pixel of the median extinction.
@@ -84,8 +84,8 @@ def least_samples(
     in_view = overlap(lidar, distance)
     if render.estimator == "analog":
         # samples contribute if they collide in the gate
-        inside = float(np.median(extinction.values))
-        around = mapping.background + mapping.molecules
+        inside = float(np.median(truth.extinction[0].values))
+        around = mapping.background + truth.molecules
         arriving = math.exp(-min(around * plan.gate_start, 300))
         fraction = in_view * inside * float(np.median(plan.gate_length())) * arriving
     else:

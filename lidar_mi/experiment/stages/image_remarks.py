@@ -11,14 +11,21 @@ from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_di
 from lidar_mi.description import Description
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.scattering import Scattering
 from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.experiment.stages.brightness import overlap
-from lidar_mi.experiment.stages.light_budget import LEAST_OVERLAP
+from lidar_mi.experiment.stages.light_budget import (
+    LEAST_OVERLAP,
+    backscatter_fractions,
+    fractions_in_words,
+)
+from lidar_mi.experiment.truth.clear_air import ClearAir
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.units import shown
 
@@ -36,6 +43,9 @@ def image_remarks(
     flows: Flows,
     truth: Truth,
     plans: Sequence[ScanPlan],
+    scattering: Scattering,
+    air: Scatterer,
+    clear_air: ClearAir,
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each."""
     flow = _of_the_flow(wake, truth.wind) if wake.file else []
@@ -47,6 +57,7 @@ def image_remarks(
         *_of_the_speed(wake, platform, retrieval, volume, truth.wind, plans[0]),
         *_of_the_light(lidar, scan, plans[0]),
         *_of_the_pattern(scan),
+        *_of_the_molecules(wake.extinction, truth, scattering, air, clear_air),
     ]
 
 
@@ -132,6 +143,24 @@ def _of_the_light(lidar: BackscatterLidar, scan: Scan, plan: ScanPlan) -> list[s
     return [
         f"{key}: {half}{shown(lidar.fov_half, 'mrad')} sees {in_view:.0%} of "
         f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
+    ]
+
+
+def _of_the_molecules(
+    mapping: ExtinctionMapping,
+    truth: Truth,
+    scattering: Scattering,
+    air: Scatterer,
+    clear_air: ClearAir,
+) -> list[str]:
+    """Molecules that a file does not ask for, as none of before they were the default does."""
+    if "molecules" in mapping.model_fields_set or not clear_air.extinction:
+        return []
+    fractions = backscatter_fractions(mapping, truth, air, clear_air)
+    return [
+        "wake.extinction.molecules: not set, which is auto since version 1.0.0rc2 and was 0 "
+        f"before: backscatter by {fractions_in_words(fractions, scattering)} "
+        f"({clear_air.origin}); expected auto or 0"
     ]
 
 

@@ -82,9 +82,9 @@ def scattering_air(
     return found
 
 
-def environment_extinction(wake: Wake) -> float:
+def environment_extinction(wake: Wake, truth: Truth) -> float:
     """Extinction coefficient around the slab and up to it, m^-1."""
-    return wake.extinction.background + wake.extinction.molecules
+    return wake.extinction.background + truth.molecules
 
 
 def check_light(
@@ -128,9 +128,7 @@ def check_light(
     if not air.albedo > 0:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
     for plan in plans:
-        check_brightness(
-            lidar, render, detector, wake.extinction, truth.extinction[0], plan, air.albedo
-        )
+        check_brightness(lidar, render, detector, wake.extinction, truth, plan, air.albedo)
 
 
 def image_names() -> tuple[str, ...]:
@@ -206,6 +204,7 @@ def render_images(
     rendered = _rendered(
         _fields(wake, platform, scan, volume, flows, truth, plans, wanted, log),
         wake,
+        truth,
         lidar,
         scattering,
         with_samples(render, samples),
@@ -255,6 +254,7 @@ def _fields(
 def _rendered(
     fields: Sequence[xr.DataArray],
     wake: Wake,
+    truth: Truth,
     lidar: BackscatterLidar,
     scattering: Scattering,
     render: RenderSettings,
@@ -269,12 +269,12 @@ def _rendered(
         _media(lidar, fields, plans),
         plans,
         lidar,
-        environment_extinction(wake),
+        environment_extinction(wake, truth),
         *air,
         render.for_winds(),
         seed,
         scans=wanted,
-        molecules=molecules(wake.extinction.molecules, lidar.wavelength, scattering.band),
+        molecules=molecules(truth.molecules, lidar.wavelength, scattering.band),
         **how,
     )
 
@@ -305,12 +305,12 @@ def chosen_samples(
     # noise is that of air at the scan's reference time, which need not be moved for it
     fields, wanted = truth.extinction, range(len(plans))
     few = with_samples(render, number)
-    pilots = list(_rendered(fields, wake, lidar, scattering, few, seed, plans, air, wanted))
+    pilots = list(_rendered(fields, wake, truth, lidar, scattering, few, seed, plans, air, wanted))
     pilots = with_pair_stderr(pilots, truth.wind, platform.dt)
     found = []
     for plan, pilot in zip(plans, pilots, strict=True):
         noisy = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, scan.pulses_per_beam)
-        least = least_samples(lidar, render, wake.extinction, truth.extinction[0], plan)
+        least = least_samples(lidar, render, wake.extinction, truth, plan)
         found.append(choose_samples(noisy, number, render, least))
     return max(found, key=lambda one: (one.number, one.fraction))
 
@@ -389,7 +389,7 @@ def detect_images(
     if detector is None:
         return scans
     # geometry and air are in single precision in a file: here they are known exactly
-    air = {"environment_extinction": environment_extinction(wake)}
+    air = {"environment_extinction": environment_extinction(wake, truth)}
     # random numbers different from those of the light transport
     found = [
         noisy_scan(

@@ -10,6 +10,7 @@ from lidar_mi.experiment.schema.retrieval import Retrieval
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.winds import window_settings
+from lidar_mi.experiment.truth.clear_air import ClearAir
 from lidar_mi.experiment.truth.extinction import true_air
 from lidar_mi.experiment.truth.flows import Flows, advection_by
 from lidar_mi.instrument.scan import Scan
@@ -28,6 +29,7 @@ def texture_sweep(
     device: str | None,
     seed: int,
     flows: Flows,
+    clear_air: ClearAir,
     log: Log,
 ) -> xr.Dataset:
     """Errors of cross-correlation on extinction pairs of more and less sub-grid texture.
@@ -45,7 +47,9 @@ def texture_sweep(
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))
         texture = wake.texture.model_copy(update={"rms": rms})
         textured = wake.model_copy(update={"texture": texture})
-        truth = true_air(textured, platform, scan, volume, seed, flows, advected=advected)
+        truth = true_air(
+            textured, platform, scan, volume, seed, flows, clear_air, advected=advected
+        )
         wind = retrieve_wind(
             truth.image(0),
             truth.image(1),

@@ -21,6 +21,7 @@ from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_pair import Pair, both, combined_noise
 from lidar_mi.experiment.stages.rendering import environment_extinction
 from lidar_mi.experiment.stages.winds import retrieval_device
+from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector import Detector
@@ -181,11 +182,12 @@ def scan_volumes(
     scan: Scan,
     lidar: BackscatterLidar,
     detector: Detector | None,
+    truth: Truth,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
 ) -> Volumes:
     """Both scans as volumes on one grid in the air, without and with a detector's noise."""
-    nodes, way = grid(wake, scan, plans), environment_extinction(wake)
+    nodes, way = grid(wake, scan, plans), environment_extinction(wake, truth)
 
     def of_scan(number: int, name: str) -> xr.DataArray:
         return scan_volume(scans[number][name], plans[number], lidar, way, nodes)

@@ -18,6 +18,7 @@ from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
+from lidar_mi.experiment.truth.clear_air import ClearAir, clear_air
 from lidar_mi.experiment.truth.flows import Advection, Flows, advection_by, flows_of, mean_flow
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.scan import Scan
@@ -44,12 +45,14 @@ class Truth:
     """The observed air, in the lidar's frame at t1 (metres, m^-1, m s^-1).
 
     ``extinction`` and ``smooth`` (without sub-grid texture) hold the fields at t1 and t2, dims
-    (x, y, z); ``wind`` has v, w on (z, y), averaged over the depth of the first gate.
+    (x, y, z), of them ``molecules`` by clear air; ``wind`` has v, w on (z, y), averaged over the
+    depth of the first gate.
     """
 
     extinction: Sequence[xr.DataArray]
     smooth: Sequence[xr.DataArray]
     wind: xr.Dataset
+    molecules: float = 0.0
 
     def image(self, which: int, smooth: bool = False) -> xr.DataArray:
         """Extinction averaged over depth as an image (z, y): that of an ideal lidar."""
@@ -102,7 +105,9 @@ def make_truth(
         )
     if flows is None:
         flows = flows_of(experiment, None if beside is None else Path(beside))
-    return call(true_air, experiment, flows=flows, advected=advected)
+    path = experiment.folder if beside is None else Path(beside)
+    clear = call(clear_air, experiment, search_path=path)
+    return call(true_air, experiment, flows=flows, clear_air=clear, advected=advected)
 
 
 def true_air(
@@ -112,6 +117,7 @@ def true_air(
     volume: Volume | None,
     seed: int,
     flows: Flows,
+    clear_air: ClearAir,
     *,
     advected: Advection | None = None,
 ) -> Truth:
@@ -121,11 +127,13 @@ def true_air(
     ----------
     flows
         From `read_flows`.
+    clear_air
+        At the site.
     advected : callable, optional
         From `advection_by` the same flows.
     """
     first, second = flows
-    mapping = wake.extinction
+    mapping, molecules = wake.extinction, clear_air.extinction
     flow = mean_flow((first, second))
     advected = advected or advection_by(wake, platform, scan, volume, flows)
     smooth1 = extinction_of(first, mapping, first, second)
@@ -160,12 +168,13 @@ def true_air(
     wind.attrs["gates"] = gates
 
     def with_molecules(field: xr.DataArray) -> xr.DataArray:
-        return field.copy(data=field.values + mapping.molecules)
+        return field.copy(data=field.values + molecules)
 
     return Truth(
         Later(with_molecules(textured1), lambda: with_molecules(textured2())),
         Later(with_molecules(smooth1), lambda: with_molecules(smooth2())),
         wind,
+        molecules,
     )
 
 

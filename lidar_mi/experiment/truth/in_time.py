@@ -106,7 +106,7 @@ def air_in_time(
         return truth.extinction[which]
     flow, dt = mean_flow(flows), platform.dt
     u = _along(wake, scan, volume, flow)
-    molecules = wake.extinction.molecules
+    molecules = truth.molecules
     taus = state_times(wake, scan, volume, flows, times)
 
     def advected(state: int) -> xr.DataArray:

@@ -28,7 +28,7 @@ from lidar_mi.retrieval.correlation.outliers import median_outliers, validated
 from lidar_mi.retrieval.correlation.unresolved_motion import Motion, Residuals, unresolved
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.intensity import normalised
-from lidar_mi.retrieval.images.noise_map import known_and_weight
+from lidar_mi.retrieval.images.noise_map import known_and_weight, variance_of_residual
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.images.spline import band_limited, likeliest
@@ -82,9 +82,10 @@ def bootstrap_covariance(
     - Image 1 after its Wiener filter, the mean of the air given the image, is advected along paths
       in that wind.
     - The residual, image 2 less image 1 so advected, is moved by two templates along both axes,
-      scaled to the level (over Gaussians of 1.5 templates, times the noise where that is known of
-      each pixel) at its new place, and added. So noise and changes keep their size and correlation
-      length, but are independent of the texture.
+      scaled to the level at its new place, and added. The level is a mean over Gaussians of 1.5
+      templates; where the noise is known of each pixel, the residual's part that is noise follows
+      it. So noise and changes keep their size and correlation length, but are independent of the
+      texture.
 
     The vectors retrieved from this pair are d - h (1 - G) d + e, with the mean G over a window, the
     fraction h of least squares, and the random errors e. A vector lacks h (1 - G) of the wind and
@@ -120,7 +121,8 @@ def bootstrap_covariance(
         Windows that pass thresholds of texture half as high again; default: all.
     noise : float or torch.Tensor, optional
         Standard deviation of the images' noise. Where it is known of each pixel, the residual's
-        level and the errors are taken to vary as it does.
+        level and the errors are taken to vary as the residual does with it,
+        `noise_map.variance_of_residual`.
 
     Returns
     -------
@@ -154,7 +156,7 @@ def bootstrap_covariance(
     residual = torch.where(compared, second - moved.image, 0.0)
     # smoothed, as a noise from few samples is itself noisy; 1 where none is known
     _, weight = known_and_weight(images, noise)
-    weight = weight.to(residual)
+    weight = 1 / variance_of_residual(residual, 1 / weight.to(residual), compared, noise)
     level = averaged(residual.square() * weight, compared, _WIDTH * windows.template) / weight
     level = level.sqrt().clamp(min=torch.finfo(residual.dtype).tiny ** 0.25)
     added = level * (residual / level).roll([_SEPARATION * windows.template] * 2, (-2, -1))

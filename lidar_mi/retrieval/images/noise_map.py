@@ -1,4 +1,7 @@
-"""Maps of the noise of images: which pixels are known, and how much each weighs."""
+"""Maps of the noise of images: which pixels are known, and how much each weighs.
+
+What is left over by a match has the noise's variance only where noise is all that differs.
+"""
 
 from collections.abc import Sequence
 
@@ -37,3 +40,33 @@ def known_and_weight(
         # no pixel may outweigh a window of others
         weight = weight.clamp(max=100.0)
     return known_at, weight
+
+
+def variance_of_residual(
+    residual: torch.Tensor,
+    relative: torch.Tensor,
+    use: torch.Tensor,
+    noise: float | torch.Tensor | None,
+) -> torch.Tensor:
+    """Variance of the difference of two matched images by place, over its mean.
+
+    s q + 1 - s: a share s of the residual's mean square is noise and varies as it does, with the
+    relative variance q. The rest, such as motion that a match does not resolve, does not follow the
+    map. s is twice the noise's mean square, that of two images, over the residual's, at most 1.
+
+    Parameters
+    ----------
+    residual : torch.Tensor
+        Of the images' unit.
+    relative : torch.Tensor, same shape
+        q, with the mean 1.
+    use : torch.Tensor of bool, same shape
+        Where the residual is known.
+    noise : float, torch.Tensor or None
+        Standard deviation of an image's noise, in the same unit.
+    """
+    if noise is None or not bool(use.any()):
+        return relative
+    whole = float(residual[use].square().mean())
+    share = min(1.0, 2 * rms(noise) ** 2 / whole) if whole > 0 else 1.0
+    return share * relative + 1 - share

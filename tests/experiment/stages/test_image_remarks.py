@@ -20,7 +20,12 @@ from tests.support.command_line import shell, words_of
 
 WAKE = {
     "name": "warned",
-    "wake": {"file": "wake_slab_40s.nc", "time": "40 s", "spacing": "1 m"},
+    "wake": {
+        "file": "wake_slab_40s.nc",
+        "time": "40 s",
+        "spacing": "1 m",
+        "extinction": {"molecules": 0},
+    },
     "render": {"samples_per_beam": 16, "max_order": 1},
     "retrieval": {"methods": ["cc"], "stride": 8, "sources": "measured"},
     "detector": {},
@@ -125,9 +130,10 @@ def test_check_ends_with_the_warnings():
     assert title == "warned: warnings" and "overlap" in rows[0][0]
 
 
-def test_light_and_noise_are_those_of_the_rendered_image():
+@pytest.mark.parametrize("molecules", [0, "auto"])
+def test_light_and_noise_are_those_of_the_rendered_image(molecules):
     """The first order's median, to the spread of air in the median pixels (3 %)."""
-    run = prepared()
+    run = prepared(wake={"extinction": {"molecules": molecules}})
     results = run.results
     light = call(
         light_budget,
@@ -135,6 +141,7 @@ def test_light_and_noise_are_those_of_the_rendered_image():
         truth=results["truth"],
         plan=results["plans"][0],
         air=results["air"],
+        clear_air=results["clear_air"],
     )
     finish(run, with_figures=False)
     scan = run.scans[0].isel(gate=0)

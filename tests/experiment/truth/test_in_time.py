@@ -172,7 +172,7 @@ def test_molecules_stay(experiment, carried):
         which=0,
         times=np.array([-0.05, 0.05]),
     )
-    added = replace(truth, extinction=(sharp + 1e-4, sharp + 1e-4))
+    added = replace(truth, extinction=(sharp + 1e-4, sharp + 1e-4), molecules=1e-4)
     both = call(
         air_in_time, mixed, truth=added, flows=flows, which=0, times=np.array([-0.05, 0.05])
     )

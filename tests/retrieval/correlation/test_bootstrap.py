@@ -8,6 +8,7 @@ case where the air is seen by its texture.
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from scipy.special import ndtri
 
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
@@ -66,6 +67,39 @@ def test_differences_between_vectors_that_are_errors_are_not_shear():
     assert np.sqrt(np.nanmean(np.square(error)) / np.nanmean(np.square(stated))) == pytest.approx(
         1, abs=0.1
     )
+
+
+def test_a_map_of_little_noise_does_not_spread_the_errors_by_other_causes():
+    """Cores that windows do not resolve, in noise of 0.1 % that is largest where texture is steep
+    and air sheared: errors are the cores', so that the map changes none by more than 15 %. Taken as
+    the residual's map it would lower them by a third."""
+    y, z = axes(96, 64)
+    grid = np.meshgrid(y, z)
+    waves = plane_waves(3, 3.0, 0.5)
+
+    def moved(sign):
+        """Of air half a time step away, in a pair of cores of 1.5 m."""
+        at = list(grid)
+        for side in (-1, 1):
+            dy, dz = grid[0] - side * 10, grid[1]
+            square = dy**2 + dz**2
+            turn = side * 60 / (2 * np.pi) * (1 - np.exp(-square / 1.5**2)) / square * DT / 2
+            at = [at[0] + sign * turn * dz, at[1] - sign * turn * dy]
+        return texture(waves, *at)
+
+    one, two = (data_array(moved(sign), y, z) for sign in (-1, 1))
+    steep = gaussian_filter(sum(part**2 for part in np.gradient(one.values)), 4)
+    sheared = 0.05 + np.exp(-((abs(grid[0]) - 10) ** 2 + grid[1] ** 2) / 4**2)
+    square = steep * sheared
+    noise = one.copy(data=1e-3 * np.sqrt(square / square.mean()))
+    by_level, by_map = (
+        retrieve_wind(one, two, DT, "multipass", noise=n, windows=WindowSizes(stride=4))
+        for n in (1e-3, noise)
+    )
+    both = (by_level["flag"] == 0) & (by_map["flag"] == 0)
+    assert both.mean() > 0.8
+    ratio = (by_map["v_stderr"] / by_level["v_stderr"]).where(both)
+    assert abs(ratio - 1).max() < 0.15
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,100 @@
+"""The molecules of the air at the site: what they take from a beam and send back."""
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from lidar_mi.atmosphere.molecules import molecular_scattering
+from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import Only
+from lidar_mi.experiment.input_files import find_file
+from lidar_mi.experiment.schema.encounter import Encounter
+from lidar_mi.experiment.schema.scattering import Scattering
+from lidar_mi.experiment.schema.site import Site
+from lidar_mi.experiment.schema.wake import ExtinctionMapping
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.io.sounding import read_sounding
+
+SHORTEST_WAVELENGTH, LONGEST_WAVELENGTH = 0.2e-6, 2e-6
+"""m, of the refractive index of air; beyond, molecules scatter less than 7e-8 m^-1."""
+
+
+class ClearAir(NamedTuple):
+    """Molecular extinction (m^-1) and backscatter (m^-1 sr^-1), and of which air in words."""
+
+    extinction: float
+    backscatter: float
+    origin: str
+
+
+def clear_air(
+    wake_extinction: ExtinctionMapping,
+    site: Site,
+    lidar: Annotated[BackscatterLidar, Only("wavelength")],
+    scattering: Annotated[Scattering, Only("phase", "parts", "band")],
+    encounter: Encounter | None,
+    search_path: Path,
+) -> ClearAir:
+    """Molecules of the air, as stated or from the site's pressure and temperature.
+
+    Raises
+    ------
+    InputError
+        A sounding that cannot be used, or that does not reach the site's altitude; a wavelength at
+        which the refractive index of air is not known.
+    """
+    stated = wake_extinction.molecules
+    if stated == 0:
+        return ClearAir(0.0, 0.0, "none, as wake.extinction.molecules says")
+    if stated == "auto" and not are_particles(scattering):
+        return ClearAir(0.0, 0.0, f"none beside scattering.phase {scattering.phase}")
+    if stated == "auto" and lidar.wavelength > LONGEST_WAVELENGTH:
+        return ClearAir(0.0, 0.0, "none worth mention at this wavelength")
+    if lidar.wavelength < SHORTEST_WAVELENGTH:
+        raise InputError(
+            f"lidar.wavelength: {lidar.wavelength:g} m is not allowed with molecules, whose "
+            f"scattering is known from {SHORTEST_WAVELENGTH:g} m on; expected a longer one, or "
+            "wake.extinction.molecules: 0"
+        )
+    altitude = site_altitude(site, encounter)
+    pressure, temperature = _air_at(altitude, site, search_path)
+    air = molecular_scattering(lidar.wavelength, pressure, temperature, scattering.band)
+    if stated != "auto":
+        return ClearAir(stated, stated / air.lidar_ratio, "as wake.extinction.molecules says")
+    source = site.sounding or "standard atmosphere"
+    origin = f"{source} at {altitude:g} m: {pressure / 100:.4g} hPa, {temperature:.4g} K"
+    return ClearAir(air.extinction, air.backscatter, origin)
+
+
+def site_altitude(site: Site, encounter: Encounter | None) -> float:
+    """Altitude of the observed air above sea level, m; that of a flight unless stated."""
+    if site.altitude is not None:
+        return site.altitude
+    return encounter.path.altitude if encounter else 0.0
+
+
+def are_particles(scattering: Scattering) -> bool:
+    """Whether the scatterers are particles alone, which are in clear air."""
+    if scattering.phase == "mixture":
+        return all(part.phase in ("aerosol", "table") for part in scattering.parts or ())
+    return scattering.phase in ("aerosol", "table")
+
+
+def _air_at(altitude: float, site: Site, search_path: Path) -> tuple[float, float]:
+    """Pressure (Pa) and temperature (K)."""
+    if site.sounding is None:
+        return standard_atmosphere(altitude)[:2]
+    file = find_file(site.sounding, search_path, "site.sounding")
+    sounding = read_sounding(file)
+    lowest, highest = sounding.altitude[[0, -1]]
+    if not lowest <= altitude <= highest:
+        raise InputError(
+            f"site.altitude: {altitude:g} m is not allowed with {file}, which has {lowest:g} to "
+            f"{highest:g} m; expected an altitude that it has"
+        )
+    # pressure falls exponentially between levels
+    logarithm = np.interp(altitude, sounding.altitude, np.log(sounding.pressure))
+    temperature = np.interp(altitude, sounding.altitude, sounding.temperature)
+    return float(np.exp(logarithm)), float(temperature)
