@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from tests.support import cf_files, image_defects, image_files
+from tests.support import cf_files, defect_families, image_defects, image_files
 
 
 @cache
@@ -56,6 +56,7 @@ def scattering_tables(seed: int) -> str | None:
 PROPERTIES: dict[str, Callable[[int], str | None]] = {
     "extinction_fields": extinction_fields,
     "cf_files": cf_files.check,
+    "defect_families": defect_families.check,
     "image_defects": image_defects.check,
     "image_files": image_files.check,
     "scattering_tables": scattering_tables,

@@ -64,3 +64,47 @@ def test_outcome_counts_wrong_and_lost_vectors(monkeypatch):
     row = measure.outcome(family, "cc", [1, 2], loss=True)
     assert (row.valid, row.far, row.seeds_far, row.lost) == (0.9, 0.1, 2, 0.1)
     assert row.variance == pytest.approx(9 * 25 / 180)
+
+
+def judged(family, method, seeds, loss=False):
+    """On smaller images, which take a third of the time."""
+    small = replace(BY_NAME[family], shape=(64, 80))
+    return measure.outcome(small, method, range(1, seeds + 1), loss)
+
+
+SOME = ("columns", "flicker", "hexagonal lattice", "denoised")
+
+
+@pytest.mark.parametrize(
+    ("family", "method"),
+    [
+        ("columns", "cc"),
+        *(pytest.param(name, "variational", marks=pytest.mark.slow) for name in SOME),
+        *(pytest.param(name, "multipass", marks=pytest.mark.slow) for name in SOME[:-1]),
+        pytest.param(
+            "denoised",
+            "multipass",
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.xfail(
+                    strict=True,
+                    raises=AssertionError,
+                    reason="100 %: copies at rest are searched by variational alone",
+                ),
+            ],
+        ),
+    ],
+)
+def test_vectors_called_valid_are_within_their_errors(family, method):
+    """At most 1 % beyond four stated errors, of families that judge."""
+    row = judged(family, method, 1)
+    assert not row.valid or row.far <= measure.MOST_FAR
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["cc", *(pytest.param(m, marks=pytest.mark.slow) for m in ("multipass", "variational"))],
+)
+def test_checks_lose_no_clean_vectors(method):
+    row = judged("clean", method, 1, loss=True)
+    assert row.valid > 0.3 and row.lost <= measure.MOST_LOST and row.far <= measure.MOST_FAR

@@ -18,6 +18,7 @@ from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.noise_check import variance_by_coloured_noise
+from lidar_mi.retrieval.flow.other_motions import better_elsewhere
 from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
 from lidar_mi.retrieval.flow.prior_check import prior_check
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
@@ -231,6 +232,9 @@ def variational_and_flow(
         return result, None
     bare = interpolated(bare, pixels, centres) > 0.5
     flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * bare).short()
+    if len(stack) == 2:
+        other = better_elsewhere(images, linear, d, windows)
+        flag = flag | (Flag.OTHER_MOTION * other.to(flag.device)).short()
     result = result._replace(flag=flag)
     if bare.double().mean() > 0.5 or not (keep and isinstance(posterior, direct.Posterior)):
         return result, None

@@ -50,6 +50,8 @@ class Flag(enum.IntFlag):
     """What resampling of scattered beams lost exceeds the noise (`resampling_error`)."""
     ERROR_UNKNOWN = 8192
     """Too few valid vectors around it, or too few clearly textured, to state one (`bootstrap`)."""
+    OTHER_MOTION = 16384
+    """Another displacement explains the images around it better (`other_motions`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:

@@ -1,0 +1,87 @@
+"""Displacements of single windows that explain two images better than the flow fitted to them.
+
+A fit ends at the maximum of the likelihood that is next to its first displacements, which may be
+another one: of a lattice of dots, that one period off. Windows that move rigidly, without a prior,
+show it (two estimators of one quantity: Hausman 1978, Econometrica 46, 1251-1271).
+"""
+
+import math
+
+import torch
+from torch.nn.functional import max_pool2d, pad
+
+from lidar_mi.retrieval.correlation.first_pass import coarse_windows
+from lidar_mi.retrieval.flow.likelihood import Images, Linear
+from lidar_mi.retrieval.images.windows import Windows, linear_weights, separable
+
+FALSE_ALARM = 1e-3
+"""Probability that a window of images that are as the model has them is better explained."""
+
+
+def better_elsewhere(
+    images: Images, linear: Linear, d: torch.Tensor, windows: Windows
+) -> torch.Tensor:
+    """Where a rigid displacement explains two images better, bool of shape `windows.count`.
+
+    Over a Gaussian window (standard deviation of the template's size) minus the log-likelihood is
+    half the squared differences over their variance: of the images warped by the flow, and of the
+    images displaced by whole pixels within the range of the first displacements, with the
+    parabolas through it and its neighbours. At the true flow the probability that one of n
+    displacements is better by ln(n / p) is below p (Markov's inequality for ratios of
+    likelihoods). Those within 2 px of the flow are on its own maximum. The flow of a window that
+    is better explained is wrong as far as the window reaches, two standard deviations.
+
+    Parameters
+    ----------
+    images : Images
+        Two.
+    linear : Linear
+        Their likelihood about the flow.
+    d : torch.Tensor, shape (2, *windows.count)
+        The flow at the windows' centres, px.
+    windows : Windows
+    """
+    size, step = windows.template, max(windows.stride, windows.template // 2)
+    frame = Windows(windows.shape, size, windows.search, step)
+    centres = [frame.centres(axis).to(linear.warped) for axis in (0, 1)]
+    at = [windows.centres(axis).to(linear.warped) for axis in (0, 1)]
+    pairs = list(zip(at, centres, strict=True))
+    flow = separable(d.nan_to_num(0.0).to(linear.warped), [linear_weights(a, c) for a, c in pairs])
+    reach = math.ceil(coarse_windows(windows).reach)
+    rim = reach // 2 + 1
+    pixels = [torch.arange(n).to(linear.warped) for n in windows.shape]
+    places = [place.expand(2, -1, -1) for place in torch.meshgrid(*pixels, indexing="ij")]
+    fields = *images.spline.values(*places), linear.weight * linear.valid / 2, *images.usable
+    one, two, weight, *known = (pad(field.to(linear.warped), (rim,) * 4) for field in fields)
+    fitted = pad((linear.warped[1] - linear.warped[0]).square(), (rim,) * 4)
+    gauss = [
+        torch.exp(-(c[:, None] + rim - torch.arange(n).to(c)).square() / 2 / size**2)
+        for c, n in zip(centres, one.shape, strict=True)
+    ]
+
+    def excess(z: int, y: int) -> torch.Tensor:
+        """Minus the log-likelihood of a displacement over that of the flow, by the same pixels."""
+        back, on = (z // 2, y // 2), (z // 2 - z, y // 2 - y)
+        first, second, seen1, seen2 = (
+            field.roll(shift, (0, 1))
+            for field, shift in ((one, back), (two, on), (known[0], back), (known[1], on))
+        )
+        off = weight * seen1 * seen2 * ((second - first).square() - fitted)
+        return separable(off, gauss)
+
+    shifts = range(-reach - 1, reach + 2)
+    wide = torch.stack([torch.stack([excess(z, y) for y in shifts]) for z in shifts])
+    misfit = wide[1:-1, 1:-1]
+    least = misfit.clone()
+    for before, after in ((wide[:-2, 1:-1], wide[2:, 1:-1]), (wide[1:-1, :-2], wide[1:-1, 2:])):
+        bottom = torch.minimum(before, after) > misfit
+        bend = torch.where(bottom, before + after - 2 * misfit, torch.inf)
+        least -= (after - before).square() / (8 * bend)
+    whole = torch.arange(-reach, reach + 1).to(flow)
+    far = torch.maximum(
+        (whole[:, None, None, None] - flow[0]).abs(), (whole[:, None, None] - flow[1]).abs()
+    )
+    better = (far >= 2) & (least < -math.log(len(whole) ** 2 / FALSE_ALARM))
+    around = 2 * math.ceil(2 * size / step) + 1
+    found = max_pool2d(better.any(0).any(0).to(flow)[None], around, 1, around // 2)[0]
+    return separable(found, [linear_weights(c, a) for a, c in pairs]) > 0
