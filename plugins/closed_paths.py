@@ -14,6 +14,7 @@ about 1 / (1 + cos(theta)): flights towards the telescope contribute by far the 
 import drjit as dr
 import mitsuba as mi
 
+from .polarization import level_frame
 from .variant_types import Float, Point, Vector
 
 # of the components of the sum of two unit vectors in single precision
@@ -90,7 +91,7 @@ class OpenPath:
         sine = dr.sqrt(one_plus * one_minus)
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
         local = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, one_plus - 1)
-        return mi.Frame3f(self.away).to_world(local)
+        return level_frame(self.away).to_world(local)
 
     def density(self, used: Float, direction: Vector) -> Float:
         """Of `sample`, per steradian."""

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .bounds import UNIFORM, UNKNOWN, Bounds, leave, locate
+from .polarization import level_frame
 from .surfaces import Air
 from .variant_types import Float, Generator, Interaction, Mask, Medium, MediumPtr, Point, Vector
 
@@ -21,7 +22,7 @@ def interaction(
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p = position
     mei.wi = -direction
-    mei.sh_frame = mi.Frame3f(-direction)
+    mei.sh_frame = level_frame(-direction)
     mei.medium = medium
     mei.wavelengths = wavelengths
     mei.time = time

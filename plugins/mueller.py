@@ -41,7 +41,7 @@ import numpy as np
 
 from .parameters import fail
 from .parameters import table as read_table
-from .polarization import rotate_from_scattering_plane, scattering_angle
+from .polarization import level_frame, rotate_from_scattering_plane, scattering_angle
 from .registration import register
 from .variant_types import (
     Context,
@@ -160,7 +160,7 @@ def define() -> type:
         ) -> tuple[Vector, Spectrum, Float]:
             sine, cosine = dr.sincos(self.sample_angle(sample1, sample2.x, active))
             sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample2.y)
-            wo = mi.Frame3f(-mei.wi).to_world(
+            wo = level_frame(-mei.wi).to_world(
                 mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, cosine)
             )
             value, pdf = self.eval_pdf(ctx, mei, wo, active)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from .variant_types import Float, Medium, PhaseFunction, Spectrum, Stokes, Vector
+from .variant_types import Float, Frame, Medium, PhaseFunction, Spectrum, Stokes, Vector
 
 
 def horizontal_axis(direction: Vector) -> Vector:
@@ -25,6 +25,16 @@ def horizontal_axis(direction: Vector) -> Vector:
     return dr.select(
         vertical, mi.Vector3f(0, 1, 0), mi.Vector3f(-direction.y * scale, direction.x * scale, 0)
     )
+
+
+def level_frame(direction: Vector) -> Frame:
+    """Axes (e_h, e_v, direction) about a direction. They turn with it, up to the vertical.
+
+    Mitsuba's own axes about a direction change abruptly where it is horizontal: random numbers
+    common to beams would there make other paths.
+    """
+    horizontal = horizontal_axis(direction)
+    return mi.Frame3f(horizontal, dr.cross(direction, horizontal), direction)
 
 
 def transverse(axis: Vector, direction: Vector) -> Vector:

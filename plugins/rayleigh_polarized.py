@@ -30,7 +30,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .parameters import fail, number
-from .polarization import rotate_from_scattering_plane
+from .polarization import level_frame, rotate_from_scattering_plane
 from .registration import register
 from .variant_types import (
     Context,
@@ -108,7 +108,7 @@ def define() -> type:
             cosine = dr.clip(cosine, -1, 1)
             sine = dr.safe_sqrt(1 - cosine * cosine)
             sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample2.y)
-            wo = mi.Frame3f(-mei.wi).to_world(
+            wo = level_frame(-mei.wi).to_world(
                 mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, cosine)
             )
             value, pdf = self.eval_pdf(ctx, mei, wo, active)

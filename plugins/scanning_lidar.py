@@ -87,7 +87,7 @@ import numpy as np
 
 from .parameters import check_pose, choice, fail, number, numbers, pose, positive, whole
 from .parameters import table as read_table
-from .polarization import horizontal_axis
+from .polarization import level_frame
 from .registration import register
 from .variant_types import (
     Box,
@@ -163,8 +163,7 @@ def define() -> type:
         def beam_frame(self, beam: UInt) -> Frame:
             """Axes (e_h, e_v, beam axis) of beams given by their index, in the lidar's frame."""
             axis = dr.gather(mi.Vector3f, self.m_directions, beam)
-            horizontal = horizontal_axis(axis)
-            return mi.Frame3f(horizontal, dr.cross(axis, horizontal), axis)
+            return level_frame(axis)
 
         def beam_origin(self, beam: UInt) -> Point:
             """Where beams start: the middle of the telescope, in the lidar's frame."""

@@ -148,3 +148,28 @@ def test_finite_differences_of_common_numbers_are_the_gradient(world):
 def test_free_flights_have_independent_numbers(world):
     with pytest.raises(Exception, match=r"random_numbers.*independent"):
         scan(world, "common", estimator="analog")
+
+
+def test_beams_of_other_directions_have_the_same_error(world):
+    """Uniform air that scatters again and again, spherical gates: all beams have the same signal.
+
+    Across the horizontal plane, where beams of 2 mrad lie on both sides of it, and to the side.
+    """
+    elevation, azimuth = np.meshgrid([-6e-3, -2e-3, 2e-3, 6e-3], [0.0, 0.1, 0.2], indexing="ij")
+    aim = np.stack([np.cos(azimuth), np.sin(azimuth), elevation], -1).reshape(-1, 3)
+    aim /= np.linalg.norm(aim, axis=1, keepdims=True)
+    rays = np.column_stack([np.zeros_like(aim), aim, np.zeros(len(aim))])
+    lidar = world.lidar(
+        (3, 4),
+        (100.0, 108.0),
+        environment=world.ENVIRONMENT,
+        gate_count=GATES,
+        gate_kind="spherical",
+        fov_half_mrad=50.0,
+        beams=mi.TensorXf(rays.astype(np.float32)),
+    )
+    settings = {"max_order": 4, "random_numbers": "common"}
+    scene = world.scene(lidar, settings, environment=world.homogeneous(0.04))
+    image = channels(scene, samples=256)
+    off = np.abs(image["S0"] - image["S0"].mean((0, 1))).max((0, 1))
+    assert (off < 0.1 * image["S0_stderr"].mean((0, 1))).all()
