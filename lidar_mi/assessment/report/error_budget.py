@@ -16,6 +16,7 @@ from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 
 # A cause with a smaller fraction of the mean square error is not named.
 _LEAST = 0.1
+_LARGER = "larger without"
 
 
 def limit_sentence(budget: Mapping[str, float], method: str) -> str:
@@ -64,8 +65,9 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
         heading="Errors without each cause in turn",
         legend="Rms errors in m/s of v and w, and the fraction of the mean square error of both "
         "due to the cause: over the same valid vectors, and over those beyond two core radii. "
-        "Noise is removed as realised, not drawn again. The method itself: its error on images of "
-        "the air without blur and noise.",
+        f"{_LARGER}: the mean square error more than doubles without the cause: no fraction is due "
+        "to it, and the row does not apply. Noise is removed as realised, not drawn again. The "
+        "method itself: its error on images of the air without blur and noise.",
         tables=[_table(budget, method) for method, budget in budgets.items()],
     )
     lead = [limit_sentence(budget, method) for method, budget in budgets.items()]
@@ -80,11 +82,16 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
     return Chapter("Error budget of the cross-flow wind", lead, drawn, numbers)
 
 
+def _fraction(value: float) -> str:
+    """A fraction of the mean square error; in words where the error doubles without the cause."""
+    return _LARGER if value < -1 else whole_percent(value)
+
+
 def _table(budget: Mapping[str, float], method: str) -> NumberTable:
     def values(cause: str) -> list[str]:
         shown = []
         for place in PLACES:
-            for key, style in (("rmse_v", fixed), ("rmse_w", fixed), ("fraction", whole_percent)):
+            for key, style in (("rmse_v", fixed), ("rmse_w", fixed), ("fraction", _fraction)):
                 value = budget.get(f"{place}{cause}{key}")
                 shown.append("-" if value is None else style(value))
         return shown

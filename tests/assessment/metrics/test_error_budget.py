@@ -382,3 +382,12 @@ def test_a_chapter_without_vectors_has_no_figure_and_dashes(tmp_path):
     assert rows == [("with all causes", "", ["-"] * 6)]
     found = budget_chapter({"cc": described(beam_blur=-0.001)}, []).numbers.tables[0][2]
     assert found[1] == ("without: width of the beam", "", ["0.100", "0.100", "0 %", "-", "-", "-"])
+
+
+def test_a_row_that_does_not_apply_says_so():
+    """An error that more than doubles without a cause has no fraction that is due to it."""
+    budget = described(detector_noise=-22.08, beam_blur=-0.4)
+    ((_, heads, rows),) = budget_chapter({"variational": budget}, []).numbers.tables
+    shown = {label: values[heads.index("fraction")] for label, _, values in rows}
+    assert shown["without: noise of the detector"] == "larger without"
+    assert "40" in shown["without: width of the beam"]

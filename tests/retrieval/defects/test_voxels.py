@@ -55,6 +55,9 @@ def test_repeated_voxels_are_said():
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True, raises=AssertionError, reason="1 to 67 % of the vectors are valid, not 90 %"
+)
 @pytest.mark.parametrize("method", ["correlation", "variational"])
 @pytest.mark.parametrize("fraction, height", [(0.001, 20.0), (0.005, 2.0), (0.005, 20.0)])
 def test_wind_among_hot_voxels(method, fraction, height):
