@@ -261,6 +261,7 @@ def test_candidates_lower_the_variance(variant):
         assert found[case, "relative variance of a pixel"].ratio > 1.5
 
 
+@pytest.mark.slow
 def test_gradients_take_little_more_memory_with_the_orders(variant):
     times, memory = {}, {}
     for order in (1, 4):
@@ -458,6 +459,7 @@ def test_without_a_gpu_the_reason_is_said(monkeypatch):
     assert found.reason == "skipped: no NVIDIA GPU with a driver that is new enough"
 
 
+@pytest.mark.slow
 def test_a_gpu_beside_the_processor(monkeypatch):
     """The processor in its place: the same images, z-scores as expected, ratios of time."""
     renderer_of, retrieval = gpu.renderer_of, gpu.retrieval

@@ -80,8 +80,8 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     page = (tmp_path / "report.html").read_text()
     assert "Beyond the autopilot, the lidar removes" in page and "own goal of 80 %" in page
     assert "Requirements, as measured in flight" in page
-    row = 'data-head="required">at least 10 Hz</td><td data-head="in flight">10 Hz</td>'
-    assert f"slabs per second</td><td {row}" in page
+    row = 'data-head="measured">10 Hz</td><td data-head="required">at least 10 Hz</td>'
+    assert row in page
     assert flight.metrics["encounter.normalised_innovation"] < 2
     shown = str(flight)
     assert (

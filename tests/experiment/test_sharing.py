@@ -44,6 +44,7 @@ BEHIND_RINGS = {
     "lidar": {"pulse_energy": "2 mJ"},
     "detector": {},
     "scan": {"range": "400 m"},
+    "site": {"altitude": "500 m"},
     "scattering": {"phase": "isotropic", "aerosol": None},
     "render": {"samples_per_beam": 16},
     "retrieval": {"methods": ["cc"], "stride": 2},

@@ -95,6 +95,7 @@ def test_elements_of_a_table():
     compared(scene, f"{MEDIUM}.phase_function.table", steps, samples=500, seeds=12)
 
 
+@pytest.mark.slow
 def test_asymmetry():
     scene = reference.loaded(reference.extinction(1.0, True), {"type": "hg", "g": 0.6})
     compared(scene, f"{MEDIUM}.phase_function.g", np.array([[0.03]]), samples=500)
@@ -131,10 +132,9 @@ def case(name):
 @pytest.mark.parametrize(
     "name",
     [
-        "extinction",
         "table",
         "flow",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("albedo", "blend")),
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("extinction", "albedo", "blend")),
     ],
 )
 def test_forward_is_the_transpose_of_backward(name):

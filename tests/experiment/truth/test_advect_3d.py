@@ -47,7 +47,7 @@ def written(folder, aerosol, wind, x=X, name="volume.nc"):
 
 def experiment(folder, file, **wake):
     """Extinction in proportion to the aerosol."""
-    extinction = {"tracer": None, "background": "1 / km"}
+    extinction = {"tracer": None, "background": "1 / km", "molecules": 0}
     given = {"file": file, "second": "advect_3d", "x": "0 m", "texture": {"rms": 0}}
     wake = given | {"extinction": extinction} | wake
     return check({"name": "moving", "wake": wake, "platform": {"dt": DT}}).read_from(folder)

@@ -312,9 +312,8 @@ def test_mean_square_strain():
     assert _mean_square_strain(turning) == 0
 
 
-@pytest.mark.parametrize(
-    ("turnover", "rms"), [(0.1, 0.8), pytest.param(0.4, 0.4, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("turnover", "rms"), [(0.1, 0.8), (0.4, 0.4)])
 def test_errors_of_flows_drawn_from_a_spectrum(turnover, rms, monkeypatch):
     """Variance of normalised errors of six flows in noise of 1 and 5 % that is told.
 
