@@ -137,6 +137,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
         "backscatter.multiple_scattering_fraction",
         "backscatter.depolarization",
         "backscatter.depolarization_stderr",
+        *(f"backscatter.fraction.{part}" for part in ("molecules", "background", "exhaust")),
     }
     # images alone are judged in v and w
     expected |= {key for key in metrics if key.startswith("sensor.flight_control.")}
