@@ -15,7 +15,7 @@ from lidar_mi.retrieval.correlation.settings import MultipassSettings
 from lidar_mi.retrieval.defects.copies import Copy, without_copy
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.defects.removal import CleanImages, as_they_are, without_defects
-from lidar_mi.retrieval.defects.sampling import Sampling, no_structure, sampling
+from lidar_mi.retrieval.defects.sampling import no_structure, sampling
 from lidar_mi.retrieval.defects.unrelated import unrelated
 from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
@@ -35,7 +35,7 @@ from lidar_mi.retrieval.wind.methods import Method
 from lidar_mi.retrieval.wind.options import IMAGE_WINDOWS, VALIDATION, VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair_dataset import Vectors, pair_dataset
 from lidar_mi.retrieval.wind.pair_input import PairInput, checked_input, method_of
-from lidar_mi.retrieval.wind.samples import at_windows, samples_fit, samples_of, sizes_of_samples
+from lidar_mi.retrieval.wind.samples import samples_fit, samples_of, wind_from_samples
 
 
 @checked_arguments
@@ -149,7 +149,12 @@ def retrieve_wind(
         "device": device,
     }
     if structure.thinned and samples_fit(given.images[0], structure, windows, blur > 0):
-        return _from_samples(given, structure, windows, chosen, noise, times, options)
+        seen = None if times is None else [samples_of(t, structure) for t in times]
+        options |= {"dt": given.dt, "method": chosen, "times": seen}
+        places = centres(given.images[0], given.windows, "template")
+        return wind_from_samples(
+            retrieve_wind, given.images, structure, windows, noise, places, **options
+        )
     given = given._replace(pixels=structure.masked(given.pixels))
 
     def found() -> tuple[CleanImages, Vectors]:
@@ -163,27 +168,6 @@ def retrieve_wind(
     if structure.spoilt or structure.thinned:
         wind["flag"] = wind["flag"] | np.int16(Flag.AT_REST)
     return wind.assign_attrs(sampling=structure.said) if structure.said else wind
-
-
-def _from_samples(
-    given: PairInput,
-    structure: Sampling,
-    windows: WindowSizes,
-    method: Method,
-    noise: float | xr.DataArray | None,
-    times: Sequence[xr.DataArray] | None,
-    options: dict[str, Any],
-) -> xr.Dataset:
-    """The wind from the samples of images that have more pixels than samples."""
-    one, two, *more = (samples_of(image, structure) for image in given.images)
-    level = samples_of(noise, structure) if isinstance(noise, xr.DataArray) else noise
-    seen = None if times is None else [samples_of(t, structure) for t in times]
-    sizes = sizes_of_samples(windows, structure)
-    found = retrieve_wind(
-        one, two, given.dt, method, windows=sizes, noise=level, more=more, times=seen, **options
-    )
-    places = centres(given.images[0], given.windows, "template")
-    return at_windows(found, places, structure, windows)
 
 
 def _vectors(

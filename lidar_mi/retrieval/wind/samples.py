@@ -1,6 +1,6 @@
 """Winds from the samples of images that have more pixels than samples."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,37 @@ def samples_fit(
     """Whether the samples of an image are enough for the windows, square ones if they must be."""
     lengths = [n // step for n, step in zip(image.shape, structure.steps, strict=True)]
     return min(lengths) >= windows.search + 2 and not (square and len(set(structure.steps)) > 1)
+
+
+def wind_from_samples(
+    retrieve: Callable[..., xr.Dataset],
+    images: Sequence[xr.DataArray],
+    structure: Sampling,
+    windows: WindowSizes,
+    noise: float | xr.DataArray | None,
+    places: Mapping[str, Any],
+    **options: Any,
+) -> xr.Dataset:
+    """The wind from the samples of images or volumes that have more pixels than samples.
+
+    Parameters
+    ----------
+    retrieve : callable
+        `retrieve_wind` or `retrieve_wind_volume`, with `options`.
+    images : sequence of xr.DataArray
+        All of them, in the order of time.
+    structure : Sampling
+    windows : WindowSizes
+        Of the pixels.
+    noise : float, xr.DataArray or None
+    places : mapping
+        Centres of the windows of the pixels, by axis.
+    """
+    one, two, *more = (samples_of(image, structure) for image in images)
+    level = samples_of(noise, structure) if isinstance(noise, xr.DataArray) else noise
+    sizes = sizes_of_samples(windows, structure)
+    found = retrieve(one, two, windows=sizes, noise=level, more=more, **options)
+    return at_windows(found, places, structure, windows)
 
 
 def samples_of(image: xr.DataArray, structure: Sampling) -> xr.DataArray:

@@ -32,7 +32,7 @@ from lidar_mi.retrieval.wind.options import (
     VectorValidation,
     WindowSizes,
 )
-from lidar_mi.retrieval.wind.samples import at_windows, samples_fit, samples_of, sizes_of_samples
+from lidar_mi.retrieval.wind.samples import samples_fit, wind_from_samples
 
 AXES = ("x", "z", "y")
 
@@ -133,22 +133,19 @@ def retrieve_wind_volume(
     steps, same = spacing(stack[0]), identical(stack, "volumes")
     structure = sampling(raw) if checks else no_structure(raw)
     if structure.thinned and samples_fit(stack[0], structure, windows, False):
-        one, two, *others = (samples_of(volume, structure) for volume in stack)
-        noise = samples_of(level, structure) if isinstance(level, xr.DataArray) else level
-        sizes = sizes_of_samples(windows, structure)
-        wind = retrieve_wind_volume(
-            one,
-            two,
-            dt,
-            method,
-            windows=sizes,
+        return wind_from_samples(
+            retrieve_wind_volume,
+            stack,
+            structure,
+            windows,
+            level,
+            centres(stack[0], frame, "window"),
+            dt=dt,
+            method=method,
             validation=validation,
-            noise=noise,
-            more=others,
             settings=settings,
             device=device,
         )
-        return at_windows(wind, centres(stack[0], frame, "window"), structure, windows)
     seen = structure.masked(raw)
     strange = [outstanding(v) if checks else torch.zeros_like(v, dtype=torch.bool) for v in seen]
     seen = [
