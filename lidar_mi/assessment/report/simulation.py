@@ -9,7 +9,7 @@ from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.campaign import metrics_of
-from lidar_mi.assessment.metrics.names import Source, wind_key
+from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.assessment.metrics.simulation import largest_parts, simulation_parts
 
 _FRACTION = f"{Source.NOISY}.monte_carlo_fraction"
@@ -23,8 +23,8 @@ _LEAST_PART = 0.1
 def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
     """Which part of the wind's error is the simulation's; empty where it is as small as asked for.
 
-    Of volumes, whose winds are not retrieved once more, and where no vector is valid, which part of
-    the images' noise it is.
+    Which part of the images' noise it is, of volumes, whose winds are not retrieved once more, and
+    where no method has a vector that is valid with this noise and with as much again.
 
     Parameters
     ----------
@@ -36,7 +36,8 @@ def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str,
         return ""
     allowed = experiment.render.monte_carlo_fraction
     number = f"{metrics[_SAMPLES]:.0f} Monte Carlo samples per beam"
-    if experiment.volume or _without_vectors(experiment, metrics):
+    parts = simulation_parts(metrics, experiment.retrieval.methods)
+    if experiment.volume or not parts:
         fraction = metrics.get(_FRACTION, 0.0)
         if experiment.detector and fraction > allowed:
             return (
@@ -47,10 +48,10 @@ def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str,
             return ""
         relative = whole_percent(metrics[f"{Source.BACKSCATTER}.mc_relative_error"])
         return (
-            f"No vector is valid, and noise of the images, {relative} of the signal of a pixel, is "
-            f"that of the simulation, not of the lidar ({number})."
+            "No vector is valid with as much noise again, and noise of the images, "
+            f"{relative} of the signal of a pixel, is that of the simulation, not of the lidar "
+            f"({number})."
         )
-    parts = simulation_parts(metrics, experiment.retrieval.methods)
     large = [part for part in parts if part.exceeds(allowed)]
     if not large:
         return ""
@@ -118,13 +119,6 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
         f"{f' ({where})' if where else ''}; "
         "render.samples_per_beam: auto or more, or a larger render.max_samples, reduces it. "
     )
-
-
-def _without_vectors(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> bool:
-    """Whether no method has a valid vector from the most complete images."""
-    source = Source.NOISY if experiment.detector else Source.BACKSCATTER
-    methods = experiment.retrieval.methods
-    return not any(metrics.get(wind_key(source, m, "valid_fraction")) for m in methods)
 
 
 def _needed(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> float:

@@ -34,11 +34,16 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def newcomer(**changes):
-    """An own wake, 200 m ahead, 5 mJ; samples as they come by default."""
+    """An own wake in aerosol alone, 200 m ahead, 5 mJ; samples as they come by default."""
     pair = {"circulation": 60, "separation": 16, "core_radius": 5, "width": 40, "height": 26}
     data = {
         "name": "newcomer",
-        "wake": {"vortex_pair": pair, "spacing": "1 m", "texture": {"outer_scale": "5 m"}},
+        "wake": {
+            "vortex_pair": pair,
+            "spacing": "1 m",
+            "texture": {"outer_scale": "5 m"},
+            "extinction": {"molecules": 0},
+        },
         "platform": {"speed": "70 m/s"},
         "lidar": {"pulse_energy": "5 mJ", "pulse_duration": "10 ns"},
         "scan": {"range": "200 m"},
@@ -246,6 +251,17 @@ def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(pr
     assert run.metrics["backscatter.samples_per_beam"] == 4e4 // (41 * 27)
     said = [text for text in run.warnings if text.startswith("render.max_samples: ")]
     assert bool(said) == run.answer[0].startswith("Noise of the simulation")
+
+
+def test_where_as_much_noise_again_leaves_no_valid_vector_it_is_said_of_the_images():
+    """Of half the contrast, by molecules, and four samples."""
+    molecules = {"extinction": {"molecules": "auto"}}
+    run = prepare(newcomer(wake=molecules, render={"samples_per_beam": 4}))
+    finish(run, with_figures=False)
+    assert not np.isfinite(run.results["simulation_noise"]["w"]).any()
+    assert run.metrics["backscatter_noisy.monte_carlo_fraction"] > 10
+    assert run.answer[0].startswith("Noise of the images is in part that of the simulation")
+    assert any(text.startswith("render.samples_per_beam: noise of") for text in run.warnings)
 
 
 def test_a_run_along_a_curve_has_it():
