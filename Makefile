@@ -2,7 +2,7 @@
 # ARGS goes to the command behind a target: make test ARGS="tests/system/test_llvm.py -x"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all fuzz bench validate reference pictures docs lint clean
+.PHONY: help setup demo test test-all fuzz bench validate pictures docs lint clean
 
 PYTHON_ENV := .venv/bin/python
 EXPERIMENT := wake_sensor
@@ -40,9 +40,6 @@ validate: setup ## check against closed forms, published numbers and other progr
 	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (f('scatrs') and f('rustmatrix') and f('miepython')))" \
 		|| $(PYTHON_ENV) -m pip install -q -e ".[test]"
 	$(PYTHON_ENV) -m validation $(ARGS)
-
-reference: setup ## write the pages of keys, commands, public names and plugins anew, from the code
-	@for page in key command api plugin; do $(PYTHON_ENV) docs/make_$${page}_reference.py || exit 1; done
 
 pictures: setup ## make the pictures of the pages anew, hours; some: make pictures ARGS="wake airport"
 	@$(PYTHON_ENV) -c "import nbclient, nbformat" 2>/dev/null || $(PYTHON_ENV) -m pip install -q -e ".[test]"

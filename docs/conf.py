@@ -76,8 +76,8 @@ def _styled(found):
 
 
 def _write_pages(app):
-    """Those that are made from the results of the validation."""
-    runpy.run_path(str(Path(app.srcdir) / "make_validation_pages.py"), run_name="__main__")
+    """Those that are made from the code and from stored results."""
+    runpy.run_path(str(Path(app.srcdir) / "make_pages.py"), run_name="__main__")
 
 
 def setup(app):

@@ -1,6 +1,4 @@
-"""Write docs/api.md and docs/api/*.md from the public names and their docstrings.
-
-Usage: ``python docs/make_api_reference.py``.
+"""Pages api.md and api/*.md from the public names and their docstrings.
 
 The names are those of ``lidar_mi/__init__.pyi``; Sphinx writes their docstrings into the pages. A
 name is on the page of the module that it comes from.
@@ -12,8 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import lidar_mi
-
-FOLDER = Path(__file__).parent
 
 NOTE = "<!-- Written by docs/make_api_reference.py from lidar_mi/__init__.pyi; edit that. -->"
 HEAD = f"""\
@@ -142,10 +138,3 @@ def _directive(name: str) -> Iterator[str]:
         yield f"   :members: {members}".rstrip()
     if name == "Flag":
         yield "   :member-order: bysource"
-
-
-if __name__ == "__main__":
-    (FOLDER / "api").mkdir(exist_ok=True)
-    for name, text in pages().items():
-        (FOLDER / name).write_text(text, encoding="utf-8")
-    print(f"{FOLDER}: {len(pages()) - 1} pages of public names")

@@ -1,17 +1,11 @@
-"""Write docs/reference/commands.md from the help of the command line.
-
-Usage: ``python docs/make_command_reference.py``.
-"""
+"""Page reference/commands.md from the help of the command line."""
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import typer
 
 from lidar_mi.cli.app import app
-
-PAGE = Path(__file__).with_name("reference") / "commands.md"
 
 HEAD = """\
 # Command line
@@ -24,11 +18,11 @@ done, with 2 if its input is refused (one line says why), and with 130 if it is 
 """
 
 
-def page() -> str:
-    """The whole page."""
+def pages() -> dict[str, str]:
+    """Text of the page by its place below ``docs``."""
     commands = typer.main.get_command(app).commands
     parts = [part for name, one in commands.items() for part in _command(name, one)]
-    return "\n\n".join([HEAD.rstrip(), *parts]) + "\n"
+    return {"reference/commands.md": "\n\n".join([HEAD.rstrip(), *parts]) + "\n"}
 
 
 def _command(name: str, command, depth: int = 2) -> Iterator[str]:
@@ -71,9 +65,3 @@ def _examples(epilog: str) -> str:
     """Commands of the list of examples as lines of a block."""
     lines = [line[3:-1] for line in epilog.splitlines() if line.startswith("- `")]
     return "\n".join(["```text", *lines, "```"])
-
-
-if __name__ == "__main__":
-    PAGE.parent.mkdir(exist_ok=True)
-    PAGE.write_text(page(), encoding="utf-8")
-    print(f"{PAGE}: {len(page().splitlines())} lines")

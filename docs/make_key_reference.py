@@ -1,20 +1,15 @@
-"""Write docs/reference/keys*.md from the descriptions of the experiment file.
+"""Pages reference/keys*.md from the descriptions of the experiment file.
 
-Usage: ``python docs/make_key_reference.py``.
-
-The pages say what ``lidar-mi explain`` says, a page for each section of a file, or for each kind of
+They say what ``lidar-mi explain`` says, a page for each section of a file, or for each kind of
 it.
 """
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 from pydantic import BaseModel
 
 from lidar_mi.experiment.schema import keys
-
-FOLDER = Path(__file__).with_name("reference")
 
 NOTE = (
     "<!-- Written by docs/make_key_reference.py from the descriptions of the keys; edit those. -->"
@@ -51,7 +46,7 @@ TABLE = "| key | meaning | unit | default | allowed |\n| --- | --- | --- | --- |
 
 
 def pages() -> dict[str, str]:
-    """Texts of all pages by the names of their files."""
+    """Texts of all pages by their places below ``docs``."""
     found = [keys.explain(name) for name in keys.sections()]
     top = [keys.explain(name) for name in keys.OF_A_FILE]
     sections = [key for key in found if key.keys]
@@ -72,7 +67,8 @@ def pages() -> dict[str, str]:
             "```\n",
         ]
     )
-    return {"keys.md": contents} | {f"{name}.md": text for name, (*_, text) in below.items()}
+    texts = {"keys": contents} | {name: text for name, (*_, text) in below.items()}
+    return {f"reference/{name}.md": text for name, text in texts.items()}
 
 
 def _of_section(key: keys.Key) -> dict[str, tuple[str, str, str]]:
@@ -155,12 +151,3 @@ def _text(text: str) -> str:
     named = r"(?<![\w.`/-])([a-z]\w*(?:[._][a-z]\w*)+)(?![\w`-])"
     parts[::2] = [re.sub(named, r"`\1`", part.replace("<", r"\<")) for part in parts[::2]]
     return "".join(parts)
-
-
-if __name__ == "__main__":
-    FOLDER.mkdir(exist_ok=True)
-    for old in FOLDER.glob("keys*.md"):
-        old.unlink()
-    for name, text in pages().items():
-        (FOLDER / name).write_text(text, encoding="utf-8")
-    print(f"{FOLDER}: {len(pages())} pages of keys")

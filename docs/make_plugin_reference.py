@@ -1,6 +1,4 @@
-"""Write docs/plugins.md and a page for each plugin in docs/plugins from the plugins' docstrings.
-
-Usage: ``python docs/make_plugin_reference.py``.
+"""Pages plugins.md and plugins/*.md, one for each plugin, from the plugins' docstrings.
 
 The docstrings are reStructuredText as Mitsuba's own plugins have them. Of that language this knows
 what they use: a label, a title, paragraphs, simple tables and code blocks, with literals and
@@ -9,11 +7,8 @@ references in the text. Anything else is an error, not a guess.
 
 import inspect
 import re
-from pathlib import Path
 
 from lidar_mi.plugins import PLUGINS
-
-FOLDER = Path(__file__).parent
 
 HEAD = """\
 # Plugins
@@ -34,7 +29,7 @@ _KINDS = {"phase": "phase function"}
 
 
 def pages() -> dict[str, str]:
-    """Texts of all pages as GitHub-flavoured Markdown, by their places under docs."""
+    """Texts of all pages as GitHub-flavoured Markdown, by their places below ``docs``."""
     rows = [
         f"| [`{plugin.NAME}`](plugins/{plugin.NAME}.md) | {_KINDS.get(plugin.KIND, plugin.KIND)} | "
         f"{_title(plugin).partition(' (`')[0]} |"
@@ -133,10 +128,3 @@ def _inline(text: str) -> str:
     if re.search(r":\w+:`", text):
         raise ValueError(f"unknown role in: {text!r}")
     return re.sub(r"``([^`]+)``", r"`\1`", text)
-
-
-if __name__ == "__main__":
-    (FOLDER / "plugins").mkdir(exist_ok=True)
-    for name, text in pages().items():
-        (FOLDER / name).write_text(text, encoding="utf-8")
-    print(f"{FOLDER}: {len(PLUGINS)} plugins")

@@ -1,7 +1,4 @@
-"""Write the pages of ``docs/validation`` from the results that ``make validate`` stored.
-
-Usage: ``python docs/make_validation_pages.py``.
-"""
+"""Pages validation/*.md from the results that ``make validate`` stored."""
 
 import sys
 from pathlib import Path
@@ -15,12 +12,6 @@ RESULTS = FOLDER.parent / "validation" / "results"
 
 
 def pages() -> dict[str, str]:
-    """Texts of the pages by their place below ``docs``."""
+    """Texts of the pages by their places below ``docs``."""
     stored = sorted(RESULTS.glob("*.json"))
     return {f"validation/{one.stem}.md": report.page(report.load(one)) for one in stored}
-
-
-if __name__ == "__main__":
-    for name, text in pages().items():
-        report.write(text, FOLDER / name)
-    print(f"{FOLDER / 'validation'}: {len(pages())} pages")

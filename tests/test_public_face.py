@@ -9,6 +9,7 @@ import doctest
 import importlib
 import inspect
 import re
+import runpy
 from importlib.resources import files
 from pathlib import Path
 
@@ -93,9 +94,15 @@ def test_public_function_has_an_example(name):
         assert any(f"lm.{name}(" in example.source for example in examples)
 
 
-def test_every_public_name_has_its_place_in_the_documentation():
-    pages = (Path(__file__).parents[1] / "docs" / "api").glob("*.md")
-    text = "\n".join(page.read_text() for page in pages)
+@pytest.fixture(scope="module")
+def pages():
+    """Of the public names, as the site has them."""
+    script = Path(__file__).parents[1] / "docs" / "make_api_reference.py"
+    return runpy.run_path(str(script))["pages"]()
+
+
+def test_every_public_name_has_its_place_in_the_documentation(pages):
+    text = "\n".join(pages.values())
     named = re.findall(r"^\.\. auto\w+:: lidar_mi\.(\w+)$", text, re.MULTILINE)
     assert sorted([*named, "__version__"]) == sorted(lm.__all__)
 
@@ -103,10 +110,9 @@ def test_every_public_name_has_its_place_in_the_documentation():
 MADE_BY_HAND = {"AircraftPose", "VectorValidation", "VirtualLidar", "WindowSizes"}
 
 
-def test_table_of_calls_has_the_signatures():
+def test_table_of_calls_has_the_signatures(pages):
     """Every function, and what one makes by hand, with its parameters and their defaults."""
-    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text()
-    calls = re.findall(r"^\| `lm\.(\w+)(\(.*?\))` \| ", page, re.MULTILINE)
+    calls = re.findall(r"^\| `lm\.(\w+)(\(.*?\))` \| ", pages["api.md"], re.MULTILINE)
     functions = {name for name in lm.__all__ if inspect.isfunction(getattr(lm, name))}
     assert {name for name, _ in calls} == functions | MADE_BY_HAND
     for name, call in calls:

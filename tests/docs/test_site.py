@@ -31,6 +31,21 @@ def listed(page):
         yield from listed(below)
 
 
+def test_pages_that_are_made_are_written_where_they_change(tmp_path, monkeypatch):
+    script = runpy.run_path(str(DOCS / "make_pages.py"))
+    monkeypatch.setitem(script["write"].__globals__, "DOCS", tmp_path)
+    made = {"api.md": "a\n", "plugins/ccd.md": "b\n", "reference/keys.md": "c\n"}
+    monkeypatch.setitem(script["write"].__globals__, "pages", lambda: made)
+    (tmp_path / "reference").mkdir()
+    (tmp_path / "reference" / "keys.md").write_text("c\n")
+    (tmp_path / "reference" / "keys_gone.md").write_text("of a key that was renamed\n")
+    before = (tmp_path / "reference" / "keys.md").stat().st_mtime_ns
+    script["write"]()
+    found = {str(page.relative_to(tmp_path)): page.read_text() for page in tmp_path.rglob("*.md")}
+    assert found == made
+    assert (tmp_path / "reference" / "keys.md").stat().st_mtime_ns == before
+
+
 def test_every_page_is_listed_and_there():
     found = sorted(listed(DOCS / "index.md"))
     assert found == sorted(set(DOCS.rglob("*.md")) - {DOCS / "index.md"})
