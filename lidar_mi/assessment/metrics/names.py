@@ -26,6 +26,9 @@ _KINDS = (
     ("bias_", "mean error of "),
     ("error_", "error of "),
     ("stderr_", "stated error of "),
+    ("coverage_68_", "errors within one standard error, "),
+    ("coverage_95_", "errors within 1.96 standard errors, "),
+    ("monte_carlo_", "noise of the simulation in "),
 )
 _QUANTITIES = {
     "rmse": "rms error",
