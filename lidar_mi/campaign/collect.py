@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.assessment.metrics.names import title_of
+from lidar_mi.assessment.labels import title_of
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.campaign.folder import DATA, CampaignFolder, open_folder
 from lidar_mi.campaign.points import MEMBER, tied
@@ -158,6 +158,8 @@ def _data_set(
 
 def knob_name(key: str) -> str:
     """What a key of an experiment is called on an axis: ``doppler.lidar.range``, as words."""
+    if key == "platform.dt":
+        return "time between the images"
     words = key.replace("doppler.lidar.", "Doppler lidar ").replace("doppler.", "Doppler lidar's ")
     return words.replace(".", " ").replace("_", " ")
 

@@ -243,6 +243,8 @@ def _best_sentence(dataset: xr.Dataset, shown: Sequence[str]) -> str:
         at = dict(zip(map(str, mean.dims), map(int, lowest), strict=True))
         varied = {dim: k for dim, k in at.items() if mean.sizes[dim] > 1}
         text += f", least at {_place(dataset, varied)}"
+    if values.size < mean.size:
+        text += f", none at {mean.size - values.size} of {mean.size} points"
     head, found, component = key.rpartition(".rmse_")
     covered = known.get(f"{head}.coverage_95_{component}") if found else None
     if covered is not None and np.isfinite(covered).any():

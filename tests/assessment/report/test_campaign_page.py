@@ -9,8 +9,8 @@ import re
 import numpy as np
 import pytest
 
+from lidar_mi.assessment.labels import title_of
 from lidar_mi.assessment.metrics.campaign import spaced_by_factors
-from lidar_mi.assessment.metrics.names import title_of
 from lidar_mi.assessment.report.campaign import answer, page
 from lidar_mi.errors import InputError
 from tests.support.campaign_results import campaign, sweep
@@ -67,7 +67,7 @@ def test_four_points_have_their_numbers():
     # 2.5 m/s at 3.16 mJ, falling with the root of the energy
     assert {"4.45", "1.41", "0.93", "75", "300", "1", "10"} <= set(texts)
     heads = re.findall(r'<th scope="col">(.*?)</th>', html[html.index('id="numbers"') :])
-    assert heads[:2] == ["error of v / m/s", "errors within 1.96 standard errors, v, sensor"]
+    assert heads[:2] == ["error of v / m/s", "coverage of 95 %, v, sensor"]
     rows = re.findall(r"<tr><td>(range.*?)</td><td[^>]*>(.*?)</td>", html)
     assert rows[0] == ("range = 75 m, energy = 1 mJ", "4.446\xa0±\xa00.029")
     assert answer(data).startswith(
