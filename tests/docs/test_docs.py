@@ -62,6 +62,7 @@ COMPUTING = (
     "control_block",
     "jsbsim",
     "air",
+    "xml_scenes",
 )
 QUICK = tuple(page for page in GUIDE if Path(page).stem not in COMPUTING)
 THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))

@@ -420,12 +420,12 @@ def _cells(
         )
         if failed[i, j]:
             axes.plot(across[j], up[i], "x", color=FAILED, ms=9, mew=2)
-        elif np.isfinite(value) and max(values.shape) <= _FEW:
+        elif max(values.shape) <= _FEW:
             # on the cell's colour, where a boundary crosses it
             axes.text(
-                across[j],
-                up[i],
-                number(value),
+                float(across[j]),
+                float(up[i]),
+                number(value) if np.isfinite(value) else "no value",
                 color="k" if _luminance(shown) > 0.4 else "w",
                 ha="center",
                 va="center",

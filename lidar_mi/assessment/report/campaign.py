@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import xarray as xr
 from markupsafe import Markup
+from matplotlib.colors import Normalize
 
 from lidar_mi.assessment.digits import three, with_error
 from lidar_mi.assessment.figures import campaign as figures
@@ -426,7 +427,8 @@ def _sweep_block(
         limits["limit"] = bank - mean
     if limits and len(at) == 2:
         text += "Black lines: where the limit is reached. "
-    norm = figures.colour_scale(mean)
+    is_fraction = re.search(r"\bcoverage_|fraction$", key)
+    norm = Normalize(0, 1) if is_fraction else figures.colour_scale(mean)
     for name, where in selections[:_PANELS]:
         here = Points(*(p.isel(where) for p in flat))
         if len(at) == 2:
