@@ -254,6 +254,7 @@ def test_fraction_of_contributing_analog_samples_is_the_optical_depth_of_the_gat
     assert len({name for name, _ in found}) == 4
 
 
+@pytest.mark.slow
 def test_candidates_lower_the_variance(variant):
     found = lines(candidates.compare(2, 64, 15, 9))
     for order in (1, 4):
@@ -368,6 +369,7 @@ def test_cross_correlation_sees_the_vortices():
     assert errors["beyond 2 core radii", "w"][0] < 1.0 < np.nanmean(-found.dz) * 0.5 / 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("openpiv") is None, reason="openpiv is not installed")
 def test_openpiv_retrieves_the_same_wind():
     pair = cases.vortex_pair_images(columns=112, rows=88)

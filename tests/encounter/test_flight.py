@@ -90,6 +90,7 @@ def test_what_was_seen_is_not_forgotten(experiment):
     assert not known[-1]
 
 
+@pytest.mark.slow
 def test_a_track_that_is_lost_in_the_wake():
     """Blind before the wake is crossed: no jump of the aileron, no more bank than the autopilot's.
 

@@ -215,6 +215,7 @@ def test_what_is_no_encounter_is_refused():
         lm.VirtualLidar(small_encounter()).step("now")
 
 
+@pytest.mark.slow
 def test_both_lidars_give_three_components():
     """Two slabs: errors of u, v, w as stated, and the same again; v and w as without u but for it.
 

@@ -225,6 +225,7 @@ def flight(**control):
     return check(keys, "test")
 
 
+@pytest.mark.slow
 def test_flight_in_turbulence_rolls_less_and_is_replayed(tmp_path, monkeypatch):
     from lidar_mi.encounter.air import air_along_path
 

@@ -108,6 +108,7 @@ def test_an_experiment_shows_changed_keys():
     assert "name: shown" in dump(experiment)
 
 
+@pytest.mark.slow
 def test_nodes_that_single_precision_cannot_hold(tmp_path):
     """Nodes 0.3 m apart: images read from their files are on those of the truth all the same."""
     data = small(spacing="0.3 m")

@@ -112,6 +112,7 @@ def test_fog_is_recovered_where_single_scattering_fails(variant, signal):
     assert rms(klett(profile, AIR.x, true_layers()[-1])) > 0.1
 
 
+@pytest.mark.slow
 def test_solution_has_the_full_model_whatever_the_derivative(variant, signal, monkeypatch):
     """Without noise: with attenuation as in single scattering, or of three quarters of it."""
     counts = 1e4 / signal[0].max() * signal[0]
@@ -134,6 +135,7 @@ def test_solution_has_the_full_model_whatever_the_derivative(variant, signal, mo
     assert np.sqrt((((one - other) / stated) ** 2).mean()) < 1
 
 
+@pytest.mark.slow
 def test_oblique_beams_share_the_profile(variant, signal):
     """Two beams to both sides, each with the counts of the one on axis."""
     sides = 170 * np.tan(np.deg2rad([-2.0, 2.0]))

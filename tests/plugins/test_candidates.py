@@ -97,6 +97,7 @@ def test_expectation_is_that_of_one_candidate(world, case):
     assert (z**2).mean() == pytest.approx(1, abs=4 * np.sqrt(2 / z.size))
 
 
+@pytest.mark.slow
 def test_second_order_is_that_of_one_candidate(world):
     """In a gate behind the slab, which only the tail of the pulse reaches."""
     found = []

@@ -66,6 +66,7 @@ def voxels(depth, varied, places, **effort):
     return compared(reference.loaded(values[..., 0]), DATA, directions, **effort)
 
 
+@pytest.mark.slow
 def test_extinction_of_voxels():
     found, expected = voxels(1.0, True, VOXELS[1::3])
     # most of them are known to a tenth

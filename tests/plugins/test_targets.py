@@ -80,6 +80,7 @@ def test_a_pulse_spreads_it_over_gates(world):
     assert (np.abs(found[:, 0] - parts) < 4.5 * found[:, 4] + 1e-3 * parts.max()).all()
 
 
+@pytest.mark.slow
 def test_gated_and_analog_agree_with_air_before_and_behind(world):
     """Scattering air of structure, three orders, a small oblique wall in the beam."""
     values = 0.01 * np.random.default_rng(1).uniform(0.3, 1.7, (3, 3, 8))

@@ -216,6 +216,7 @@ def test_images_are_described_by_their_metadata(demo):
         assert (scan["S0"].values > 0).all() and (scan["S0_stderr"].values > 0).all()
 
 
+@pytest.mark.slow
 def test_a_single_vector_between_nodes(tmp_path):
     """Of images with room for no more: the true wind there is that of the node beside it."""
     pair = {"circulation": 150, "separation": "8 m", "core_radius": "1 m"}

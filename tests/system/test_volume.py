@@ -55,6 +55,7 @@ def air(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_the_whole_chain(tmp_path, air):
     with figure_rules.judged_figures() as figures:

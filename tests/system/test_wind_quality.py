@@ -154,6 +154,7 @@ def test_the_air_between_the_vortices_moves_down(demo):
         assert mean("v", (-27, -19), (6, 14)) > 3
 
 
+@pytest.mark.slow
 def test_swapped_images_reverse_the_wind(demo):
     pair = on_one_grid(*(read_scan(demo.folder / name)["Y"] for name in IMAGES))
     forth = retrieve_wind(*pair, dt=0.1, windows=WindowSizes(stride=4))

@@ -238,6 +238,7 @@ def test_plunge_of_a_small_aircraft():
     agree(found, plunge_variance(SIGMA, LENGTH, SHORTEST, speed, tau))
 
 
+@pytest.mark.slow
 def test_roll_of_the_default_aircraft():
     """Roll rate of a Boeing 737 by strips: from the transverse correlation between all strips."""
     path = Path(climb_angle=0.0)

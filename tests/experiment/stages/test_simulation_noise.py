@@ -141,6 +141,7 @@ def test_the_mean_of_chosen_images_is_unbiased(prepared):
     assert (z**2).mean() == pytest.approx(1, abs=0.2)
 
 
+@pytest.mark.slow
 def test_the_winds_of_a_newcomer_are_those_of_many_samples(prepared, number):
     """Errors of w with a tenth of the variance, beside eight times as many and with eight samples:
     noise of the detector is that of one seed."""
@@ -264,6 +265,7 @@ def test_where_as_much_noise_again_leaves_no_valid_vector_it_is_said_of_the_imag
     assert any(text.startswith("render.samples_per_beam: noise of") for text in run.warnings)
 
 
+@pytest.mark.slow
 def test_a_run_along_a_curve_has_it():
     """Which pixels scattered beams reach at the reference time depends on the noise."""
     timing = {"pattern": "lissajous", "cycles": [139, 110], "duration": "95 ms"}

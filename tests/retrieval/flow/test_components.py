@@ -79,6 +79,7 @@ def retrieved(images, level, monkeypatch, stride=4):
     return found, models[-1], residuals[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("level", "unbiased"), [(0.05, 0.025), pytest.param(0.01, 0.05, marks=pytest.mark.slow)]
 )
@@ -174,6 +175,7 @@ def test_motion_through_the_plane_is_found(through, monkeypatch):
     assert max(one["replaced"] for one in amplitudes) < 0.01 * through**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [1e-3, 0.02])
 def test_noise_is_no_motion_through_the_plane(level, monkeypatch):
     """0.05 px at most: what changes long waves is seen through the flow."""

@@ -112,6 +112,7 @@ def observed(flow, noise, seed):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turnover", [0.1, 0.4])
 def test_the_spectrum_of_a_random_flow_is_found(turnover):
     """Density of displacements in waves of 10 to 60 px, whatever its slope.

@@ -78,6 +78,7 @@ def of_air(seed):
     return drawn(air, 300 + seed, slices(2, 14), wake=False).lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("single", [False, True])
 def test_turbulence_is_seldom_taken_for_a_wake(single):
     """At most a tenth of the scans have a false alarm of 0.1: three sigma more than that."""
@@ -142,6 +143,7 @@ def test_over_the_top_and_to_the_west_is_the_same_plane():
     np.testing.assert_allclose(np.abs(found[2]["y"]), np.abs(found[0]["y"]), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_track_is_better_than_its_fits():
     fits, tracks, normal = [], [], []
     for seed in (0, 1):

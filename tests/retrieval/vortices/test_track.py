@@ -44,6 +44,7 @@ def assert_coverage(departures, tolerance=0.05):
         assert abs(np.mean(np.abs(departures) < limit) - expected) < tolerance
 
 
+@pytest.mark.slow
 def test_errors_hold_where_the_wake_walks_as_stated():
     """100 flights. Innovations and errors of state and of the pair at the wing are chi-square."""
     found = flights(100, wakes_that_walk)

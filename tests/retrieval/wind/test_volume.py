@@ -264,6 +264,7 @@ def test_attenuation_and_brightness_are_no_wind():
         assert float(np.abs(off).max()) < 0.02, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["correlation", "variational"])
 def test_volumes_without_wind_information_are_flagged(method):
     shape = (10, 12, 14)
