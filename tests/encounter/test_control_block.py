@@ -31,7 +31,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.reading import check, settings
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.yaml import to_yaml
-from tests.encounter.test_jump_linear import chain
+from tests.support.markov_chain import chain
 from tests.support.synthetic_lidar import encounter_keys
 
 SEEDS = range(1, 9)

@@ -10,6 +10,7 @@ import scipy
 
 from lidar_mi.encounter.jump_linear import jump_covariance, stationary_distribution
 from lidar_mi.errors import InputError
+from tests.support.markov_chain import chain
 
 STEPS, RECORDS = 2000, 200
 TRANSITION = np.array([[0.97, 0.03], [0.3, 0.7]])
@@ -21,16 +22,6 @@ def system(random, radius, modes=1):
     a *= radius / np.array([abs(np.linalg.eigvals(one)).max() for one in a])[:, None, None]
     shapes = ((4, 2), (2, 4), (2, 2))
     return a, *(random.standard_normal((modes, *shape)) for shape in shapes)
-
-
-def chain(random, transition, number, records=1):
-    """Modes of chains from the stationary distribution; (number, records)."""
-    mode = (random.random(records) > stationary_distribution(transition)[0]).astype(int)
-    found = []
-    for draw in random.random((number, records)):
-        found.append(mode)
-        mode = (draw > transition[mode, 0]).astype(int)
-    return np.array(found)
 
 
 def test_without_jumps_it_is_the_integral_of_the_spectrum():

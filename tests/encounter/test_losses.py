@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lidar_mi.encounter.losses import gust_dependence, loss_chain
-from tests.encounter.test_jump_linear import chain
+from tests.support.markov_chain import chain
 
 BEGIN, END = 0.02, 0.4
 
