@@ -36,7 +36,7 @@ bench: setup ## compare with other programs, side by side: docs/performance.md; 
 		|| $(PYTHON_ENV) -m pip install -q -e ".[bench]"
 	$(PYTHON_ENV) -m benchmarks $(ARGS)
 
-validate: setup ## check against closed forms, published numbers and other programs: docs/validation.md
+validate: setup ## check against closed forms, published numbers and other programs: docs/validation
 	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (f('scatrs') and f('rustmatrix') and f('miepython')))" \
 		|| $(PYTHON_ENV) -m pip install -q -e ".[test]"
 	$(PYTHON_ENV) -m validation $(ARGS)

@@ -6,8 +6,10 @@ browsers draw by themselves.
 
 import html
 import re
+import runpy
 import unicodedata
 from importlib import metadata
+from pathlib import Path
 
 from docutils import nodes
 from latex2mathml.converter import convert
@@ -73,6 +75,12 @@ def _styled(found):
     return f"<mi>{unicodedata.lookup(f'MATHEMATICAL {style} {letter}')}</mi>"
 
 
+def _write_pages(app):
+    """Those that are made from the results of the validation."""
+    runpy.run_path(str(Path(app.srcdir) / "make_validation_pages.py"), run_name="__main__")
+
+
 def setup(app):
-    """Formulas of the pages in MathML."""
+    """Formulas of the pages in MathML, and pages that the site alone has."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
+    app.connect("builder-inited", _write_pages)

@@ -1,8 +1,10 @@
-"""Close a control loop with the lidar of recorded flights, without a renderer.
+"""Close two control loops with the lidar of recorded flights, without a renderer.
 
 A controller levels the wings of the default aircraft and cancels the roll gust that the lidar
-announces. The variance of roll follows from a Lyapunov equation; with --flights the same loop flies
-along the recorded flights, by their estimates as they were delivered and the true wind.
+announces; flaps cancel the lift of the announced vertical gust. Variances of roll, aileron and load
+factor follow from the Lyapunov equations of a system that jumps where estimates are lost; with
+--flights the same loops fly along the recorded flights, by their estimates as they were delivered
+and the true wind.
 
     lidar-mi fly gust --mode feedforward -o outputs/air --set encounter.path.beyond='900 m'
     lidar-mi export outputs/air --format control
@@ -16,35 +18,50 @@ import control as ct
 import numpy as np
 import scipy
 
+from lidar_mi.encounter.jump_linear import jump_covariance
+from lidar_mi.encounter.sensor_samples import SensorSamples, flights_in, samples_of
+
 INERTIA, AILERON_MOMENT = 8.0e5, 1.052e6  # kg m^2 and N m/rad, of the default aircraft
+MASS, GRAVITY = 48500.0, 9.80665
 FROM_ROLL, FROM_RATE = 1.0, 0.5  # aileron per roll (1) and per roll rate (s)
 
 
-def line(signal: str, steps: int, now: str, soon: str, dt: float) -> ct.StateSpace:
+def line(axis: str, signal: str, steps: int, dt: float) -> ct.StateSpace:
     """A signal `steps` samples ago, and one sample less."""
     last = np.eye(steps)[[-1, -2]]
     matrices = np.eye(steps, k=-1), np.eye(steps, 1), last, np.zeros((2, 1))
-    return ct.ss(*matrices, dt, inputs=[signal], outputs=[now, soon])
+    outputs = [f"{signal}_{axis}_now", f"{signal}_{axis}_soon"]
+    return ct.ss(*matrices, dt, inputs=[f"{signal}_{axis}"], outputs=outputs)
 
 
-def rolling(damping: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Roll and roll rate one sample later: from both, and from p now, p soon and the aileron.
+def sampled(a: np.ndarray, b: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """States one sample later: from the states, and from gust now, gust soon and control.
 
-    Between two samples the gust is linear, and the aileron rests.
+    Between two samples the gust is linear, and the control rests.
     """
-    a = np.array([[0, 1], [0, -damping / INERTIA]])
-    b = np.array([[0, 0], [damping, AILERON_MOMENT]]) / INERTIA
-    whole = np.zeros((5, 5))
-    whole[:2] = np.hstack([a * dt, b * dt, np.zeros((2, 1))])
-    whole[2, 4] = 1.0  # the slope of the gust
-    step = scipy.linalg.expm(whole)[:2]
-    return step[:, :2], np.column_stack([step[:, 2] - step[:, 4], step[:, 4], step[:, 3]])
+    n = len(a)
+    whole = np.zeros((n + 3, n + 3))
+    whole[:n] = np.hstack([a * dt, b * dt, np.zeros((n, 1))])
+    whole[n, -1] = 1.0  # the slope of the gust
+    step = scipy.linalg.expm(whole)[:n]
+    soon = step[:, -1]
+    return step[:, :n], np.column_stack([step[:, n] - soon, soon, step[:, n + 1]])
 
 
-def rms(block: dict, forward: float) -> tuple[float, float]:
-    """Predicted rms of roll and aileron, rad.
+def aircraft(block: dict) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Roll and roll rate by p and aileron; vertical speed by w and the lift of flaps as a gust."""
+    dt, damping = float(block["dt"]), float(block["roll_moment_per_gust"])  # -L_p, N m s/rad
+    lift = float(block["lift_per_gust"]) / MASS
+    roll = np.array([[0, 1], [0, -damping / INERTIA]])
+    pushed = np.array([[0, 0], [damping, AILERON_MOMENT]]) / INERTIA
+    return sampled(roll, pushed, dt), sampled(np.array([[-lift]]), np.array([[lift, lift]]), dt)
 
-    `forward` is the fraction of the announced rolling moment that the aileron cancels.
+
+def loop(block: dict, forward: float, received: bool, hold: float) -> ct.StateSpace:
+    """Gusts and noise to roll, aileron (rad) and load factor while estimates arrive, or do not.
+
+    `forward` is the fraction of the announced gust that the controls cancel. In place of a lost
+    estimate the last value counts, times `hold`.
     """
     axes, dt = list(block["axis"]), float(block["dt"])
     gusts, white, noise, estimates = (
@@ -52,70 +69,97 @@ def rms(block: dict, forward: float) -> tuple[float, float]:
     )
     air = ct.ss(*(block[f"gust_{name}"] for name in "ABCD"), dt, inputs=white, outputs=gusts)
     lidar = ct.ss(*(block[name] for name in "ABCD"), dt, inputs=gusts + noise, outputs=estimates)
+    kept, new = (0.0, 1.0) if received else (hold, 0.0)
     # the wing meets a plane so many samples after its first scan
     steps = round(float(block["arrival"]) / dt)
-    wind = line("gust_p", steps, "p_now", "p_soon", dt)
-    memory = line("estimate_p", steps - int(block["delay_steps"]), "e_now", "e_soon", dt)
-    damping = float(block["roll_moment_per_gust"])  # -L_p, N m s/rad
-    wing = ct.ss(
-        *rolling(damping, dt),
-        np.eye(2),
-        np.zeros((2, 3)),
-        dt,
-        inputs=["p_now", "p_soon", "aileron"],
-        outputs=["roll", "rate"],
-    )
-    cancel = -forward * damping / AILERON_MOMENT
+    parts = [air, lidar]
+    for axis in "pw":
+        used = ct.ss(
+            kept, new, kept, new, dt, inputs=[f"estimate_{axis}"], outputs=[f"used_{axis}"]
+        )
+        wait = line(axis, "used", steps - int(block["delay_steps"]), dt)
+        parts += [used, wait, line(axis, "gust", steps, dt)]
+    (roll, pushed), (rise, lifted) = aircraft(block)
+    damping, lift = float(block["roll_moment_per_gust"]), float(block["lift_per_gust"])
+    gust = ["gust_p_now", "gust_p_soon"], ["gust_w_now", "gust_w_soon"]
+    parts += [
+        ct.ss(
+            *(roll, pushed, np.eye(2), np.zeros((2, 3)), dt),
+            inputs=[*gust[0], "aileron"],
+            outputs=["roll", "rate"],
+        ),
+        ct.ss(
+            *(rise, lifted, [[-1]], [[1, 0, 1]], dt), inputs=[*gust[1], "flap"], outputs=["angle"]
+        ),
+    ]
+    cancel = -forward * damping / AILERON_MOMENT / 2
+    gains = np.zeros((3, 7))
+    gains[0, [0, 1, 4, 5]] = cancel, cancel, -FROM_ROLL, -FROM_RATE
+    gains[1, [2, 3]] = -forward / 2
+    gains[2, 6] = lift / (MASS * GRAVITY)
+    seen = [f"used_{axis}_{when}" for axis in "pw" for when in ("now", "soon")]
     law = ct.ss(
-        *([], [], [], [[cancel / 2, cancel / 2, -FROM_ROLL, -FROM_RATE]]),
-        dt,
-        inputs=["e_now", "e_soon", "roll", "rate"],
-        outputs=["aileron"],
+        *([], [], [], gains, dt),
+        inputs=[*seen, "roll", "rate", "angle"],
+        outputs=["aileron", "flap", "load"],
     )
-    loop = ct.interconnect(
-        [air, lidar, wind, memory, wing, law],
-        inputs=white + noise,
-        outputs=["roll", "aileron"],
-        check_unused=False,
+    return ct.interconnect(
+        [*parts, law], inputs=white + noise, outputs=["roll", "aileron", "load"], check_unused=False
     )
+
+
+def rms(block: dict, forward: float, hold: float = 0.0) -> np.ndarray:
+    """Predicted rms of roll, aileron (rad) and load factor."""
+    modes = [loop(block, forward, received, hold) for received in (True, False)]
     inputs = scipy.linalg.block_diag(np.diag(block["gust_innovations"]), block["noise_covariance"])
-    states = scipy.linalg.solve_discrete_lyapunov(loop.A, loop.B @ inputs @ loop.B.T)
-    found = loop.C @ states @ loop.C.T + loop.D @ inputs @ loop.D.T
-    roll, aileron = np.sqrt(np.diag(found))
-    return float(roll), float(aileron)
+    matrices = ([getattr(mode, name) for mode in modes] for name in "ABCD")
+    found = jump_covariance(*matrices, block["loss_transition"], inputs)
+    return np.sqrt(np.diag(found))
 
 
-def rms_in_flights(block: dict, folder: Path, forward: float) -> float:
-    """Rms of roll, rad, of the loop along recorded flights; a lost estimate announces nothing."""
-    from lidar_mi.encounter.sensor_samples import flights_in, samples_of
-
-    damping = float(block["roll_moment_per_gust"])
-    decay, push = rolling(damping, float(block["dt"]))
-    cancel, squares = -forward * damping / AILERON_MOMENT, []
-    for flight in map(samples_of, flights_in(folder)):
-        if abs(flight.distance - block["range"]) > 0.01:
-            continue
-        truth, found = flight.truth[:, 3], np.nan_to_num(flight.estimate[:, 3])
-        x = np.zeros(2)
-        for k in range(len(truth) - 1):
-            aileron = cancel * (found[k] + found[k + 1]) / 2 - FROM_ROLL * x[0] - FROM_RATE * x[1]
-            x = decay @ x + push @ [truth[k], truth[k + 1], aileron]
-            squares.append(x[0] ** 2)
-    return float(np.sqrt(np.mean(squares)))
+def rms_in_flights(
+    block: dict, flights: list[SensorSamples], forward: float, hold: float = 0.0
+) -> np.ndarray:
+    """Rms of roll, aileron (rad) and load factor along recorded flights."""
+    damping, lift = float(block["roll_moment_per_gust"]), float(block["lift_per_gust"])
+    (roll, pushed), (rise, lifted) = aircraft(block)
+    squares = []
+    for flight in flights:
+        (w, p), (w_used, p_used) = flight.truth[:, 2:].T, flight.estimate[:, 2:].T.copy()
+        for used in (w_used, p_used):
+            for k in np.flatnonzero(np.isnan(used)):
+                used[k] = hold * used[k - 1] if k else 0.0
+        x, rising = np.zeros(2), np.zeros(1)
+        for k in range(len(w) - 1):
+            announced = forward * (p_used[k] + p_used[k + 1]) / 2
+            aileron = -damping / AILERON_MOMENT * announced - FROM_ROLL * x[0] - FROM_RATE * x[1]
+            flap = -forward * (w_used[k] + w_used[k + 1]) / 2
+            load = lift / (MASS * GRAVITY) * (w[k] - rising[0] + flap)
+            squares.append(np.array([x[0], aileron, load]) ** 2)
+            x = roll @ x + pushed @ [p[k], p[k + 1], aileron]
+            rising = rise @ rising + lifted @ [w[k], w[k + 1], flap]
+    return np.sqrt(np.mean(squares, axis=0))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("block", type=Path, help="block_RANGE.npz of lidar-mi export")
     parser.add_argument("--flights", type=Path, help="folder of the flights that it is made from")
+    parser.add_argument(
+        "--hold", type=float, default=0.0, help="a lost estimate is the last one times this factor"
+    )
     options = parser.parse_args()
     block = dict(np.load(options.block))
+    flights = []
+    if options.flights:
+        samples = map(samples_of, flights_in(options.flights))
+        flights = [one for one in samples if abs(one.distance - block["range"]) < 0.01]
+    degrees = np.array([180 / np.pi, 180 / np.pi, 1.0])
     for forward in (0.0, 0.5, 1.0):
-        roll, aileron = np.degrees(rms(block, forward))
-        text = (
-            f"forward {forward:.1f}: roll {roll:.2f}, aileron {aileron:.2f} degrees rms predicted"
-        )
-        if options.flights:
-            flown = np.degrees(rms_in_flights(block, options.flights, forward))
-            text += f", roll {flown:.2f} in the flights"
+        roll, aileron, load = degrees * rms(block, forward, options.hold)
+        text = f"forward {forward:.1f}: roll {roll:.2f}, aileron {aileron:.2f} degrees, "
+        text += f"load factor {load:.3f} rms predicted"
+        if flights:
+            roll, _, load = degrees * rms_in_flights(block, flights, forward, options.hold)
+            text += f", roll {roll:.2f}, load factor {load:.3f} in the flights"
         print(text)

@@ -1,7 +1,8 @@
 """Comparison of lidar-mi with independent numbers.
 
-``make validate`` (or ``python -m validation``) runs every check, prints one table per group and
-writes ``docs/validation.md`` with its figures; it ends with an error if any row fails.
+``make validate`` (or ``python -m validation``) runs every check, prints its tables and stores them
+in ``validation/results``, a file for each group, of which the site makes pages. It ends with an
+error if any row fails.
 
 lidar_equation       single scattering: closed forms
 multiple_scattering  all orders in a dense slab: an independent simulation in numpy
@@ -19,10 +20,9 @@ air                  turbulence, gusts and a microburst: theory, regulations
 filaments            bent vortices, rings, decay: theory, published numbers
 loads                an aircraft that rises in gusts: closed forms, its frequency response
 common_numbers       error of winds by the simulation's own noise; only by name
-coverage             standard errors of winds where air changes: its section, by name or --slow
+coverage             standard errors of winds where air changes; stored by name or with --slow
 instrument           winds by an etalon with defects; only by name
-flows                winds of families of flows that judge, and of those that build: its section
-                     of the page; only by name
+flows                winds of families of flows that judge, and of those that build; only by name
 defects              winds of images with defects, by families of which half only judge; only by
                      name
 resolution           winds from fewer, larger pixels, against their bound; only by name
@@ -52,5 +52,5 @@ GROUPS = (
 )
 OPEN = ("common_numbers", "instrument", "flows", "defects", "resolution", "line_vortices")
 """Run only by name: some of their rows fail."""
-SECTIONS = ("coverage", "flows")
-"""Groups whose text is a section of the page, between marks, that short runs leave as it is."""
+TOLD = ("coverage", "flows")
+"""Groups whose texts hold their tables."""

@@ -3,19 +3,20 @@
 import argparse
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
 from benchmarks.measure import fresh_process
 
-from . import GROUPS, OPEN, SECTIONS, report
+from . import GROUPS, OPEN, TOLD, report
 from . import __doc__ as description
 from .eradiate import provenance
 from .group import run
 from .scenes import Effort
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "validation.md"
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -38,20 +39,25 @@ def main(arguments: list[str] | None = None) -> int:
         help="of the families of `flows` and `defects`: these alone, and nothing is written",
     )
     parser.add_argument(
-        "-o", "--out", type=Path, default=PAGE, help="page to write when all groups run"
+        "-o",
+        "--out",
+        type=Path,
+        default=ROOT,
+        metavar="FOLDER",
+        help="into whose validation/results and docs/validation to write (default: this tree)",
     )
     options = parser.parse_args(arguments)
     unknown = [name for name in options.groups if name not in (*GROUPS, *OPEN)]
     if unknown:
         parser.error(f"NAME: {unknown[0]!r} is none of {', '.join((*GROUPS, *OPEN))}")
 
-    folder = options.out.parent / options.out.stem
-    effort = Effort(16 if options.slow else 1, folder, options.eradiate, options.purpose)
-    docs = options.out.parent
-    pages = (*sorted(docs.glob("accuracy*.md")), *sorted(docs.glob("experiments/*.md")))
-    by_hand = [hand for hand in pages if hand.exists()]
+    docs, stored = options.out / "docs", options.out / "validation" / "results"
+    effort = Effort(
+        16 if options.slow else 1, docs / "validation", options.eradiate, options.purpose
+    )
+    by_hand = (*sorted(docs.glob("accuracy*.md")), *sorted(docs.glob("experiments/*.md")))
     console = Console(width=None if sys.stdout.isatty() else 140)
-    found, failed = [], []
+    failed = []
     for name in options.groups or GROUPS:
         with console.status(f"checking: {name}"), fresh_process() as process:
             future = process.submit(run, name, effort)
@@ -59,42 +65,37 @@ def main(arguments: list[str] | None = None) -> int:
             if error := future.exception():
                 failed.append(f"{name}: {error!r}")
                 continue
-        found.append(future.result())
-        for check in found[-1][-1]:
+        title, introduction, checks = future.result()
+        for check in checks:
             report.show(check, console)
-            whole = not (name == "flows" and options.purpose)
-            if name in SECTIONS and whole and (options.slow or options.groups):
-                title, introduction, _ = found[-1]
-                text = "\n\n".join([f"## {title}", introduction, check.text])
-                report.write(report.with_section(_stored(options.out), name, text), options.out)
             for hand in by_hand:
                 text = hand.read_text(encoding="utf-8")
                 if (renewed := report.with_table(text, check)) != text:
                     report.write(renewed, hand)
                     console.print(f"written: table {check.name} of {hand}", highlight=False)
-            if name in (*OPEN, *SECTIONS):
+            if name in (*OPEN, *TOLD):
                 console.print(check.text, highlight=False, soft_wrap=True)
             failed += [
                 f"{check.title}, {row.name}: expected {row.expected:.6g}, got {row.got:.6g}"
                 for row in check.rows
                 if not row.passed
             ]
-    if len(found) == len(GROUPS):
-        command = "make validate" + (" ARGS=--slow" if options.slow else "")
-        others = [one for name, one in zip(GROUPS, found, strict=True) if name not in SECTIONS]
-        page = report.page(others, command, [provenance(options.eradiate)])
-        for name in SECTIONS:
-            if text := report.section_of(_stored(options.out), name):
-                page = report.with_section(page, name, text)
-        report.write(page, options.out)
-        console.print(f"written: {options.out}", highlight=False)
+        # a part of the families, or few seeds among all groups, leave what more of them found
+        if options.purpose or (name in TOLD and not (options.slow or options.groups)):
+            continue
+        if name in TOLD:
+            checks = [replace(check, rows=()) for check in checks]
+        if name in (*GROUPS, *TOLD):
+            note = provenance(options.eradiate) if name == "steady_state" else ""
+            command = f"python -m validation {name}{' --slow' if options.slow else ''}"
+            results = report.Results(
+                title, introduction, command, tuple(checks), report.versions(), note
+            )
+            report.store(results, stored / f"{name}.json")
+            console.print(f"written: {stored / name}.json", highlight=False)
     for line in failed:
         console.print(f"FAILS: {line}", style="red", highlight=False, soft_wrap=True)
     return int(bool(failed))
-
-
-def _stored(page: Path) -> str:
-    return page.read_text(encoding="utf-8") if page.exists() else ""
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ INTRODUCTION = (
     "its fits with different seeds count as independent only as far as their errors differ. Bold: "
     "a coverage wrong by more than 5 percentage points, or a variance outside 0.8 to 1.25, by "
     "more than the uncertainty, if 1 % or more of the vectors are valid. Cases and causes: "
-    "[standard errors](standard_errors.md#standard-errors-where-air-changes)."
+    "[standard errors](../standard_errors.md#standard-errors-where-air-changes)."
 )
 
 SCENES = Path(str(files("lidar_mi.scenes")))

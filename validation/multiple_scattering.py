@@ -17,7 +17,7 @@ TITLE = "Multiple scattering"
 INTRODUCTION = (
     "A slab of 100 m and optical thickness 2 in a vacuum, 500 m away, in ten gates of 10 m, with "
     "six orders of scattering. In its last gates multiple scattering exceeds single scattering. "
-    "The reference is [an analog simulation](../validation/transport_reference.py) in numpy, "
+    "The reference is [an analog simulation](../../validation/transport_reference.py) in numpy, "
     "with double precision, its own Stokes algebra and no code in common with the plugins. "
     "Standard errors of both sides are from independent batches."
 )

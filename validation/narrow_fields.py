@@ -15,7 +15,7 @@ from .second_order import Bistatic, second_order
 TITLE = "Narrow fields of view"
 INTRODUCTION = (
     "A pencil beam, a telescope of finite size and a homogeneous slab. The reference is "
-    "[a quadrature](../validation/second_order.py) of the light scattered twice, in double "
+    "[a quadrature](../../validation/second_order.py) of the light scattered twice, in double "
     "precision and coordinates without singularity: errors of 1e-4. Where the field of view is "
     "narrow, the last vertex lies millimetres from the beam and the excess length of a path is a "
     "millionth of it: single precision that cancels would lose light here."

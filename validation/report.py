@@ -1,9 +1,9 @@
-"""Results of checks: rows, a table on the terminal and a page of the documentation."""
+"""Results of checks: rows, a table on the terminal, files of them and pages made of these."""
 
+import json
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -147,85 +147,80 @@ def show(check: Check, console: Console) -> None:
         console.print("\n".join(_markdown(check.comparison)), soft_wrap=True, highlight=False)
 
 
-def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes=()) -> str:
-    """The whole page as GitHub-flavoured Markdown.
+@dataclass(frozen=True)
+class Results:
+    """What a group of checks found, as it is stored.
 
     Parameters
     ----------
-    groups : sequence of (title, introduction, checks)
+    title, introduction : str
     command : str
-        The command that computes the page again.
-    notes : sequence of str
-        Lines about the sources of stored references.
+        The command that computes it again.
+    checks : tuple of Check
+    versions : mapping of str to str
+        Of the packages that it was computed with.
+    note : str
+        On the source of stored references.
     """
-    checks = [check for _, _, found in groups for check in found]
-    rows = [row for check in checks for row in check.rows]
+
+    title: str
+    introduction: str
+    command: str
+    checks: tuple[Check, ...]
+    versions: dict[str, str]
+    note: str = ""
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that matter, as far as they are installed."""
+    known = {name: _version(name) for name in PACKAGES}
+    return {name: number for name, number in known.items() if number}
+
+
+def store(results: Results, path: Path) -> None:
+    """Write results as JSON; long texts line by line, so that changes can be read."""
+    data = asdict(results)
+    for check in data["checks"]:
+        check["text"] = check["text"].splitlines()
+    write(json.dumps(data, indent=1, ensure_ascii=False) + "\n", path)
+
+
+def load(path: Path) -> Results:
+    """Results that `store` wrote."""
+    data = json.loads(path.read_text(encoding="utf-8"))
+    checks = []
+    for check in data.pop("checks"):
+        table = check.pop("comparison")
+        if table:
+            table = Comparison(tuple(table["heads"]), tuple(map(tuple, table["lines"])))
+        rows = tuple(Row(**row) for row in check.pop("rows"))
+        text, figures = "\n".join(check.pop("text")), tuple(map(tuple, check.pop("figures")))
+        checks.append(Check(**check, text=text, rows=rows, figures=figures, comparison=table))
+    return Results(**data, checks=tuple(checks))
+
+
+def page(results: Results) -> str:
+    """The page of a group in ``docs/validation``, as GitHub-flavoured Markdown."""
+    rows = [row for check in results.checks for row in check.rows]
     failed = sum(not row.passed for row in rows)
-    verdict = f"{failed} of {len(rows)} fail" if failed else f"all {len(rows)} pass"
-    lines = [
-        "# Validation",
-        "",
-        "<!-- Written by `python -m validation`; edit validation/ instead. -->",
-        "",
-        "Comparisons of lidar-mi with independent numbers: closed forms, published",
-        "values, conservation laws and other programs. They concern light transport, Doppler",
-        "receivers, air and vortices, loads on aircraft, the track of vortices, and times and "
-        "poses of beams. The last two sections",
-        "measure the standard errors of retrieved winds; other errors of the retrievals are under "
-        "[accuracy](accuracy.md). Every other row of this",
-        "page is computed again by",
-        "",
-        "```sh",
-        command,
-        "```",
-        "",
-        f"A row passes if the numbers agree within {SIGMAS} standard errors plus what the "
-        "reference",
-        "itself leaves undetermined (the tolerance). *Sigma* is the standard error of the "
-        "difference,",
-        "from both sides together; *deviation* is the difference in units of sigma. Rows without "
-        "random error have a",
-        "tolerance in place of sigma (marked with a bar, as in \\|5e-05\\|), and their deviation "
-        "is in",
-        f"tolerances. Seeds are fixed. **Of {len(rows)} rows, {verdict}.**",
-        "",
-    ]
-    for title, _, found in groups:
-        lines += [f"- [{title}](#{_anchor(title)})"]
-        lines += [f"  - [{check.title}](#{_anchor(check.title)})" for check in found]
-    lines.append("")
-    for title, introduction, found in groups:
-        lines += [f"## {title}", "", introduction, ""]
-        for check in found:
-            lines += _section(check)
-    lines += ["## Versions", "", *notes, ""]
-    known = [(name, _version(name)) for name in PACKAGES]
-    lines += ["| package | version |", "| --- | --- |"]
-    lines += [f"| {name} | {number} |" for name, number in known if number]
+    lines = [f"# {results.title}", "", results.introduction, ""]
+    if rows:
+        fails = f"{failed} fail" if failed else "none fails"
+        lines += [f"Written by `{results.command}`. Of {len(rows)} rows, {fails}.", ""]
+    for check in results.checks:
+        lines += _section(check)
+    named = ", ".join(f"{name} {number}" for name, number in results.versions.items())
+    lines += [*([results.note, ""] if results.note else []), f"Versions: {named}."]
     return "\n".join(lines) + "\n"
 
 
-def with_section(page: str, name: str, text: str) -> str:
-    """A page with what stands between the marks of a name replaced; without them put at its end."""
-    begin, end = (f"<!-- {name}: {what} -->" for what in ("begin", "end"))
-    section = f"{begin}\n\n{text.strip()}\n\n{end}"
-    before, found, rest = page.partition(begin)
-    if not found:
-        return f"{page.rstrip()}\n\n{section}\n"
-    return before + section + rest.partition(end)[2]
-
-
-def section_of(page: str, name: str) -> str:
-    """What stands between the marks of a name on a page, empty if there is nothing."""
-    return page.partition(f"<!-- {name}: begin -->")[2].partition(f"<!-- {name}: end -->")[0]
-
-
 def _section(check: Check) -> list[str]:
-    lines = [f"### {check.title}", "", f"<!-- {check.name} -->", "", check.text, ""]
-    lines += [
-        "| quantity | expected | obtained | sigma | deviation | | reference |",
-        "| --- | ---: | ---: | ---: | ---: | --- | --- |",
-    ]
+    lines = [f"## {check.title}", "", check.text, ""]
+    if check.rows:
+        lines += [
+            "| quantity | expected | obtained | sigma | deviation | | reference |",
+            "| --- | ---: | ---: | ---: | ---: | --- | --- |",
+        ]
     for row in check.rows:
         verdict = "pass" if row.passed else "**FAIL**"
         cells = [cell.replace("|", "\\|") for cell in (*_cells(row), verdict, row.reference)]
@@ -234,7 +229,7 @@ def _section(check: Check) -> list[str]:
     if check.comparison:
         lines += [*_markdown(check.comparison), ""]
     for name, caption in check.figures:
-        lines += [f"![{caption}](validation/{name})", "", f"*{caption}*", ""]
+        lines += [f"![{caption}]({name})", "", f"*{caption}*", ""]
     return lines
 
 
@@ -243,9 +238,12 @@ def with_table(text: str, check: Check) -> str:
 
     A page that has no such marks stays as it is.
     """
-    if check.comparison is None or not section_of(text, check.name):
+    begin, end = (f"<!-- {check.name}: {what} -->" for what in ("begin", "end"))
+    before, found, rest = text.partition(begin)
+    if check.comparison is None or not found:
         return text
-    return with_section(text, check.name, "\n".join(_markdown(check.comparison)))
+    table = "\n".join(_markdown(check.comparison))
+    return f"{before}{begin}\n\n{table}\n\n{end}{rest.partition(end)[2]}"
 
 
 def _markdown(table: Comparison) -> list[str]:
@@ -262,11 +260,6 @@ def _cells(row: Row) -> list[str]:
 def _number(value: float) -> str:
     """Six digits."""
     return f"{value:.6g}"
-
-
-def _anchor(title: str) -> str:
-    """GitHub's name for a heading."""
-    return "".join(c for c in title.lower() if c.isalnum() or c in " -_").replace(" ", "-")
 
 
 def _version(package: str) -> str | None:

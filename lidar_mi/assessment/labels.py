@@ -25,3 +25,38 @@ SOURCE_NAMES: Mapping[str, str] = {
 """What winds are retrieved from, as figures and tables call it."""
 
 BACKSCATTER = "attenuated backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"
+
+_KINDS = (
+    ("rmse_", "rms error of "),
+    ("bias_", "mean error of "),
+    ("error_", "error of "),
+    ("stderr_", "stated error of "),
+    ("coverage_68_", "coverage of 68 %, "),
+    ("coverage_95_", "coverage of 95 %, "),
+    ("monte_carlo_", "noise of the simulation in "),
+)
+_QUANTITIES = {
+    "rmse": "rms error",
+    "bias": "mean error",
+    "v_los": "the line-of-sight speed",
+    "valid_fraction": "fraction of valid vectors",
+    "largest_roll": "largest bank angle",
+}
+_ORIGINS = {**METHOD_NAMES, **SOURCE_NAMES}
+
+
+def title_of(key: str) -> str:
+    """What a metric is called in headings: the quantity first, then where it is from.
+
+    >>> title_of("backscatter_noisy.variational.all.rmse_v")
+    'rms error of v, backscatter with detector noise, variational retrieval'
+    """
+    *places, quantity = key.split(".")
+    whose = "standard error of " if quantity.endswith("_stderr") else ""
+    quantity = quantity.removesuffix("_stderr")
+    start, words = next((p for p in _KINDS if quantity.startswith(p[0])), ("", ""))
+    rest = quantity.removeprefix(start)
+    named = _QUANTITIES.get(rest, rest)
+    origin = [_ORIGINS.get(place, place) for place in places if place != "all"]
+    texts = [whose + words + named, *origin]
+    return ", ".join(texts).replace("_", " ")

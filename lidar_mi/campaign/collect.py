@@ -1,6 +1,7 @@
 """The points of a campaign as one data set."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,12 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.assessment.metrics.names import title_of
+from lidar_mi.assessment.labels import title_of
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.campaign.folder import DATA, CampaignFolder, open_folder
 from lidar_mi.campaign.points import MEMBER, tied
-from lidar_mi.experiment.folder.records import METRICS
+from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.io.json import read_json
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.progress import Notice
 
@@ -51,7 +51,10 @@ def open_campaign(folder: str | Path) -> xr.Dataset:
     """
     opened = open_folder(folder)
     path = opened.path / DATA
-    return read_netcdf(path) if path.is_file() else collect(opened)
+    if path.is_file():
+        with suppress(InputError):  # damaged: collected again
+            return read_netcdf(path)
+    return collect(opened)
 
 
 def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
@@ -77,9 +80,9 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
             notice("collecting points", number / total)
         place = folder.place(number)
         places[number] = str(place.relative_to(folder.path))
-        if folder.is_done(number):
+        metrics = folder.metrics(number)
+        if metrics is not None:
             status[number] = STATUS.index("done")
-            metrics = read_json(place / METRICS, "metrics of a point")
             # points may have different metrics: those of others are NaN
             for key, value in metrics.items():
                 if not key.startswith("timing."):
@@ -155,6 +158,8 @@ def _data_set(
 
 def knob_name(key: str) -> str:
     """What a key of an experiment is called on an axis: ``doppler.lidar.range``, as words."""
+    if key == "platform.dt":
+        return "time between the images"
     words = key.replace("doppler.lidar.", "Doppler lidar ").replace("doppler.", "Doppler lidar's ")
     return words.replace(".", " ").replace("_", " ")
 

@@ -118,9 +118,13 @@ class CampaignFolder:
         """Folder of images of one signature."""
         return self.path / IMAGES / signature[:_SHORT]
 
+    def metrics(self, number: int) -> dict[str, float | None] | None:
+        """Metrics of a point; None: there are none yet, or their file is damaged."""
+        return _read_mapping(self.place(number) / METRICS, "metrics of a point")
+
     def is_done(self, number: int) -> bool:
-        """Whether a point's metrics are there."""
-        return (self.place(number) / METRICS).is_file()
+        """Whether a point's metrics are there and whole."""
+        return self.metrics(number) is not None
 
     def outcome(self, number: int) -> Outcome | None:
         """The outcome of a point; None: there is none yet."""
@@ -143,12 +147,21 @@ class CampaignFolder:
         return locked(self.path)
 
 
-def read_outcome(place: Path) -> Outcome | None:
-    """The outcome of the point in a folder; None: there is none yet."""
-    path = place / OUTCOME
-    if not path.is_file():
+def _read_mapping(path: Path, expected: str) -> dict[str, Any] | None:
+    """Content of a JSON file; None: it is missing, or torn, so that its point is computed again."""
+    try:
+        found = read_json(path, expected) if path.is_file() else None
+    except InputError:
         return None
-    found = read_json(path, "outcome of a point")
+    return found if isinstance(found, dict) else None
+
+
+def read_outcome(place: Path) -> Outcome | None:
+    """The outcome of the point in a folder; None: there is none yet, or its file is damaged."""
+    path = place / OUTCOME
+    found = _read_mapping(path, "outcome of a point")
+    if found is None:
+        return None
     try:
         return Outcome(**found)
     except TypeError:

@@ -1,4 +1,4 @@
-"""The lidar of a flight as a block for control design: linear filters, delay, coloured noise."""
+"""The lidar of a flight as a block for control design: filters, delay, coloured noise, losses."""
 
 import math
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ import xarray as xr
 
 from lidar_mi.encounter.filter_fit import BEFORE, FilterFit, autocovariance, fit_filter, fit_process
 from lidar_mi.encounter.gust_axes import GUSTS
+from lidar_mi.encounter.losses import gust_dependence, loss_chain
 from lidar_mi.encounter.sensor_samples import MARGIN, SensorSamples
 from lidar_mi.errors import InputError
 
@@ -33,8 +34,9 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
 
     Its input k is the true gust, of every axis that the lidar has, in the plane that it begins to
     scan at the time k dt, and white noise with the covariance `noise_covariance`. Its output k is
-    the newest estimate at the time k dt. The wing is in the plane `arrival` seconds after the first
-    scan, `lead` seconds after the delivery.
+    the newest estimate at the time k dt; it is lost where a chain with `loss_transition` is in its
+    second state. The wing is in the plane `arrival` seconds after the first scan, `lead` seconds
+    after the delivery.
 
     Parameters
     ----------
@@ -44,8 +46,9 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        ``A``, ``B``, ``C``, ``D``, ``dt``, ``noise_covariance``; filters, noise and spectra of
-        every axis with their standard errors. Each variable has units and a meaning.
+        ``A``, ``B``, ``C``, ``D``, ``dt``, ``noise_covariance``, ``loss_transition``; filters,
+        noise and spectra of every axis with their standard errors. Each variable has units and a
+        meaning.
 
     Raises
     ------
@@ -95,6 +98,7 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
             **_gust_model(truth[:, measured]),
             **_timing(one, delay_steps),
             **_numbers(flights, fits),
+            **_losses(flights, measured),
             **_spectra(fits, one.period, delay_steps),
         },
         {"axis": axes},
@@ -258,6 +262,30 @@ def _numbers(flights: Sequence[SensorSamples], fits: Sequence[FilterFit]) -> Var
         "slabs": column([fit.count for fit in fits], ratio, "from which the axis is identified"),
         "flights": ((), len(flights), {**ratio, "long_name": "from which it is identified"}),
     }
+
+
+def _losses(flights: Sequence[SensorSamples], measured: list[int]) -> Variables:
+    """The chain of lost estimates, and whether it describes them."""
+    lost = [~np.isfinite(flight.estimate[:, measured]).all(axis=1) for flight in flights]
+    chain = loss_chain(lost)
+    dependence = [gust_dependence(lost, [one.truth[:, k] for one in flights]) for k in measured]
+    ratio, ratio_p = np.array(dependence).T
+    probability, run = chain.probability, chain.mean_run
+    texts = {
+        "loss_probability": (probability[0], "of an estimate to be lost"),
+        "loss_probability_stderr": (probability[1], "standard error of loss_probability"),
+        "loss_run": (run[0], "mean number of estimates lost in succession"),
+        "loss_run_stderr": (run[1], "standard error of loss_run"),
+        "loss_memory_p": (chain.memory_p, "p value of runs of geometric lengths"),
+        "loss_gust_ratio": (ratio, "mean square of the gust in lost slabs over that in all"),
+        "loss_gust_p": (ratio_p, "p value of losses that do not depend on the gust"),
+    }
+    found = {
+        name: (("axis",) if np.ndim(value) else (), value, {"units": "1", "long_name": text})
+        for name, (value, text) in texts.items()
+    }
+    about = {"units": "1", "long_name": "probability from received, lost to received, lost"}
+    return {**found, "loss_transition": (("loss", "loss_2"), chain.transition, about)}
 
 
 def _spectra(fits: Sequence[FilterFit], dt: float, delay_steps: int) -> Variables:

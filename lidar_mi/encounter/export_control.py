@@ -19,6 +19,9 @@ from lidar_mi.io.text import write_text
 
 ABOUT = "blocks.json"
 
+_UNLIKELY = 1e-3
+"""P value of a test of the losses below which a remark is made."""
+
 
 @checked_arguments
 def export_control(
@@ -44,8 +47,8 @@ def export_control(
     overwrite : bool
         Replace files that are there.
     remark : callable, optional
-        Called with a line for every range that cannot be identified beside others that can.
-        Default: a warning.
+        Called with a line for every range that cannot be identified beside others that can, and
+        for lost estimates that no chain describes. Default: a warning.
 
     Returns
     -------
@@ -83,14 +86,29 @@ def export_control(
         raise InputError(
             f"{there[0]}: exists; expected another folder (-o DIR), or --overwrite to replace it"
         )
-    for one in refused:
-        (remark or warnings.warn)(str(one))
+    for text in [*map(str, refused), *(line for name in found for line in _doubts(found[name]))]:
+        (remark or warnings.warn)(text)
     make_folder(out)
     for name, block in found.items():
         write_npz(out / f"{name}.npz", block)
         write_mat(out / f"{name}.mat", block)
     write_text(out / ABOUT, to_json({name: _described(block) for name, block in found.items()}))
     return paths
+
+
+def _doubts(block: xr.Dataset) -> list[str]:
+    """A line for each property of the losses that the chain does not have."""
+    where = f"control block at {float(block['range']):.4g} m: lost estimates"
+    found = []
+    if (p := float(block["loss_memory_p"])) < _UNLIKELY:
+        found.append(f"{where}: the lengths of runs are not geometric (p = {p:.1g})")
+    for axis in block["axis"].values[block["loss_gust_p"].values < _UNLIKELY]:
+        ratio = float(block["loss_gust_ratio"].sel(axis=axis))
+        found.append(
+            f"{where} depend on the gust: the mean square of {axis} in them is {ratio:.2g} times "
+            "that in all"
+        )
+    return found
 
 
 def _names(distances: list[float]) -> list[str]:

@@ -51,6 +51,22 @@ GUIDE = tuple(
     f"docs/guide/{name}.md"
     for name in ("start", "report", "index", *in_order((DOCS / "guide" / "index.md").read_text()))
 )
+# guides whose commands and programs compute for seconds
+COMPUTING = (
+    "start",
+    "python",
+    "images",
+    "methods",
+    "rings",
+    "flights",
+    "control_block",
+    "jsbsim",
+    "air",
+    "xml_scenes",
+    "doppler_lines",
+    "measured_wakes",
+)
+QUICK = tuple(page for page in GUIDE if Path(page).stem not in COMPUTING)
 THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))
 PAGES = ("README.md", *sorted(str(page.relative_to(ROOT)) for page in DOCS.rglob("*.md")))
 GENERATED = ("api", "command", "key", "plugin")
@@ -440,7 +456,14 @@ def test_a_file_name_stands_for_one_text():
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("pages", [THEORY, (*GUIDE, "README.md")])
+@pytest.mark.parametrize(
+    "pages",
+    [
+        pytest.param(THEORY, id="theory"),
+        pytest.param(QUICK, id="quick"),
+        pytest.param((*GUIDE, "README.md"), id="guide", marks=pytest.mark.slow),
+    ],
+)
 def test_printed_code_runs(pages, workplace, capsys):
     """Block by block, as a reader would: files written by one are there for the next.
 

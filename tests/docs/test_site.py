@@ -17,7 +17,7 @@ import pytest
 DOCS = Path(__file__).parents[2] / "docs"
 NEEDED = ("sphinx", "myst_parser", "furo", "latex2mathml")
 MOST_LINES = 300
-GENERATED = {"performance.md", "reference/commands.md", "validation.md"}
+GENERATED = {"performance.md", "reference/commands.md"}
 missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
 with_sphinx = pytest.mark.skipif(bool(missing), reason=f"no {', '.join(missing)}: extra docs")
 
@@ -43,7 +43,7 @@ def test_pages_are_short():
         for page in DOCS.rglob("*.md")
     }
     long = {name for name, number in lines.items() if number > MOST_LINES}
-    assert not long - GENERATED
+    assert not {name for name in long - GENERATED if not name.startswith("validation/")}
 
 
 def test_the_readme_is_one_screen():

@@ -2,13 +2,14 @@
 
 Detects a gust of another sign or size than the aircraft feels, a wrong filter, delay, noise or
 spectrum, stated errors that do not hold, files that control programs do not read, and a variance of
-roll that differs from that of flights by more than 10 %.
+roll or load that differs from that of flights by more than 10 %, with and without lost estimates.
 """
 
 import json
 import re
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.encounter.air import air_along_path
 from lidar_mi.encounter.aircraft import Commands, loads_in_wind
+from lidar_mi.encounter.control_block import control_block
 from lidar_mi.encounter.estimate import Estimate
 from lidar_mi.encounter.flight import aircraft_of
 from lidar_mi.encounter.gust_axes import gusts, span_nodes
@@ -29,6 +31,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.reading import check, settings
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.yaml import to_yaml
+from tests.support.markov_chain import chain
 from tests.support.synthetic_lidar import encounter_keys
 
 SEEDS = range(1, 9)
@@ -137,6 +140,11 @@ def flights(tmp_path_factory):
         record(folder / f"{seed}" / "run", experiment(seed), seed)
     lm.export_control(folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def samples(flights):
+    return [samples_of(one) for one in flights_in(flights)]
 
 
 @pytest.fixture(scope="module")
@@ -290,21 +298,85 @@ def weather():
     return found
 
 
-@pytest.mark.parametrize("forward", [0.0, 1.0])
-def test_predicted_roll_agrees_with_flights(block, weather, forward):
+def with_losses(block, lost, run):
+    """The block of a lidar that loses so many estimates, in runs of this mean length."""
+    begin = lost / run / (1 - lost)
+    return block | {"loss_transition": np.array([[1 - begin, begin], [1 / run, 1 - 1 / run]])}
+
+
+@pytest.mark.parametrize(("forward", "lost"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.05)])
+def test_predicted_roll_agrees_with_flights(block, weather, forward, lost):
     """Within 10 %: the variance of roll of nonlinear flights, by the roll model and its aileron.
 
     The air is that of the flights from which the block is identified: the variance of turbulence
-    differs by more from realisation to realisation.
+    differs by more from realisation to realisation. A lost estimate announces nothing.
     """
+    block = with_losses(block, lost, 3)
     predicted = example()["rms"](block, forward)[0] ** 2
-    # the first 5 s are transient
-    found = np.mean([np.mean(rolled(*one, forward)[200:] ** 2) for one in weather])
-    assert abs(found / predicted - 1) < 0.1
+    random, found = np.random.default_rng(5), []
+    for moments, estimates in weather:
+        modes = chain(random, block["loss_transition"], len(estimates))[:, 0]
+        # the first 5 s are transient
+        rolls = rolled(moments, np.where(modes == 0, estimates, 0.0), forward)[200:]
+        found.append(np.mean(rolls**2))
+    assert abs(np.mean(found) / predicted - 1) < 0.1
 
 
+@pytest.mark.parametrize("hold", [0.0, 1.0])
+@pytest.mark.parametrize("run", [1, 3])
+def test_predicted_variances_with_losses_agree_with_flights(block, samples, run, hold):
+    """Within 10 %: roll, aileron and load factor, over 4 realisations of 3 % lost.
+
+    Runs of lost estimates are too few in one realisation: their standard error of the variance of
+    load is 7 %.
+    """
+    block, random = with_losses(block, 0.03, run), np.random.default_rng(6)
+    flights = []
+    for one in 4 * samples:
+        modes = chain(random, block["loss_transition"], len(one.estimate))
+        flights.append(replace(one, estimate=np.where(modes == 0, one.estimate, np.nan)))
+    predicted = example()["rms"](block, 1.0, hold) ** 2
+    found = example()["rms_in_flights"](block, flights, 1.0, hold) ** 2
+    np.testing.assert_allclose(found, predicted, rtol=0.1)
+
+
+def test_a_few_lost_estimates_raise_the_load_much(block):
+    """The residual without losses is small: 3 % in runs of 3 add half of its variance.
+
+    A load that the estimate does not reduce has the variance pi of the gust in place of that of the
+    residual: both samples that a control averages are lost in the inner part of a run.
+    """
+    rms = example()["rms"]
+    gust, residual = rms(block, 0.0)[2] ** 2, rms(block, 1.0)[2] ** 2
+    found = rms(with_losses(block, 0.03, 3), 1.0)[2] ** 2
+    assert found / residual > 1.4
+    # runs so long that their ends do not count
+    found = rms(with_losses(block, 0.03, 100), 1.0)[2] ** 2
+    assert found == pytest.approx(0.97 * residual + 0.03 * gust, rel=0.03)
+
+
+def test_lost_estimates_are_counted(tmp_path, samples):
+    """The chain of flights of which 5 % are lost in runs of 4, within 4 standard errors."""
+    transition = with_losses({}, 0.05, 4)["loss_transition"]
+    random = np.random.default_rng(7)
+    flights = []
+    for one in samples:
+        modes = chain(random, transition, len(one.estimate))
+        flights.append(replace(one, estimate=np.where(modes == 0, one.estimate, np.nan)))
+    found = control_block(flights)
+    for name, true in (("loss_probability", 0.05), ("loss_run", 4)):
+        assert abs(found[name] - true) < 4 * found[f"{name}_stderr"] < true
+    assert found["loss_memory_p"] > 1e-3 and (found["loss_gust_p"] > 1e-3).all()
+    assert (abs(found["loss_gust_ratio"] - 1) < 0.5).all()
+    # the filter is that of the lidar without losses
+    k = list(found["axis"].values).index("w")
+    error = float(found["gain"][k]) - FILTER["w"][0]
+    assert abs(error) < 4 * found["gain_stderr"][k]
+
+
+@pytest.mark.slow
 def test_the_example_flies_along_recorded_flights(flights, block, capsys, monkeypatch):
-    """Roll by the recorded estimates, within 10 % of the predicted variance."""
+    """Roll and load by the recorded estimates, within 10 % of the predicted variance."""
     path = str(flights / "control" / "block_150m.npz")
     monkeypatch.setattr(sys, "argv", ["control_loop.py", path, "--flights", str(flights)])
     pytest.importorskip("control")
@@ -312,12 +384,13 @@ def test_the_example_flies_along_recorded_flights(flights, block, capsys, monkey
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3
     for text in lines:
-        predicted, _, flown = map(float, re.findall(r"\d\.\d\d", text))
-        # both are rounded to a hundredth of a degree
-        assert abs((flown / predicted) ** 2 - 1) < 0.13
-    assert example()["AILERON_MOMENT"] == pytest.approx(
-        aircraft_of(experiment().encounter).control_moments[0, 0], rel=1e-3
-    )
+        roll, _, load, flown_roll, flown_load = map(float, re.findall(r"\d\.\d\d+", text))
+        # roll is rounded to a hundredth of a degree
+        assert abs((flown_roll / roll) ** 2 - 1) < 0.13
+        assert abs((flown_load / load) ** 2 - 1) < 0.13
+    aircraft = aircraft_of(experiment().encounter)
+    assert example()["AILERON_MOMENT"] == pytest.approx(aircraft.control_moments[0, 0], rel=1e-3)
+    assert example()["MASS"] == experiment().encounter.aircraft.heave.mass
 
 
 def test_a_range_of_few_slabs_does_not_hide_the_others(tmp_path):

@@ -16,6 +16,7 @@ import xarray as xr
 from benchmarks.velocimetry import Field
 from tests.support.flows import axes, origin
 from validation import __main__ as command
+from validation import report
 from validation.flows import __main__ as quick_look
 from validation.flows import families, images, measure, table
 from validation.flows.families import BY_NAME, FAMILIES, Family
@@ -509,7 +510,7 @@ def test_lines_from_other_processes_are_in_order(capfd):
     assert "2 of 2: cells, 1 % known" in capfd.readouterr().err
 
 
-def test_part_of_the_families_does_not_overwrite_the_page(monkeypatch, tmp_path, capsys):
+def test_part_of_the_families_does_not_overwrite_the_results(monkeypatch, tmp_path, capsys):
     check = table.Check("Families", "| table |", (table.Row("one", "of", 1.0, 1.0, 0.0, 0.1),))
 
     class Process:
@@ -528,11 +529,11 @@ def test_part_of_the_families_does_not_overwrite_the_page(monkeypatch, tmp_path,
             )()
 
     monkeypatch.setattr(command, "fresh_process", Process)
-    page = tmp_path / "validation.md"
-    assert command.main(["flows", "--purpose", "build", "-o", str(page)]) == 0
-    assert "| build |" in capsys.readouterr().out and not page.exists()
-    assert command.main(["flows", "-o", str(page)]) == 0
-    assert "<!-- flows: begin -->\n\n## T\n\nI\n\n| None |" in page.read_text()
+    results = tmp_path / "validation" / "results" / "flows.json"
+    assert command.main(["flows", "--purpose", "build", "-o", str(tmp_path)]) == 0
+    assert "| build |" in capsys.readouterr().out and not results.exists()
+    assert command.main(["flows", "-o", str(tmp_path)]) == 0
+    assert "\n| None |\n" in report.page(report.load(results))
 
 
 def test_quick_look(capsys, tmp_path):

@@ -1,7 +1,7 @@
-"""The validation: that it can fail, that its references are right, that its page is in date.
+"""The validation: that it can fail, that its references are right, that its results are in date.
 
 Detects: a row that passes with a wrong number or without any yardstick, a failure that does not end
-in an error, a check or figure that the page lacks or has too many, 1e-5 in the integral equation
+in an error, a check or figure that the results lack or have too many, 1e-5 in the integral equation
 that stands for steady states, stored numbers that belong to other cases than those asked for.
 
 What the checks themselves find is not tested here: that is `make validate`.
@@ -24,11 +24,9 @@ ROOT = Path(__file__).resolve().parents[2]
 if not (ROOT / "validation").is_dir():
     pytest.skip("the validation is part of the source tree", allow_module_level=True)
 
-from validation import GROUPS, SECTIONS, report
+from validation import GROUPS, TOLD, report
 from validation import __main__ as command
 from validation.report import Check, Row
-
-PAGE = ROOT / "docs" / "validation.md"
 
 
 @pytest.fixture
@@ -240,31 +238,47 @@ def fake_run(name, effort):
 def quick(monkeypatch, tmp_path):
     monkeypatch.setattr(command, "run", fake_run)
     monkeypatch.setattr(command, "fresh_process", lambda: ThreadPoolExecutor(1))
-    return tmp_path / "validation.md"
+    return tmp_path
+
+
+def stored(folder, name):
+    return report.load(folder / "validation" / "results" / f"{name}.json")
 
 
 def test_command_ends_with_an_error_where_a_row_fails(quick, capsys):
     assert command.main(["lidar_equation", "-o", str(quick)]) == 0
-    assert "FAILS" not in capsys.readouterr().out and not quick.exists()
+    assert "FAILS" not in capsys.readouterr().out
     assert command.main(["gradients", "lidar_equation", "-o", str(quick)]) == 1
     assert "FAILS: Check gradients, one | of: expected 1, got 2" in capsys.readouterr().out
 
 
-def test_command_continues_after_a_failing_group_and_writes_no_page(quick, capsys):
+def test_command_continues_after_a_failing_group_and_stores_the_others(quick, capsys):
     assert command.main(["-o", str(quick)]) == 1
     printed = capsys.readouterr().out
-    assert "broke" in printed and "Check gradients" in printed and not quick.exists()
+    assert "broke" in printed and "Check gradients" in printed
+    there = {path.stem for path in (quick / "validation" / "results").iterdir()}
+    assert there == set(GROUPS) - {"molecules", "coverage"}
 
 
-def test_page_lists_failures(quick, monkeypatch):
-    monkeypatch.setattr(command, "GROUPS", ("lidar_equation", "gradients"))
-    assert command.main(["--slow", "-o", str(quick)]) == 1
-    text = quick.read_text()
-    assert "Of 2 rows, 1 of 2 fail." in text and "make validate ARGS=--slow" in text
+def test_page_of_a_group_lists_failures(quick):
+    assert command.main(["gradients", "--slow", "-o", str(quick)]) == 1
+    text = report.page(stored(quick, "gradients"))
+    assert text.startswith("# Title gradients\n\nText.\n")
+    assert "`python -m validation gradients --slow`. Of 1 rows, 1 fail." in text
     assert "| one \\| of | 1 | 2 | \\|1.0e-01\\| | +10.0 | **FAIL** | two |" in text
 
 
-def test_comparison_is_printed_and_on_the_page(quick, monkeypatch, capsys):
+def test_results_are_read_as_they_were_stored(tmp_path):
+    row = Row("a", "b | c", 1.0, 1.0 + 1e-9, sigma=0.1, tolerance=0.2, unit="m")
+    table = report.Comparison(("receiver", "m/s"), (("rings", "0.1"), ("µ", "")))
+    figures = (("one.png", "What it shows"),)
+    checks = Check("T", "Two\n\nparts.", (row,), figures, "g.one", table), Check("U", "", ())
+    results = report.Results("G", "In short.", "command", checks, report.versions(), "note")
+    report.store(results, tmp_path / "g.json")
+    assert report.load(tmp_path / "g.json") == results
+
+
+def test_comparison_is_printed_and_on_the_pages(quick, monkeypatch, capsys):
     table = report.Comparison(("receiver", "m/s"), (("rings", "0.1"),))
 
     def with_table(name, effort):
@@ -272,93 +286,60 @@ def test_comparison_is_printed_and_on_the_page(quick, monkeypatch, capsys):
         return title, text, [replace(check, comparison=table)]
 
     monkeypatch.setattr(command, "run", with_table)
-    monkeypatch.setattr(command, "GROUPS", ("lidar_equation",))
-    assert command.main(["-o", str(quick)]) == 0
-    lines = "| receiver | m/s |\n| --- | --- |\n| rings | 0.1 |\n"
-    assert lines in capsys.readouterr().out and f"\n\n{lines}\n" in quick.read_text()
-    pages = [quick.parent / "accuracy.md", quick.parent / "experiments" / "wake.md"]
-    pages[1].parent.mkdir()
+    pages = [quick / "docs" / "accuracy.md", quick / "docs" / "experiments" / "wake.md"]
+    pages[1].parent.mkdir(parents=True)
     begin, end = (f"<!-- lidar_equation.one: {what} -->" for what in ("begin", "end"))
     for hand in pages:
         hand.write_text(f"before\n{begin}\n| old |\n{end}\nafter\n")
     assert command.main(["lidar_equation", "-o", str(quick)]) == 0
+    lines = "| receiver | m/s |\n| --- | --- |\n| rings | 0.1 |\n"
+    assert lines in capsys.readouterr().out
+    assert f"\n\n{lines}\n" in report.page(stored(quick, "lidar_equation"))
     for hand in pages:
         assert hand.read_text() == f"before\n{begin}\n\n{lines}\n{end}\nafter\n"
 
 
-def test_command_names_unknown_arguments(capsys):
-    with pytest.raises(SystemExit) as stop:
-        command.main(["speed"])
-    assert stop.value.code == 2 and "'speed' is none of" in capsys.readouterr().err
-
-
-def test_group_that_runs_by_name_writes_its_section_alone(quick, monkeypatch):
-    """Into a page that stays as it is; a new page keeps the section."""
-    begin, end = "<!-- coverage: begin -->", "<!-- coverage: end -->"
-    quick.write_text(f"before\n\n{begin}\nold\n{end}\n\nafter\n")
-    assert command.main(["coverage", "-o", str(quick)]) == 0
-    text = quick.read_text()
-    assert text.startswith(f"before\n\n{begin}\n\n## Title coverage\n") and "old" not in text
-    assert text.endswith(f"\n{end}\n\nafter\n")
-    monkeypatch.setattr(command, "GROUPS", ("lidar_equation",))
-    assert command.main(["-o", str(quick)]) == 0
-    section = report.section_of(text, "coverage")
-    assert "before" not in quick.read_text() and section in quick.read_text()
-
-
-def test_short_run_of_all_groups_leaves_the_section_of_a_long_one(quick, monkeypatch, capsys):
-    begin, end = "<!-- coverage: begin -->", "<!-- coverage: end -->"
-    quick.write_text(f"{begin}\n\nof twelve seeds\n\n{end}\n")
+def test_short_run_of_all_groups_leaves_what_many_seeds_found(quick, monkeypatch, capsys):
     monkeypatch.setattr(command, "GROUPS", ("lidar_equation", "coverage"))
+    there = quick / "validation" / "results" / "coverage.json"
     assert command.main(["-o", str(quick)]) == 0
-    short = quick.read_text()
-    assert "of twelve seeds" in short and "Title coverage" not in short
-    assert "Check coverage" in capsys.readouterr().out
-    assert command.main(["--slow", "-o", str(quick)]) == 0
-    slow = quick.read_text()
-    assert "of twelve seeds" not in slow and slow.count("## Title coverage") == 1
+    assert not there.exists() and "Check coverage" in capsys.readouterr().out
+    for arguments in (["coverage"], ["--slow"]):
+        assert command.main([*arguments, "-o", str(quick)]) == 0
+        (only,) = stored(quick, "coverage").checks
+        assert (only.text, only.rows) == ("More.", ())
+        there.unlink()
 
 
-# --- the page
+# --- what is stored
 
 
-@pytest.fixture(scope="module")
-def page():
-    return PAGE.read_text()
+RESULTS = {path.stem: report.load(path) for path in (ROOT / "validation" / "results").iterdir()}
+WITH_ROWS = sorted(set(GROUPS) - set(TOLD))
+
+
+def test_every_group_has_its_results_and_its_page():
+    assert set(RESULTS) == set(GROUPS) | set(TOLD)
+    index = (ROOT / "docs" / "validation.md").read_text()
+    for name, results in RESULTS.items():
+        assert f"| [{results.title}](validation/{name}.md), `{name}` | " in index
 
 
 @pytest.mark.usefixtures("variant")
-def test_page_has_every_check_and_no_other(page):
-    rest = [name for name in GROUPS if name not in SECTIONS]
-    known = [f"{name}.{check.__name__}" for name in rest for check in group(name).CHECKS]
-    assert re.findall(r"^<!-- (\w+\.\w+) -->$", page, re.MULTILINE) == known
-    for name in GROUPS:
-        assert f"\n## {group(name).TITLE}\n\n{group(name).INTRODUCTION}\n" in page
+@pytest.mark.parametrize("name", WITH_ROWS)
+def test_results_are_of_every_check_and_no_other(name):
+    module = group(name)
+    assert [one.name for one in RESULTS[name].checks] == [
+        f"{name}.{check.__name__}" for check in module.CHECKS
+    ]
+    assert (RESULTS[name].title, RESULTS[name].introduction) == (module.TITLE, module.INTRODUCTION)
 
 
-def rows(page):
-    """Cells of all rows of checks, by the check's name."""
-    found, name = {}, None
-    for line in page.splitlines():
-        if match := re.fullmatch(r"<!-- (\w+\.\w+) -->", line):
-            name = match[1]
-        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
-        if name and len(cells) == 7 and cells[5] not in ("", "---"):
-            found.setdefault(name, []).append(cells)
-    return found
-
-
-def test_every_row_of_the_page_passes(page):
-    found = [row for group_rows in rows(page).values() for row in group_rows]
-    assert f"**Of {len(found)} rows, all {len(found)} pass.**" in page
-    assert {row[5] for row in found} == {"pass"} and len(found) > 150
-    for row in found:
-        expected, got, sigma, deviation = row[1], row[2], row[3].strip("\\|"), row[4]
-        assert all(row[:1] + row[6:]), row
-        # the printed numbers agree with each other as far as their digits go
-        off = (float(got) - float(expected)) / float(sigma)
-        digits = 1e-5 * max(abs(float(expected)), abs(float(got))) / float(sigma)
-        assert off == pytest.approx(float(deviation), rel=0.06, abs=0.06 + digits), row
+@pytest.mark.parametrize("name", WITH_ROWS)
+def test_every_stored_row_passes(name):
+    rows = [row for check in RESULTS[name].checks for row in check.rows]
+    assert len(rows) > 5 and all(row.name and row.reference for row in rows)
+    assert not [row for row in rows if not row.passed]
 
 
 @pytest.mark.usefixtures("variant")
@@ -372,34 +353,30 @@ def test_every_row_of_the_page_passes(page):
         pytest.param("receivers.published", marks=pytest.mark.slow),
     ],
 )
-def test_page_is_in_date(page, effort, name):
+def test_results_are_in_date(effort, name):
     """Quick checks without chance: the same rows again."""
     module, _, function = name.partition(".")
     made = getattr(group(module), function)(effort)
-    printed = rows(page)[name]
-    assert [row[0] for row in printed] == [report._cells(row)[0] for row in made.rows]
-    for row, line in zip(made.rows, printed, strict=True):
-        assert line[6] == row.reference
-        assert float(line[1]) == pytest.approx(row.expected, rel=1e-5)
-        assert float(line[2]) == pytest.approx(row.got, rel=1e-5, abs=0.1 * row.tolerance)
+    (stored,) = (check for check in RESULTS[module].checks if check.name == name)
+    assert len(stored.rows) == len(made.rows)
+    for row, old in zip(made.rows, stored.rows, strict=True):
+        assert report._cells(old)[0] == report._cells(row)[0] and old.reference == row.reference
+        assert old.expected == pytest.approx(row.expected, rel=1e-5)
+        assert old.got == pytest.approx(row.got, rel=1e-5, abs=0.1 * row.tolerance)
 
 
-def test_figures_of_the_page_are_there_and_small(page):
-    shown = re.findall(r"!\[[^\]]+\]\((validation/[\w.]+)\)", page)
-    assert len(shown) == len(set(shown)) >= 5
-    there = {f"validation/{path.name}" for path in (ROOT / "docs" / "validation").iterdir()}
-    assert set(shown) == there
-    assert all((ROOT / "docs" / name).stat().st_size < 80_000 for name in shown)
+def test_figures_are_there_and_small():
+    shown = [
+        name
+        for results in RESULTS.values()
+        for check in results.checks
+        for name, _ in check.figures
+    ]
+    there = {path.name: path for path in (ROOT / "docs" / "validation").glob("*.png")}
+    assert len(shown) == len(set(shown)) >= 5 and set(shown) == set(there)
+    assert all(path.stat().st_size < 80_000 for path in there.values())
 
 
-def test_links_of_the_page_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#]+)\)", page):
-        assert target.startswith("https://") or (PAGE.parent / target).resolve().exists(), target
-    headings = re.findall(r"^#+ (.+)$", page, re.MULTILINE)
-    for anchor in re.findall(r"\]\(#([^)]+)\)", page):
-        assert anchor in {report._anchor(heading) for heading in headings}
-
-
-def test_page_is_linked_from_the_readme():
+def test_index_is_linked_from_the_readme():
     assert "(docs/validation.md)" in (ROOT / "README.md").read_text()
     assert re.search(r"^validate:", (ROOT / "Makefile").read_text(), re.MULTILINE)

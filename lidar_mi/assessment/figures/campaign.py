@@ -10,11 +10,11 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis as MatplotlibAxis
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm, Normalize, to_hex
+from matplotlib.colors import LogNorm, Normalize, to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from scipy.interpolate import RegularGridInterpolator
 
 from lidar_mi.assessment.digits import three
@@ -24,6 +24,8 @@ from lidar_mi.assessment.metrics.campaign import MEMBER, Interval, over_members
 from lidar_mi.assessment.metrics.sensitivity import SobolIndices
 
 FAILED, ABSENT, DOT = "#a4161a", "#e4e4e4", "#3b6ea5"
+_FEW = 6
+"""Up to so many values along an axis each has its tick, and every cell its number."""
 COLOURS = ("#1f5fa8", "#c2571a", "#2c7a3f", "#8a3a8f", "#7a6200", "#4a4a4a", "#b0306a", "#0d7f86")
 
 
@@ -84,7 +86,7 @@ def draw_map(
 ) -> str:
     """A metric over two knobs, and where it is at its limits.
 
-    Failed points are crossed out, those without a value grey.
+    Failed points are crossed out, those without a value grey. Cells of a small grid have numbers.
     """
     figure, axes = panel(title)
     values = values.transpose(y.name, x.name)
@@ -97,6 +99,7 @@ def draw_map(
         points,
         lambda v: to_hex(cmap(norm(v))),
         lambda v: f"{label}: {three(v)}",
+        three,
     )
     bar = figure.colorbar(ScalarMappable(norm, cmap), ax=axes, label=wrapped(label))
     if isinstance(norm, LogNorm):
@@ -129,6 +132,7 @@ def draw_requirements(
         points,
         lambda v: "#cfe8d3" if v >= 0 else "#f3d5cf",
         lambda v: f"smallest margin {100 * v:+.0f} %",
+        lambda v: f"{100 * v:+.0f} %",
     )
     handles = []
     for (name, one), colour in zip(margins.items(), COLOURS * 3, strict=False):
@@ -245,6 +249,8 @@ def draw_lines(
             axes.plot(p, low, "x", color=FAILED, ms=7, mew=2, clip_on=False)
             marks.append(_dot(p, low, "failed", FAILED, points, {x.name: int(k)}))
     _scale(axes, x, None)
+    for values, _ in list(groups.values())[:1]:
+        _ticks(axes.xaxis, x, x.places(values[x.name].values))
     axes.set_ylabel(wrapped(label))
     _by_factors(axes, known)
     if limit is not None:
@@ -390,8 +396,9 @@ def _cells(
     points: Points,
     colour: Callable[[float], str],
     text: Callable[[float], str],
+    number: Callable[[float], str],
 ) -> list[Mark]:
-    """Cells of a map around its points, (y, x)."""
+    """Cells of a map around its points, (y, x); with their numbers where there are few."""
     across, up = (axis.places(values[axis.name].values) for axis in (x, y))
     edges = _edges(across, x.logarithmic), _edges(up, y.logarithmic)
     marks = []
@@ -413,11 +420,38 @@ def _cells(
         )
         if failed[i, j]:
             axes.plot(across[j], up[i], "x", color=FAILED, ms=9, mew=2)
+        elif max(values.shape) <= _FEW:
+            # on the cell's colour, where a boundary crosses it
+            axes.text(
+                float(across[j]),
+                float(up[i]),
+                number(value) if np.isfinite(value) else "no value",
+                color="k" if _luminance(shown) > 0.4 else "w",
+                ha="center",
+                va="center",
+                bbox={"facecolor": shown, "edgecolor": "none", "pad": 1},
+            )
     # how many numbers an axis has follows from its limits
     axes.set_xlim(edges[0].min(), edges[0].max())
     axes.set_ylim(edges[1].min(), edges[1].max())
     _scale(axes, x, y)
+    _ticks(axes.xaxis, x, across)
+    _ticks(axes.yaxis, y, up)
     return marks
+
+
+def _luminance(colour: str) -> float:
+    """From 0 (black) to 1 (white), Rec. 709 on the values as displayed."""
+    return float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722)))
+
+
+def _ticks(side: MatplotlibAxis, axis: Axis, places: np.ndarray) -> None:
+    """Ticks at the values themselves, where they are few and their numbers do not overlap."""
+    at = np.sort(np.log(places) if axis.logarithmic else places)
+    if axis.labels or not 1 < len(at) <= _FEW or np.diff(at).min() < np.ptp(at) / 10:
+        return
+    side.set_ticks(places, [three(float(value)) for value in places])
+    side.set_minor_locator(NullLocator())
 
 
 def _dot(

@@ -92,20 +92,20 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
     known = {key for key, values in metrics.items() if np.isfinite(values).any()}
     best = _best_method(metrics, known)
     vortex = [vortex_key(Origin.IMAGES, f"error_{q}") for q in ("circulation_5_15", "position")]
+    head, components = ("sensor", "uvw") if "sensor.rmse_w" in known else (best, "vw")
     wanted = [
-        *(f"sensor.rmse_{name}" for name in "uvw"),
-        *(() if "sensor.rmse_w" in known else (f"{best}.rmse_v", f"{best}.rmse_w")),
-        *(() if "sensor.rmse_w" in known else (f"{best}.valid_fraction",)),
+        # an error beside how often it lies within what is stated
+        *(f"{head}.{what}_{name}" for name in components for what in ("rmse", "coverage_95")),
+        *(() if head == "sensor" else (f"{best}.valid_fraction",)),
         # of these, what the simulation's own noise adds
         f"{best}.monte_carlo_w",
-        "sensor.coverage_95_w",
         *vortex,
         "sensor.rmse_v_los",
         "sensor.doppler.pulses_needed",
         "coherent.vortices.circulation_error",
         "coherent.vortices.place_error",
         "coherent.vortices.valid_fraction",
-        *(f"coherent.winds.rmse_{name}" for name in "uvw"),
+        *(f"coherent.winds.{what}_{name}" for name in "uvw" for what in ("rmse", "coverage_95")),
         *(
             f"encounter.{mode}.largest_roll"
             for mode in ("off", "autopilot", "feedforward", "perfect")
@@ -164,6 +164,17 @@ def judged(dataset: xr.Dataset, key: str) -> xr.DataArray:
     if f"{phase}.applies" in dataset:
         nothing &= dataset[f"{phase}.applies"] == 1
     return margin.where(~nothing, -1.0)
+
+
+def spaced_by_factors(values: np.ndarray) -> bool:
+    """Whether values are spaced more evenly by factors than by differences; two, by 8 or more."""
+    at = np.sort(np.asarray(values, dtype=float))
+    if len(at) < 2 or at[0] <= 0:
+        return False
+    if len(at) == 2:
+        return bool(at[1] >= 8 * at[0])
+    linear, factors = (np.std(steps) / np.mean(steps) for steps in map(np.diff, (at, np.log(at))))
+    return bool(factors < linear)
 
 
 def varies_by_factors(values: np.ndarray) -> bool:

@@ -20,38 +20,6 @@ EXACT = (Source.EXTINCTION, Source.WITHOUT_TEXTURE)
 RENDERED = (Source.BACKSCATTER, Source.NOISY)
 """Sources that are images of the lidar; the second one behind a detector."""
 
-
-_KINDS = (
-    ("rmse_", "rms error of "),
-    ("bias_", "mean error of "),
-    ("error_", "error of "),
-    ("stderr_", "stated error of "),
-)
-_QUANTITIES = {
-    "rmse": "rms error",
-    "bias": "mean error",
-    "v_los": "the line-of-sight speed",
-    "valid_fraction": "fraction of valid vectors",
-    "largest_roll": "largest bank angle",
-}
-
-
-def title_of(key: str) -> str:
-    """What a metric is called in headings: the quantity first, then where it is from.
-
-    >>> title_of("backscatter_noisy.variational.all.rmse_v")
-    'rms error of v, backscatter noisy, variational'
-    """
-    *places, quantity = key.split(".")
-    whose = "standard error of " if quantity.endswith("_stderr") else ""
-    quantity = quantity.removesuffix("_stderr")
-    start, words = next((p for p in _KINDS if quantity.startswith(p[0])), ("", ""))
-    rest = quantity.removeprefix(start)
-    named = _QUANTITIES.get(rest, rest)
-    texts = [whose + words + named, *(place for place in places if place != "all")]
-    return ", ".join(texts).replace("_", " ")
-
-
 OUTSIDE_CORES = "outside_cores."
 """Of errors beyond two core radii, before the quantity."""
 

@@ -27,6 +27,7 @@ def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, fl
             wind = found.sel(source=source, algorithm=method)
             true = wind[["v_true", "w_true"]].rename(v_true="v", w_true="w")
             numbers = wind_metrics(wind, true, list(cores)) | efficiency(wind) | skill(wind)
+            numbers |= coverage(wind)
             metrics |= {wind_key(source, method, key): value for key, value in numbers.items()}
     return metrics
 
@@ -48,6 +49,23 @@ def efficiency(wind: xr.Dataset) -> dict[str, float]:
             rmse = error_statistics(error, where=used)["rmse"]
             # without errors there is nothing to divide by
             metrics |= {f"efficiency_{name}": least / rmse} if rmse > 0 else {}
+    return metrics
+
+
+def coverage(wind: xr.Dataset) -> dict[str, float]:
+    """How often errors of valid vectors lie within what a method states, of v and w.
+
+    ``coverage_68_*``, ``coverage_95_*``: as of `errors.error_statistics`; empty for methods that
+    state no errors.
+    """
+    metrics: dict[str, float] = {}
+    for name in ("v", "w"):
+        if f"{name}_stderr" not in wind:
+            continue
+        error = (wind[name] - wind[f"{name}_true"]).values
+        found = error_statistics(error, wind[f"{name}_stderr"].values, wind["flag"].values == 0)
+        for key in ("coverage_68", "coverage_95"):
+            metrics |= {f"{key}_{name}": found[key]} if key in found else {}
     return metrics
 
 

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import xarray as xr
 from markupsafe import Markup
+from matplotlib.colors import Normalize
 
 from lidar_mi.assessment.digits import three, with_error
 from lidar_mi.assessment.figures import campaign as figures
@@ -25,6 +26,8 @@ from lidar_mi.units import conversion, usual_unit
 
 _PANELS = 16
 _FEW = 4
+_ROWS = 36
+"""Of the table of points, at most."""
 _DONE, _FAILED = 0, 1
 
 
@@ -61,7 +64,9 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     blocks = [*flown, *blocks]
     return template("campaign.html").render(
         name=dataset.attrs.get("name", "campaign"),
-        lead=_lead(dataset, axes, margins),
+        lead=_lead(dataset, shown, axes, margins),
+        numbers=_table(dataset, shown, axes),
+        members=MEMBER in dataset.dims,
         rows=_requirement_rows(margins, axes),
         required=_marked(required),
         blocks=_marked(blocks),
@@ -74,9 +79,10 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
 
 
 def answer(dataset: xr.Dataset) -> str:
-    """What a campaign did, and at how many points the requirements are met: its report's lead."""
+    """How large errors are, where they are least, and where requirements are met: the lead."""
     dataset = _in_usual_units(dataset)
-    return _lead(dataset, _axes(dataset), _margins(dataset))
+    shown = numbers.chosen(numbers.metrics_of(dataset), None)
+    return _lead(dataset, shown, _axes(dataset), _margins(dataset))
 
 
 Margins = Mapping[tuple[str, str], Mapping[str, numbers.Interval]]
@@ -121,9 +127,8 @@ def _axis(dataset: xr.Dataset, name: str) -> Axis:
     at = dataset[name]
     if not numbers.is_numeric(dataset, name):
         return Axis(name, label_of(at, name), False, tuple(str(value) for value in at.values))
-    values = at.values
-    # without a word of it, by factors where values differ by some
-    guess = "log" if values.min() > 0 and values.max() >= 8 * values.min() else "linear"
+    # the description of a list does not say
+    guess = "log" if numbers.spaced_by_factors(at.values) else "linear"
     return Axis(name, label_of(at, name), at.attrs.get("scale", guess) == "log")
 
 
@@ -188,13 +193,83 @@ def _failures(dataset: xr.Dataset) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Margins) -> str:
+def _table(
+    dataset: xr.Dataset, shown: Sequence[str], axes: Mapping[str, Axis]
+) -> tuple[list[str], list[tuple[str, str, list[str]]]] | None:
+    """Heads and rows of the metrics at every point, with standard errors over members.
+
+    None: there is one point, or there are too many.
+    """
+    known = numbers.metrics_of(dataset)
+    points = dataset["status"].size // dataset.sizes.get(MEMBER, 1)
+    if not axes or not 1 < points <= _ROWS:
+        return None
+    columns = []
+    for key in shown:
+        values = known[key]
+        count = values.notnull().sum(MEMBER) if MEMBER in values.dims else None
+        error = None if count is None else values.std(MEMBER, ddof=1) / np.sqrt(count)
+        columns.append((numbers.over_members(values).mean, error))
+    status = dataset["status"]
+    first = status.isel({MEMBER: 0}) if MEMBER in status.dims else status
+    rows = []
+    for at in _each(first):
+        varied = {dim: k for dim, k in at.items() if dim in axes or dim == SAMPLE}
+        rows.append((_place(dataset, varied), "", [_cell(*one, at) for one in columns]))
+    return [label_of(known[key], key) for key in shown], rows
+
+
+def _cell(mean: xr.DataArray, error: xr.DataArray | None, at: Mapping[str, int]) -> str:
+    value = float(mean.isel(at))
+    if not np.isfinite(value):
+        return "-"
+    stderr = np.nan if error is None else float(error.isel(at))
+    return with_error(value, stderr) if stderr > 0 else three(value)
+
+
+def _best_sentence(dataset: xr.Dataset, shown: Sequence[str]) -> str:
+    """Values of the first metric, where it is least, and how often errors are as stated."""
+    known = numbers.metrics_of(dataset)
+    if not shown:
+        return ""
+    key = shown[0]
+    mean = numbers.over_members(known[key]).mean
+    values = mean.values[np.isfinite(mean.values)]
+    if not values.size:
+        return ""
+    name, _, unit = label_of(known[key], key).partition(" / ")
+    text = f"{name[:1].upper()}{name[1:]}: {_from_to(values)} {unit}".rstrip()
+    if values.size > 1:
+        lowest = np.unravel_index(int(np.nanargmin(mean.values)), mean.shape)
+        at = dict(zip(map(str, mean.dims), map(int, lowest), strict=True))
+        varied = {dim: k for dim, k in at.items() if mean.sizes[dim] > 1}
+        text += f", least at {_place(dataset, varied)}"
+    if values.size < mean.size:
+        text += f", none at {mean.size - values.size} of {mean.size} points"
+    head, found, component = key.rpartition(".rmse_")
+    covered = known.get(f"{head}.coverage_95_{component}") if found else None
+    if covered is not None and np.isfinite(covered).any():
+        each = 100 * numbers.over_members(covered).mean.values
+        text += f"; {_from_to(each[np.isfinite(each)])} % of errors are within 1.96 standard errors"
+        text += " (95 % if as stated)"
+    return f"{text}. "
+
+
+def _from_to(values: np.ndarray) -> str:
+    low, high = three(float(values.min())), three(float(values.max()))
+    return low if low == high else f"{low} to {high}"
+
+
+def _lead(
+    dataset: xr.Dataset, shown: Sequence[str], axes: Mapping[str, Axis], margins: Margins
+) -> str:
     status = dataset["status"]
     runs, done = status.size, int((status == _DONE).sum())
     failed = int((status == _FAILED).sum())
     members = dataset.sizes.get(MEMBER, 1)
     points = runs // (status.sizes.get(MEMBER, 1))
     text = points_sentence(dataset, lambda at: _place(dataset, at))
+    text += _best_sentence(dataset, shown)
     text += f"{points} point{'s' * (points != 1)} of {dataset.attrs.get('base', 'an experiment')}"
     if members > 1:
         text += f" with {members} members each"
@@ -352,7 +427,8 @@ def _sweep_block(
         limits["limit"] = bank - mean
     if limits and len(at) == 2:
         text += "Black lines: where the limit is reached. "
-    norm = figures.colour_scale(mean)
+    is_fraction = re.search(r"\bcoverage_|fraction$", key)
+    norm = Normalize(0, 1) if is_fraction else figures.colour_scale(mean)
     for name, where in selections[:_PANELS]:
         here = Points(*(p.isel(where) for p in flat))
         if len(at) == 2:

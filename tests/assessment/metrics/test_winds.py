@@ -42,3 +42,18 @@ def test_a_method_without_standard_errors_has_no_such_verdict():
     metrics = cross_flow_metrics(winds(np.nan), [])
     assert not any("stderr" in key or "skill" in key for key in metrics)
     assert not has_no_skill(metrics, Source.BACKSCATTER, "variational")
+
+
+def test_coverage_counts_valid_vectors():
+    """Four of twenty errors of v are 1.5 standard errors, two are 3, one of which is flagged."""
+    found = winds(0.5)
+    off = np.zeros((1, 1, 4, 5))
+    off[..., 0, :4], off[..., 1, :2] = 1.5 * 0.5, 3 * 0.5
+    flag = np.zeros(off.shape, int)
+    flag[..., 1, 0] = Flag.NO_SKILL.value
+    metrics = cross_flow_metrics(found.assign(v=found["v"] + off, flag=found["flag"] + flag), [])
+    head = "backscatter.variational.coverage"
+    assert metrics[f"{head}_68_v"] == pytest.approx(14 / 19)
+    assert metrics[f"{head}_95_v"] == pytest.approx(18 / 19)
+    assert metrics[f"{head}_95_w"] == 1.0
+    assert not any("coverage" in key for key in cross_flow_metrics(winds(np.nan), []))

@@ -9,6 +9,8 @@ import re
 import numpy as np
 import pytest
 
+from lidar_mi.assessment.labels import title_of
+from lidar_mi.assessment.metrics.campaign import spaced_by_factors
 from lidar_mi.assessment.report.campaign import answer, page
 from lidar_mi.errors import InputError
 from tests.support.campaign_results import campaign, sweep
@@ -50,6 +52,45 @@ def test_the_lead_says_where_requirements_are_not_met():
     assert re.search(r"\(error of v: margin -\d+ %\)\.$", text)
     many = answer(sweep())
     assert "Not met for flight control, landing at 6 points, most often error of v at 6" in many
+
+
+def test_four_points_have_their_numbers():
+    """In the cells and in a table, coverage beside the error; ticks are the values themselves."""
+    data = sweep().isel(range=[0, 2], energy=[1, 2])
+    covered = np.array([0.5, 0.93, 0.95, 0.97]).reshape(2, 2)[..., None]
+    data["sensor.rmse_w"] = data["sensor.rmse_v"].copy()
+    for name in "vw":
+        key = f"sensor.coverage_95_{name}"
+        data[key] = data["sensor.rmse_v"].dims, covered + np.zeros(4), {"long_name": title_of(key)}
+    html = page(data, "name: test")
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", html)
+    # 2.5 m/s at 3.16 mJ, falling with the root of the energy
+    assert {"4.45", "1.41", "0.93", "75", "300", "1", "10"} <= set(texts)
+    heads = re.findall(r'<th scope="col">(.*?)</th>', html[html.index('id="numbers"') :])
+    assert heads[:2] == ["error of v / m/s", "coverage of 95 %, v, sensor"]
+    rows = re.findall(r"<tr><td>(range.*?)</td><td[^>]*>(.*?)</td>", html)
+    assert rows[0] == ("range = 75 m, energy = 1 mJ", "4.446\xa0±\xa00.029")
+    assert answer(data).startswith(
+        "Error of v: 1.41 to 4.45 m/s, least at range = 75 m, energy = 10 mJ; "
+        "50 to 97 % of errors are within 1.96 standard errors"
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "logarithmic"),
+    [
+        ([1, 2, 3, 10], True),
+        (np.arange(1, 11), False),
+        ([75, 150, 300], True),
+        ([300, 150, 75], True),
+        ([50, 100, 150], False),
+        ([1, 9], True),
+        ([50, 150], False),
+        ([0, 1, 10, 100], False),
+    ],
+)
+def test_axes_are_scaled_as_their_values(values, logarithmic):
+    assert spaced_by_factors(np.array(values)) == logarithmic
 
 
 def test_maps_of_positive_knobs_end_at_zero_or_above():
