@@ -101,12 +101,19 @@ def breakable(body):
     )
 
 
+def _text(page):
+    """What a page says, without its comments."""
+    for comment in [*page.findall(nodes.comment), *page.findall(nodes.raw)]:
+        comment.parent.remove(comment)
+    return " ".join(page.astext().split())
+
+
 def _write_texts(app, error):
     """The texts that the search page loads."""
     if error or app.builder.format != "html":
         return
     names = sorted(app.env.found_docs)
-    texts = {name: " ".join(app.env.get_doctree(name).astext().split()) for name in names}
+    texts = {name: _text(app.env.get_doctree(name)) for name in names}
     script = f"const PAGE_TEXTS = {json.dumps(texts, ensure_ascii=False)};\n"
     (Path(app.outdir) / "_static" / "pages.js").write_text(script, encoding="utf-8")
 
