@@ -1,4 +1,4 @@
-"""Plots that a user expects of results: ``wind.lidar.plot()``, ``scan.lidar.plot()``.
+"""Plots that a user expects of results: ``wind.lm.plot()``, ``scan.lm.plot()``.
 
 All show the pilot's view: port (+y) on the left, up (+z) at the top. matplotlib is loaded by the
 first plot.
@@ -16,7 +16,7 @@ from lidar_mi.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_ARROWS = 28
+ARROWS = 28
 """About as many arrows along the longer side."""
 
 _COLOURS = {
@@ -28,14 +28,17 @@ _COLOURS = {
 
 
 @xr.register_dataset_accessor("lidar")
+@xr.register_dataset_accessor("lm")
 class LidarPlots:
-    """What lidar-mi adds to a data set of winds or of a scan, as ``data.lidar``.
+    """What lidar-mi adds to a data set of winds, of a scan or of flights, as ``data.lm``.
+
+    ``data.lidar`` is the same.
 
     Examples
     --------
     >>> import lidar_mi as lm
     >>> scan = lm.read_scan("image_t1.exr")  # doctest: +SKIP
-    >>> axes = scan.lidar.plot()  # doctest: +SKIP
+    >>> axes = scan.lm.plot()  # doctest: +SKIP
     """
 
     def __init__(self, data: xr.Dataset) -> None:
@@ -73,15 +76,89 @@ class LidarPlots:
             )
         return plot_image(data[layer], ax)
 
+    def wind(
+        self, ax: "Axes | None" = None, *, colours: str = "speed", lines: str = "arrows"
+    ) -> "Axes":
+        """Draw winds; parameters and errors as of `plot_wind`."""
+        return plot_wind(self._data, ax, colours=colours, lines=lines)
 
-def plot_wind(wind: xr.Dataset, ax: "Axes | None" = None) -> "Axes":
-    """Cross-flow wind (v, w) on (z, y) as arrows on its speed; flagged vectors are grey.
+    def vorticity(self) -> xr.DataArray:
+        """Vorticity along x of winds (v, w); as of `vorticity`."""
+        return vorticity(self._data)
+
+    def flights(self, name: Hashable = "roll", ax: "Axes | None" = None) -> "Axes":
+        """Draw a time series of every flight."""
+        return plot_flights(self._data, ax, name)
+
+
+def vorticity(wind: xr.Dataset) -> xr.DataArray:
+    """Vorticity along x, dw/dy - dv/dz, s^-1, by central differences of valid vectors.
+
+    Parameters
+    ----------
+    wind : xr.Dataset, dims (z, y)
+        v, w (m s^-1), y and z (m); vectors with a flag other than 0 are left out.
+
+    Returns
+    -------
+    xr.DataArray, dims (z, y)
+        Positive: anticlockwise from y to z. NaN beside a vector that is left out.
 
     Raises
     ------
     InputError
-        Vectors of more than one plane, source or method.
+        Winds of more than one plane, source or method.
     """
+    _only_a_plane(wind["v"])
+    valid = wind.where(wind["flag"] == 0) if "flag" in wind else wind
+    found = valid["w"].differentiate("y") - valid["v"].differentiate("z")
+    about = {"long_name": "vorticity along x", "units": "s-1"}
+    return found.transpose("z", "y").rename("vorticity").assign_attrs(about)
+
+
+def arrow_length(speeds: np.ndarray, limit: float) -> float:
+    """Length of the arrow of the largest speed, in distances between arrows.
+
+    The median speed has a third of a distance, so that arrows are seen far from the cores, however
+    large the plane is; the largest has between 1.8 and 5, so that they do not cover each other.
+
+    Parameters
+    ----------
+    speeds : array
+        Of the arrows, m/s; those that are not finite are left out.
+    limit : float
+        The largest speed, m/s.
+    """
+    known = speeds[np.isfinite(speeds)]
+    usual = float(np.median(known)) if known.size else 0.0
+    return float(np.clip(limit / (3 * usual), 1.8, 5.0)) if usual > 0 else 1.8
+
+
+def plot_wind(
+    wind: xr.Dataset, ax: "Axes | None" = None, *, colours: str = "speed", lines: str = "arrows"
+) -> "Axes":
+    """Cross-flow wind (v, w) on (z, y) as arrows or streamlines on its speed or vorticity.
+
+    Flagged vectors are grey. Where the standard error exceeds the speed, colours are pale.
+
+    Parameters
+    ----------
+    wind : xr.Dataset, dims (z, y)
+        v, w (m s^-1); ``flag``, ``v_stderr`` and ``w_stderr`` where there are any.
+    ax : matplotlib Axes, optional
+        Default: of a new figure.
+    colours : str
+        speed or vorticity.
+    lines : str
+        arrows or streamlines; streamlines end at flagged vectors.
+
+    Raises
+    ------
+    InputError
+        Vectors of more than one plane, source or method; other colours or lines.
+    """
+    _one_of("colours", colours, ("speed", "vorticity"))
+    _one_of("lines", lines, ("arrows", "streamlines"))
     _only_a_plane(wind["v"])
     v, w = (wind[name].transpose("z", "y") for name in "vw")
     valid = (
@@ -89,39 +166,93 @@ def plot_wind(wind: xr.Dataset, ax: "Axes | None" = None) -> "Axes":
     )
     speed = np.hypot(v.values, w.values)
     known = speed[valid & np.isfinite(speed)]
-    # the few vectors of a core must not determine the scale of all others
-    limit = float(np.quantile(known, 0.999)) if known.size else 1.0
-    ax, extend = _axes(ax, v), "max" if known.size and known.max() > limit else "neither"
-    y, z = v["y"].values, v["z"].values
-    shown = np.where(valid, speed, np.nan)
-    mesh = ax.pcolormesh(y, z, shown, shading="nearest", vmin=0, vmax=limit or 1.0, cmap="viridis")
     unit = re.sub(r"-(\d)", r"$^{-\1}$", str(v.attrs.get("units", "m s-1")))
-    what = "cross-flow wind" if unit.startswith("m") else "motion"
-    ax.figure.colorbar(mesh, ax=ax, label=f"{what} / {unit}", extend=extend, pad=0.02)
-    every = max(1, round(max(v.shape) / _ARROWS))
+    ax = _axes(ax, v)
+    if colours == "vorticity":
+        field = vorticity(wind).values
+        label = f"vorticity along x / {unit.removeprefix('m ')}"
+        limit = _largest(np.abs(field))
+        span: dict[str, Any] = {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r"}
+    else:
+        field = np.where(valid, speed, np.nan)
+        label = f"{'cross-flow wind' if unit.startswith('m') else 'motion'} / {unit}"
+        limit = _largest(field)
+        span = {"vmin": 0, "vmax": limit, "cmap": "viridis"}
+    beyond = bool((np.abs(field[np.isfinite(field)]) > limit).any())
+    ends = ("both" if colours == "vorticity" else "max") if beyond else "neither"
+    y, z = v["y"].values, v["z"].values
+    mesh = ax.pcolormesh(y, z, field, shading="nearest", **span)
+    ax.figure.colorbar(mesh, ax=ax, label=label, extend=ends, pad=0.02)
+    # after the bar, whose colours are full
+    opacity: Any = _opacity(wind, speed)
+    mesh.set_alpha(opacity)
+    on_top = "white" if colours == "speed" else "black"
+    if lines == "streamlines":
+        across, up = (np.where(valid, part.values, np.nan) for part in (v, w))
+        ax.streamplot(y, z, across, up, color=on_top, density=1.4, linewidth=0.7, arrowsize=0.7)
+        return _axes(ax, v)
+    _quiver(ax, v, w, valid, on_top, _largest(known), unit)
+    return ax
+
+
+def _quiver(
+    ax: "Axes",
+    v: xr.DataArray,
+    w: xr.DataArray,
+    valid: np.ndarray,
+    colour: str,
+    limit: float,
+    unit: str,
+) -> None:
+    """Arrows of valid vectors in a colour; others are grey and no longer than arrows are apart."""
+    y, z = v["y"].values, v["z"].values
+    every = max(1, round(max(v.shape) / ARROWS))
     some = np.s_[::every, ::every]
     step = every * float(np.ptp(y)) / max(1, len(y) - 1)
+    speed = np.hypot(v.values, w.values)
+    length = arrow_length(speed[valid], limit)
     style: dict[str, Any] = {
         "angles": "xy",
         "scale_units": "xy",
-        "scale": (limit or 1.0) / (1.8 * step) if step else 1.0,
+        "scale": limit / (length * step) if step else 1.0,
         "width": 0.0025,
     }
-    for which, colour in ((valid, "white"), (~valid, "0.6")):
+    most = limit / length
+    shorter = np.where(valid, 1.0, most / np.maximum(speed, most))
+    for which, shade in ((valid, colour), (~valid, "0.6")):
         arrows = ax.quiver(
             y[::every],
             z[::every],
-            np.where(which, v.values, np.nan)[some],
-            np.where(which, w.values, np.nan)[some],
-            color=colour,
+            np.where(which, v.values * shorter, np.nan)[some],
+            np.where(which, w.values * shorter, np.nan)[some],
+            color=shade,
             **style,
         )
-        if colour == "white":
-            length = float(f"{limit:.1g}") or 1.0
-            label = f"{length:g} {unit}"
-            ax.quiverkey(arrows, 0.9, 1.04, length, label, labelpos="W", color="black")
+        if which is valid:
+            key = float(f"{limit:.1g}") or 1.0
+            label = f"{key:g} {unit}"
+            ax.quiverkey(arrows, 0.9, 1.04, key, label, labelpos="W", color="black")
     ax.set_title(ax.get_title() or " ")  # room for the key
-    return ax
+
+
+def _largest(values: np.ndarray) -> float:
+    """Of known values; the few of a core do not determine the scale of all others."""
+    known = values[np.isfinite(values)]
+    return (float(np.quantile(known, 0.999)) if known.size else 0.0) or 1.0
+
+
+def _opacity(wind: xr.Dataset, speed: np.ndarray) -> np.ndarray | None:
+    """Pale where the standard error is larger than the speed; None: no errors are stated."""
+    if not {"v_stderr", "w_stderr"} <= set(wind.data_vars):
+        return None
+    errors = [np.broadcast_to(wind[f"{name}_stderr"], wind[name].shape) for name in "vw"]
+    stderr = xr.DataArray(np.hypot(*errors), dims=wind["v"].dims).transpose("z", "y").values
+    return np.where(stderr > speed, 0.25, 1.0)
+
+
+def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise InputError(f"{name}: {value!r} is not allowed; expected {' or '.join(allowed)}")
 
 
 def plot_image(image: xr.DataArray, ax: "Axes | None" = None) -> "Axes":

@@ -1,7 +1,8 @@
 """Plots of winds, scans and flights. Unit tier.
 
 Detects: a vector drawn where it is not, a flagged one that looks like others, a mirrored view, an
-image of another layer, an angle in radians, and a plot of what has more dimensions than a plane.
+image of another layer, an angle in radians, a plot of what has more dimensions than a plane, arrows
+too short to be seen in a large plane, noise as vivid as wind, vorticity of another sign.
 """
 
 import subprocess
@@ -18,7 +19,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.quiver import Quiver
 
 import lidar_mi as lm
-from lidar_mi.plots import plot_flights
+from lidar_mi.plots import arrow_length, plot_flights, vorticity
 from tests.support import figure_rules
 
 Y, Z = np.arange(-2.0, 3.0), np.arange(4.0)
@@ -127,3 +128,73 @@ def test_matplotlib_is_loaded_by_the_first_plot():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def pair(width, height, spacing=1.0, circulation=400.0, radius=3.0):
+    """Two Rankine vortices of opposite circulation, 40 m apart, in a plane of a size."""
+    y = np.arange(-width / 2, width / 2 + spacing / 2, spacing)
+    z = np.arange(-height / 2, height / 2 + spacing / 2, spacing)
+    v, w = np.zeros((2, z.size, y.size))
+    for side in (-1, 1):
+        dy, dz = y[None] - 20 * side, z[:, None]
+        rate = circulation / (2 * np.pi * np.maximum(dy**2 + dz**2, radius**2))
+        v, w = v - side * rate * dz, w + side * rate * dy
+    return xr.Dataset({"v": (("z", "y"), v), "w": (("z", "y"), w)}, {"z": z, "y": y})
+
+
+@pytest.mark.parametrize("width", [60, 100, 140])
+def test_arrows_are_seen_in_planes_of_any_size(width):
+    """The median one has more than a hundredth of the width, the longest less than a quarter."""
+    axes = pair(width, 0.6 * width, width / 140).lm.plot()
+    shown = next(one for one in axes.collections if isinstance(one, Quiver))  # the valid ones
+    length = np.ma.filled(np.ma.hypot(shown.U, shown.V), np.nan) / shown.scale / width
+    assert np.nanmedian(length) > 0.01 and np.nanmax(length) < 0.25
+
+
+def test_length_of_arrows():
+    assert arrow_length(np.array([1.0, 1.0, np.nan]), 1.0) == 1.8
+    assert arrow_length(np.array([1.0, 2.0, 9.0]), 9.0) == pytest.approx(1.8)
+    assert arrow_length(np.array([1.0, 1.0, 12.0]), 12.0) == pytest.approx(4.0)
+    assert arrow_length(np.array([]), 1.0) == arrow_length(np.zeros(3), 1.0) == 1.8
+
+
+def test_vorticity_of_a_rankine_core():
+    """2 times the rate of rotation, Gamma / (pi r^2), in the core and nothing outside."""
+    wind = pair(140, 80, 0.5)
+    found = wind.lm.vorticity()
+    core = found.sel(y=20, z=0).item()
+    # the other vortex is irrotational there
+    assert core == pytest.approx(400 / (np.pi * 9), rel=1e-3)
+    assert found.sel(y=-20, z=0).item() == pytest.approx(-core)
+    assert abs(found.sel(y=0, z=30).item()) < 1e-3 * core
+    flag = xr.zeros_like(wind["v"], dtype=int)
+    flag.loc[{"y": 20.5, "z": 0.0}] = 4
+    assert np.isnan(vorticity(wind.assign(flag=flag)).sel(y=20, z=0))
+
+
+def test_vorticity_and_streamlines_are_drawn():
+    axes = pair(100, 60, 2.0).lm.wind(colours="vorticity", lines="streamlines")
+    mesh = axes.collections[0]
+    low, high = mesh.get_clim()
+    assert low == -high and mesh.get_array().min() < 0 < mesh.get_array().max()
+    assert not arrows(axes) and axes.get_xlim() == (50, -50)
+    with pytest.raises(lm.InputError, match="colours: 'red' is not allowed; expected speed or vor"):
+        pair(100, 60, 2.0).lm.wind(colours="red")
+
+
+def test_noise_is_not_as_vivid_as_wind(wind):
+    """Pale where the standard error exceeds the speed; flagged vectors are short."""
+    stderr = xr.full_like(wind["v"], 0.1)
+    stderr.loc[{"y": 0.0, "z": 3.0}] = 100.0
+    loud = wind.assign(v_stderr=stderr, w_stderr=stderr)
+    loud["v"].loc[{"y": 0.0, "z": 1.0}] = 1e4  # the flagged one
+    axes = loud.lm.plot()
+    alpha = np.reshape(axes.collections[0].get_alpha(), (4, 5))
+    # 0 m/s at y = 0, z = 0
+    assert alpha[3, 2] == alpha[0, 2] == 0.25 and (alpha == 0.25).sum() == 2
+    (((v, w),),) = ([*one.values()] for c, one in arrows(axes).items() if c == to_rgba("0.6"))
+    # at most a distance between arrows: 1 m where the limit's arrow is 1.8 m long or more
+    assert np.hypot(v, w) < np.hypot(33, 33) / 1.8
+    assert {tuple(one) for one in (wind.lm.plot().get_xlim(), wind.lidar.plot().get_xlim())} == {
+        (2.0, -2.0)
+    }

@@ -47,6 +47,7 @@ def compare(wake, x, tolerance):
         )
 
 
+@pytest.mark.slow
 def test_palm(tmp_path):
     x, y, zu = np.arange(1.0, 128, 2), np.arange(1.0, 60, 2), np.arange(-1.0, 60, 2)
     yv, zw = y - 1, zu + 1
@@ -90,6 +91,7 @@ def test_wrf():
     compare(read_wake("wake.nc", require=["tracer"]), 1.0, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_folder")
 def test_openfoam():
     """Points of cells without order."""

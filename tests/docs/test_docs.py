@@ -63,6 +63,8 @@ COMPUTING = (
     "jsbsim",
     "air",
     "xml_scenes",
+    "doppler_lines",
+    "measured_wakes",
 )
 QUICK = tuple(page for page in GUIDE if Path(page).stem not in COMPUTING)
 THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))

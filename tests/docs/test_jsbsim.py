@@ -45,6 +45,7 @@ def test_all_are_listed():
 
 
 @of_this_version
+@pytest.mark.slow
 def test_some_do_as_listed(capfd):
     assert rows_as_flown(SAMPLE, capfd) == {name: ROWS[name] for name in SAMPLE}
 

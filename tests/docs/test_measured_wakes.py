@@ -7,10 +7,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 PAGE = Path(__file__).parents[2] / "docs" / "guide" / "measured_wakes.md"
 
 
+@pytest.mark.slow
 def test_the_example_finds_its_vortices(tmp_path, monkeypatch):
     """16 numbers within 3.5 standard errors: exceeded by chance in 1 %."""
     monkeypatch.chdir(tmp_path)

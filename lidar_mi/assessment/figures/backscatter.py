@@ -32,6 +32,7 @@ from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import deviations
 from lidar_mi.assessment.metrics.names import Source
+from lidar_mi.plots import ARROWS, arrow_length
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,15 @@ class Scale:
     Attributes
     ----------
     limit : float
-        Speed at the end of the colours, m/s; its arrow is 1.8 times as long as the distance
-        from arrow to arrow.
+        Speed at the end of the colours, m/s.
+    length : float
+        Of its arrow, in distances between arrows.
     y, z : array
         Axes of the plane, m.
     """
 
     limit: float
+    length: float
     y: np.ndarray
     z: np.ndarray
 
@@ -56,7 +59,8 @@ def _scale(truth: ObservedAir) -> Scale:
     speed = speed_of(truth.wind["v"], truth.wind["w"])
     # the few nodes of a core must not determine the scale of all others
     limit = float(speed.quantile(0.999)) or 1.0
-    return Scale(limit, truth.wind["y"].values, truth.wind["z"].values)
+    length = arrow_length(speed.values, limit)
+    return Scale(limit, length, truth.wind["y"].values, truth.wind["z"].values)
 
 
 def draw_all(
@@ -163,8 +167,8 @@ def _with_valid(found: xr.Dataset, *sources: str) -> tuple[list[str], str]:
 
 
 def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, scale: Scale) -> None:
-    """Vectors at their positions, about 45 across; flagged ones grey, valid ones by speed."""
-    every = max(1, round(wind.sizes["y"] / 45))
+    """Vectors at their positions, a few dozen across; flagged ones grey, valid ones by speed."""
+    every = max(1, round(wind.sizes["y"] / ARROWS))
     step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
     thin = wind.isel(z=slice(every // 2, None, every), y=slice(every // 2, None, every))
     y, z = (np.broadcast_to(thin[f"{a}_vector"], thin["v"].shape).ravel() for a in "yz")
@@ -173,12 +177,16 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
     style: dict[str, Any] = {
         "angles": "xy",
         "scale_units": "xy",
-        "scale": scale.limit / (1.8 * step),
+        "scale": scale.limit / (scale.length * step),
         "width": 0.0022,
     }
     flagged, valid = known & (flag != 0), known & (flag == 0)
     if flagged.any():
-        axes.quiver(y[flagged], z[flagged], v[flagged], w[flagged], color="0.75", **style)
+        # no longer than arrows are apart: noise is not as vivid as wind
+        most = scale.limit / scale.length
+        shorter = most / np.maximum(np.hypot(v, w)[flagged], most)
+        shown = v[flagged] * shorter, w[flagged] * shorter
+        axes.quiver(y[flagged], z[flagged], *shown, color="0.75", **style)
     arrows = axes.quiver(
         y[valid],
         z[valid],

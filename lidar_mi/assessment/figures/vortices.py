@@ -15,6 +15,7 @@ from lidar_mi.assessment.figures.plates import Drawn, Plate, arrow_scale, save_a
 from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
+from lidar_mi.plots import ARROWS, arrow_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 _STYLE: Mapping[str, tuple[str, str]] = {
@@ -100,10 +101,11 @@ def _pair(
 
 
 def _arrows(axes: Axes, y: np.ndarray, z: np.ndarray, model: xr.Dataset, limit: float) -> None:
-    every = max(1, round(len(y) / 40))
+    every = max(1, round(len(y) / ARROWS))
     at = np.ix_(np.arange(every // 2, len(z), every), np.arange(every // 2, len(y), every))
     v, w = model["v"].values[at], model["w"].values[at]
     step = every * (y[1] - y[0])
+    length = arrow_length(np.hypot(v, w), limit)
     arrows = axes.quiver(
         y[at[1]].ravel(),
         z[at[0]].ravel(),
@@ -114,7 +116,7 @@ def _arrows(axes: Axes, y: np.ndarray, z: np.ndarray, model: xr.Dataset, limit: 
         norm=Normalize(0, limit),
         angles="xy",
         scale_units="xy",
-        scale=limit / (1.8 * step),
+        scale=limit / (length * step),
         width=0.0022,
     )
     arrow_scale(axes, arrows, limit)

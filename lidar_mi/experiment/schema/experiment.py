@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
 from lidar_mi.experiment.schema.coherent import CoherentDoppler
-from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.experiment.schema.doppler import Doppler, at_site
 from lidar_mi.experiment.schema.encounter import Encounter
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
@@ -29,7 +29,7 @@ from lidar_mi.tables import Table, Tabular
 from lidar_mi.units import AS_GIVEN, Within
 
 # keys of the backscatter lidar, which observes a wake
-BACKSCATTER = ("platform", "site", "lidar", "detector", "scan", "scattering", "render", "retrieval")
+BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
 
 
 NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
@@ -216,6 +216,24 @@ class Experiment(Tabular, Section):
                 f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which "
                 "is unpolarised; expected auto or 0"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _doppler_lidar_in_the_air_of_the_site(self) -> Self:
+        if self.fringes is None:
+            if self.imaged_wake is None and self.site != Site():
+                raise ValueError("site: not allowed with doppler.kind coherent alone")
+            return self
+        if self.imaged_wake is None and self.site.sounding is not None:
+            raise ValueError(
+                "site.sounding: not allowed without wake, as the Doppler lidar's air is that of "
+                "the standard atmosphere; expected site.altitude"
+            )
+        if self.site.altitude is not None:
+            lidar = at_site(self.fringes.lidar, self.site.altitude, self.scattering.band)
+            doppler = self.fringes.model_copy(update={"lidar": lidar})
+            # the section is frozen from here on
+            object.__setattr__(self, "doppler", doppler)
         return self
 
     @model_validator(mode="after")

@@ -13,6 +13,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema.experiment import BACKSCATTER, NAME, Experiment
 from lidar_mi.experiment.schema.faults import first_fault
+from lidar_mi.experiment.schema.site import Site
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 from lidar_mi.units import AS_GIVEN
@@ -226,6 +227,8 @@ def settings(experiment: Experiment, *, si: bool = False) -> dict[str, Any]:
     Quantities are text as they were given, or with their SI units.
     """
     unused = {*BACKSCATTER} if experiment.imaged_wake is None else set()
+    if experiment.imaged_wake is None and experiment.site == Site():
+        unused.add("site")
     unused |= {
         name
         for name in ("wake", "doppler", "sensor", "volume", "encounter")

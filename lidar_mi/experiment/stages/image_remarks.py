@@ -9,9 +9,11 @@ import xarray as xr
 from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
 from lidar_mi.description import Description
+from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
 from lidar_mi.experiment.schema.scattering import Scattering
+from lidar_mi.experiment.schema.site import Site
 from lidar_mi.experiment.schema.volume import Volume
 from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.experiment.stages.brightness import overlap
@@ -46,8 +48,16 @@ def image_remarks(
     scattering: Scattering,
     air: Scatterer,
     clear_air: ClearAir,
+    site: Site,
+    doppler: Doppler | None,
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each."""
+    sounding = []
+    if doppler and site.sounding:
+        sounding = [
+            "site.sounding: only the backscatter lidar's air is that; the Doppler lidar's is of "
+            f"the standard atmosphere at {doppler.lidar.altitude:g} m"
+        ]
     flow = _of_the_flow(wake, truth.wind) if wake.file else []
     interpolated = flows[0].attrs.get("interpolated")
     grid = [f"wake.file: {interpolated}"] if interpolated else []
@@ -58,6 +68,7 @@ def image_remarks(
         *_of_the_light(lidar, scan, plans[0]),
         *_of_the_pattern(scan),
         *_of_the_molecules(wake.extinction, truth, scattering, air, clear_air),
+        *sounding,
     ]
 
 
@@ -158,8 +169,8 @@ def _of_the_molecules(
         return []
     fractions = backscatter_fractions(mapping, truth, air, clear_air)
     return [
-        "wake.extinction.molecules: not set, which is auto since version 1.0.0rc2 and was 0 "
-        f"before: backscatter by {fractions_in_words(fractions, scattering)} "
+        "wake.extinction.molecules: not set, which is auto and was 0 up to version 1.0.0rc1: "
+        f"backscatter by {fractions_in_words(fractions, scattering)} "
         f"({clear_air.origin}); expected auto or 0"
     ]
 

@@ -11,7 +11,9 @@ from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.stages.light_budget import backscatter_fractions, fractions_in_words
 from lidar_mi.experiment.truth.clear_air import clear_air
 
-# U.S. Standard Atmosphere 1976, tables of NOAA: m, hPa, K
+# U.S. Standard Atmosphere 1976: geometric altitude z (m), hPa, K. The tropopause is defined at the
+# geopotential altitude H = 11 km, with 226.32 hPa and 216.65 K; below it T = 288.15 K - 6.5 K/km H
+# and p follows T^5.25588, with H = r z / (r + z) and r = 6356.766 km
 STANDARD = ((0, 1013.25, 288.15), (5000, 540.48, 255.676), (11019, 226.32, 216.65))
 
 
@@ -28,13 +30,21 @@ def air(**keys):
 
 
 @pytest.mark.parametrize(
-    "wavelength, rayleigh",
-    # Bucholtz 1995 (Appl. Opt. 34, 2765), table 3: volume scattering coefficient at 288.15 K and
-    # 1013.25 hPa; his King factors are others, by less than 0.5 %
-    [("550 nm", 1.149e-5), ("350 nm", 7.45e-5)],
+    "micrometres, fit",
+    # Bucholtz 1995 (Appl. Opt. 34, 2765), table 3: the volume scattering coefficient at 288.15 K
+    # and 1013.25 hPa is A l^-(B + C l + D / l) / km at l um, below and above 0.5 um; his King
+    # factors are others, by less than 0.5 %
+    [
+        (0.355, (7.68246e-4, 3.55212, 1.35579, 0.11563)),
+        (0.532, (10.21675e-4, 3.99668, 1.10298e-3, 2.71393e-2)),
+        (1.064, (10.21675e-4, 3.99668, 1.10298e-3, 2.71393e-2)),
+    ],
 )
-def test_extinction_at_sea_level(wavelength, rayleigh):
-    assert air(wavelength=wavelength).extinction == pytest.approx(rayleigh, rel=0.01)
+def test_extinction_at_sea_level(micrometres, fit):
+    a, b, c, d = fit
+    rayleigh = 1e-3 * a * micrometres ** -(b + c * micrometres + d / micrometres)
+    found = air(wavelength=f"{micrometres} um").extinction
+    assert found == pytest.approx(rayleigh, rel=5e-3)
 
 
 def test_backscatter_at_sea_level():
@@ -138,3 +148,51 @@ def test_a_file_that_says_nothing_is_told_of_its_molecules():
     assert len(said) == 1
     assert "not set" in said[0] and "molecules 5" in said[0]
     assert not [text for text in prepare(experiment()).warnings if "molecules" in text]
+
+
+@pytest.mark.parametrize("altitude, pressure, temperature", STANDARD)
+def test_a_doppler_lidar_is_in_the_air_of_the_site(altitude, pressure, temperature):
+    """355 nm: 2.759e-26 cm^2 a molecule (Bodhaine et al. 1999), 8.0e-6 / m / sr at sea level."""
+    there = lm.load_experiment(
+        "fringes", site={"altitude": altitude}, **{"doppler.lidar.wavelength": "355 nm"}
+    ).doppler.lidar
+    density = pressure / 1013.25 * 288.15 / temperature
+    assert there.altitude == altitude
+    assert there.extinction == pytest.approx(2.759e-30 * 2.547e25 * density, rel=2e-3)
+    assert there.backscatter == pytest.approx(8.0e-6 * density, rel=0.01)
+
+
+def test_what_a_doppler_lidar_says_itself_stays():
+    usual, stated = (
+        lm.load_experiment("fringes", **keys).doppler.lidar
+        for keys in (
+            {},
+            {
+                "site.altitude": 1000,
+                "doppler.lidar.altitude": 3000,
+                "doppler.lidar.aerosol_fraction": 0.5,
+                "doppler.lidar.extinction": "0.2 / km",
+            },
+        )
+    )
+    assert usual.altitude == 8500
+    assert (stated.altitude, stated.extinction) == (3000, 2e-4)
+    clear = lm.load_experiment("fringes", **{"site.altitude": 3000}).doppler.lidar
+    # as much light of aerosol as of molecules
+    assert stated.backscatter == pytest.approx(2 * clear.backscatter, rel=1e-9)
+
+
+def test_a_site_that_a_doppler_lidar_cannot_use():
+    with pytest.raises(InputError, match=r"site\.sounding: not allowed without wake"):
+        lm.load_experiment("fringes", **{"site.sounding": "balloon.csv"})
+    with pytest.raises(InputError, match="site: not allowed"):
+        lm.load_experiment("airport", **{"site.altitude": 100})
+
+
+def test_the_air_of_the_site_survives_a_record(tmp_path):
+    found = lm.load_experiment("fringes", **{"site.altitude": 1000})
+    from lidar_mi.experiment.schema.reading import dump
+
+    file = tmp_path / "again.yaml"
+    file.write_text(dump(found))
+    assert lm.load_experiment(file).doppler == found.doppler
