@@ -64,7 +64,7 @@ class Standing(NamedTuple):
         return found._replace(d=d, covariance=found.covariance / left**2 + more)
 
     def __str__(self) -> str:
-        return f"{self.fraction:.1%} of the squared slopes at rest" if self.fraction else ""
+        return f"{self.fraction:.1%} of the texture does not move" if self.fraction else ""
 
 
 def standing(
