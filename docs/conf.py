@@ -5,6 +5,7 @@ browsers draw by themselves.
 """
 
 import html
+import json
 import re
 import runpy
 import unicodedata
@@ -40,6 +41,9 @@ html_theme = "furo"
 html_title = f"lidar-mi {release}"
 html_static_path = ["_static"]
 html_css_files = ["narrow.css"]
+# with excerpts of its own, also of a site that is opened as files
+html_search_scorer = str(Path(__file__).with_name("search.js"))
+html_show_search_summary = False
 html_copy_source = False
 html_show_sphinx = False
 # contrasts of 4.5 and more, which those of furo have not
@@ -80,7 +84,43 @@ def _write_pages(app):
     runpy.run_path(str(Path(app.srcdir) / "make_pages.py"), run_name="__main__")
 
 
+def _finish_page(app, name, template, context, doctree):
+    """The search page has the texts of all pages; keys may end a line after their dots."""
+    if name == "search":
+        app.add_js_file("pages.js", priority=400)
+    if "body" in context:
+        context["body"] = breakable(context["body"])
+
+
+def breakable(body):
+    """Places after dots and underscores of keys at which a line may end, and nowhere else."""
+    return re.sub(
+        r'(?<=<span class="pre">)[\w.]+(?=</span>)',
+        lambda key: re.sub(r"(?<=\w)([._])(?=[^\W\d])", r"\1<wbr>", key[0]),
+        body,
+    )
+
+
+def _text(page):
+    """What a page says, without its comments."""
+    for comment in [*page.findall(nodes.comment), *page.findall(nodes.raw)]:
+        comment.parent.remove(comment)
+    return " ".join(page.astext().split())
+
+
+def _write_texts(app, error):
+    """The texts that the search page loads."""
+    if error or app.builder.format != "html":
+        return
+    names = sorted(app.env.found_docs)
+    texts = {name: _text(app.env.get_doctree(name)) for name in names}
+    script = f"const PAGE_TEXTS = {json.dumps(texts, ensure_ascii=False)};\n"
+    (Path(app.outdir) / "_static" / "pages.js").write_text(script, encoding="utf-8")
+
+
 def setup(app):
     """Formulas of the pages in MathML, and pages that the site alone has."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     app.connect("builder-inited", _write_pages)
+    app.connect("html-page-context", _finish_page)
+    app.connect("build-finished", _write_texts)

@@ -74,6 +74,13 @@ def complete_shipped(incomplete: str) -> list[str]:
     return starting(incomplete, experiments())
 
 
+def complete_instrument(incomplete: str) -> list[str]:
+    """Published instruments."""
+    from lidar_mi.experiment.shipped import instruments
+
+    return starting(incomplete, instruments())
+
+
 def complete_key(incomplete: str) -> list[str]:
     """Keys and sections of an experiment file."""
     from lidar_mi.experiment.schema.keys import OF_A_FILE, names

@@ -38,6 +38,7 @@ from lidar_mi.encounter.integrity import Integrity
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.scan_store import ScanStore
+from lidar_mi.encounter.strip_loads import StripLoads
 from lidar_mi.encounter.user_controller import name_of, user_controller
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.schema.encounter import Encounter
@@ -215,14 +216,16 @@ def simulate_flight(
     a_scan = math.ceil(period / _STEP)
     dt, count = period / a_scan, round(duration(encounter) / period) * a_scan
     record, transfer = FlightRecorder(), bumpless_transfer()
-    withdrawn: list[bool] = []
+    keys, withdrawn = encounter.aircraft, list[bool]()
+    mass = aircraft.mass if isinstance(aircraft, JSBSimAircraft) else keys.heave.mass
+    met = StripLoads(aircraft, wake.wind, keys.aerodynamics, mass)
     deflection, symmetric, limits = np.zeros(3), 0.0, aircraft.limits
     for step in range(count + 1):
         state = aircraft.state
         if step % a_scan == 0:
             notice(f"{state.time:.0f} of {count * dt:.0f} s", step / count)
         preview = preview_at(state)
-        loads = loads_in_wind(aircraft.strips, state, wake.wind, aircraft.density)
+        loads = met(state)
         predicted = preview(state.time) if preview else None
         moments = aircraft.control_moments
         if integrity:

@@ -9,8 +9,8 @@ moment the second, so that strips with n = 1 for forces and n = 2 for rolling mo
 and the rolling moment of the lifting line in any wind; the aspect ratio of n = 2 is that of one
 half of the wing (Barrows 1977).
 
-Neglected: unsteady lift (the chord is short against the wake), stall, sweep, the fuselage, and the
-forces in a surface's plane.
+Neglected: sweep, the fuselage, and the forces in a surface's plane. Unsteady lift, stall and wind
+along the path are of `strip_loads`.
 
 Body frame: x forward, y left, z up, from the centre of gravity.
 """
@@ -63,6 +63,8 @@ class Strips:
         Lift slope of forces, and of moments about the body's x axis, per rad.
     bends : ndarray of bool, shape (n,)
         Strips of the wing: they bend its roots.
+    chords : ndarray, shape (n,)
+        m.
     """
 
     places: np.ndarray
@@ -71,6 +73,7 @@ class Strips:
     slopes: np.ndarray
     roll_slopes: np.ndarray
     bends: np.ndarray
+    chords: np.ndarray
 
 
 def finite_span_slope(section_slope: float, aspect_ratio: float, mode: int = 1) -> float:
@@ -177,7 +180,7 @@ def as_wing(surface: Strips) -> Strips:
 
 def joined(*surfaces: Strips) -> Strips:
     """Strips of several surfaces."""
-    names = ("places", "normals", "areas", "slopes", "roll_slopes", "bends")
+    names = ("places", "normals", "areas", "slopes", "roll_slopes", "bends", "chords")
     return Strips(*(np.concatenate([getattr(one, name) for one in surfaces]) for name in names))
 
 
@@ -249,4 +252,5 @@ def _surface(
         finite_span_slope(lift_slope, aspect_ratio) * ones,
         finite_span_slope(lift_slope, aspect_ratio, mode=2) * ones,
         np.zeros(len(places), bool),
+        4 * whole_area / (np.pi * span) * np.sin(angle),
     )

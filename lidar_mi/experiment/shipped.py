@@ -21,6 +21,7 @@ class _Kind(NamedTuple):
 
 _EXPERIMENT = _Kind("an experiment file", "", ".yaml")
 _CAMPAIGN = _Kind("a campaign file", "campaigns", ".yaml")
+_INSTRUMENT = _Kind("an instrument", "instruments", ".yaml")
 _SCENE = _Kind("a Mitsuba scene (XML)", "", ".xml")
 
 
@@ -65,6 +66,22 @@ def described(name: str) -> tuple[str, str]:
     path = _found_shipped(name, [_EXPERIMENT, _CAMPAIGN])
     question, needs = read_text(path, "an experiment file").splitlines()[:2]
     return question.removeprefix("# "), needs.removeprefix("# Needs ").removesuffix(".")
+
+
+def instruments() -> list[str]:
+    """Names of the published instruments that come with the package, in alphabetical order."""
+    return _names(_INSTRUMENT)
+
+
+def instrument_file(name: str) -> Path:
+    """The experiment file of a published instrument, in which each number has its source.
+
+    Raises
+    ------
+    InputError
+        There is none of this name; the message lists them.
+    """
+    return _found_shipped(name, [_INSTRUMENT])
 
 
 def shipped_file(name: str) -> Path:

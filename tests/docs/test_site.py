@@ -6,8 +6,10 @@ styled letters that browsers would draw plain.
 """
 
 import importlib.util
+import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -88,6 +90,48 @@ def test_formulas_become_mathml():
     assert "\U0001d750" in drawn and "<msup>" in drawn and "mathvariant" not in drawn
 
 
+SEARCH = """
+const { wordsOf, rank, excerpt } = require(process.argv[1]);
+const texts = {
+  "guide/pulses": "The pulse energy, " + "of a laser ".repeat(30),
+  "guide/much": "pulse energy and pulse energy ".repeat(5) + "of a laser ".repeat(20),
+  "changelog": "pulse energy and pulse energy ".repeat(5) + "of a laser ".repeat(20),
+};
+const words = wordsOf("Pulse  energy?");
+const score = (page) => rank(5, page, words, texts);
+const order = Object.keys(texts).sort((a, b) => score(b) - score(a));
+const far = "pulse ".repeat(3) + "x ".repeat(300) + "the energy of a pulse " + "y ".repeat(300);
+console.log(JSON.stringify([words, order, excerpt(far, words), excerpt("a < b", [])]));
+"""
+
+
+@with_sphinx
+def test_keys_end_a_line_between_their_words():
+    breakable = runpy.run_path(str(DOCS / "conf.py"))["breakable"]
+    key = '<code><span class="pre">doppler.lidar.pulse_energy</span></code> a.b'
+    assert breakable(key) == key.replace("lidar.", "lidar.<wbr>").replace(
+        "doppler.", "doppler.<wbr>"
+    ).replace("pulse_", "pulse_<wbr>")
+    number = '<span class="pre">0.5</span> <span class="pre">a.yaml</span>'
+    assert breakable(number) == number.replace("a.", "a.<wbr>")
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+def test_search_ranks_and_shows_where_words_are_found():
+    """Pages with more of the words first, the changelog last; excerpts where most words are."""
+    done = subprocess.run(
+        ["node", "-e", SEARCH, str(DOCS / "search.js")], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    words, order, far, none = json.loads(done.stdout)
+    assert words == ["pulse", "energy"]
+    assert order == ["guide/much", "guide/pulses", "changelog"]
+    assert [piece for piece, marked in far if marked] == ["energy", "pulse"]
+    text = "".join(piece for piece, _ in far)
+    assert text.startswith("… x") and text.endswith("y …") and len(text) < 260
+    assert none == [["a < b", False]]
+
+
 @pytest.mark.slow
 @with_sphinx
 def test_site_is_built_without_a_warning(tmp_path):
@@ -105,9 +149,14 @@ def test_site_is_built_without_a_warning(tmp_path):
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    static = tmp_path / "site" / "_static"
     theory = [page.read_text() for page in (tmp_path / "site" / "theory").glob("*.html")]
     assert sum(page.count("<math ") for page in theory) > 500
     assert not any("merror" in page for page in theory)
+    search = (tmp_path / "site" / "search.html").read_text()
+    assert "pages.js" in search and "rank(score" in (static / "language_data.js").read_text()
+    texts = json.loads((static / "pages.js").read_text().partition("= ")[2].rstrip(";\n"))
+    assert "pulse energy" in texts["campaigns"].lower() and len(texts) > 100
     # no script or style from elsewhere: it opens offline
     for page in (tmp_path / "site").rglob("*.html"):
         assert not re.search(r'(?:src|href)="https?://[^"]+\.(?:js|css)', page.read_text())

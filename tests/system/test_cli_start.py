@@ -16,7 +16,14 @@ import yaml
 from lidar_mi.cli import app as cli
 from lidar_mi.cli.options import complete_change, complete_key, complete_shipped
 from lidar_mi.experiment.schema import keys, reading
-from lidar_mi.experiment.shipped import campaigns, described, experiments, flights, shipped_file
+from lidar_mi.experiment.shipped import (
+    campaigns,
+    described,
+    experiments,
+    flights,
+    instrument_file,
+    shipped_file,
+)
 from lidar_mi.units import to_si
 from tests.support.command_line import words_of
 
@@ -238,3 +245,19 @@ def test_examples_of_help_are_one_a_line(lidar_mi):
     lines = [line.strip(" •") for line in after if "lidar-mi" in line]
     assert lines[0] == "lidar-mi run wake_backscatter"
     assert lines[1].startswith("lidar-mi run my.yaml -o outputs/calm")
+
+
+def test_new_file_like_an_instrument(lidar_mi, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, _ = lidar_mi("new", "mine", "--like", "windcube_200s")
+    assert code == 0
+    shipped, mine = (
+        instrument_file("windcube_200s").read_text(),
+        (tmp_path / "mine.yaml").read_text(),
+    )
+    # sources stand beside the numbers as before
+    assert mine == shipped.replace("name: windcube_200s", "name: mine")
+    assert reading.load(tmp_path / "mine.yaml").name == "mine"
+    code, _, err = lidar_mi("new", "other", "--like", "windcube_200")
+    assert code == 2 and "did you mean windcube_200s?" in err and "halo_streamline" in err
+    assert not (tmp_path / "other.yaml").exists()

@@ -80,19 +80,7 @@ SOME = ("columns", "flicker", "hexagonal lattice", "denoised")
     [
         ("columns", "cc"),
         *(pytest.param(name, "variational", marks=pytest.mark.slow) for name in SOME),
-        *(pytest.param(name, "multipass", marks=pytest.mark.slow) for name in SOME[:-1]),
-        pytest.param(
-            "denoised",
-            "multipass",
-            marks=[
-                pytest.mark.slow,
-                pytest.mark.xfail(
-                    strict=True,
-                    raises=AssertionError,
-                    reason="100 %: copies at rest are searched by variational alone",
-                ),
-            ],
-        ),
+        *(pytest.param(name, "multipass", marks=pytest.mark.slow) for name in SOME),
     ],
 )
 def test_vectors_called_valid_are_within_their_errors(family, method):

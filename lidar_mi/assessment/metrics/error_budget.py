@@ -27,7 +27,7 @@ CAUSES = {
     "window": "averaging over the window",
     "shear": "shear within the window",
     "time_step": "curved paths in the time step",
-    "method": "the method itself",
+    "method": "the method",
 }
 """Causes of error by key, and their names."""
 

@@ -72,9 +72,9 @@ def coverage(wind: xr.Dataset) -> dict[str, float]:
 def skill(wind: xr.Dataset) -> dict[str, float]:
     """What a method states of its own errors; empty for methods that state none.
 
-    ``stderr_*``: rms standard error, m/s, of vectors that are valid or have the flag `no_skill`
-    alone. ``no_skill_fraction``: 1 where they are as large as the true wind, else the fraction of
-    all vectors with that flag.
+    ``stderr_*``: rms standard error, m/s, of vectors that are valid, or whose only flag is
+    `no_skill`. ``no_skill_fraction``: 1 where they equal the rms of the true wind or exceed it,
+    else the fraction of all vectors with that flag.
     """
     from lidar_mi.retrieval.images.quality import Flag
 

@@ -67,18 +67,10 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
         "due to the cause: over the same valid vectors, and over those beyond two core radii. "
         f"{_LARGER}: the mean square error more than doubles without the cause: no fraction is due "
         "to it, and the row does not apply. Noise is removed as realised, not drawn again. The "
-        "method itself: its error on images of the air without blur and noise.",
+        "method: its error without blur and noise.",
         tables=[_table(budget, method) for method, budget in budgets.items()],
     )
     lead = [limit_sentence(budget, method) for method, budget in budgets.items()]
-    known = {method: causes_of(budget) for method, budget in budgets.items()}
-    whole = [METHOD_NAMES[m] for m, causes in known.items() if causes and "window" not in causes]
-    if whole:
-        lead.append(
-            "No window, no shear within one and no straight path apply to "
-            f"{' and '.join(whole)}, fitted to whole images along curved paths: "
-            "smoothing is part of the method."
-        )
     return Chapter("Error budget of the cross-flow wind", lead, drawn, numbers)
 
 

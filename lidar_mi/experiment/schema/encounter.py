@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from lidar_mi.experiment.schema.aerodynamics import Aerodynamics
 from lidar_mi.experiment.schema.air import Air
 from lidar_mi.experiment.schema.heave import HeaveKeys
 from lidar_mi.experiment.schema.section import Section
@@ -160,6 +161,7 @@ class Aircraft(Section):
         0.1, description="rolling moment coefficient per rad of aileron"
     )
     heave: HeaveKeys = HeaveKeys()
+    aerodynamics: Aerodynamics = Aerodynamics()
 
     @field_validator("model", mode="before")
     @classmethod

@@ -105,9 +105,10 @@ def check_lines(
     middle = scan.range + scan.thickness / 2
     if abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
-            f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab "
-            f"of scan, {middle:g} m, to half a range bin: {middle - lidar.range_bin / 2:g} to "
-            f"{middle + lidar.range_bin / 2:g} m (set both, with scan.range)"
+            f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected at most "
+            f"half a range bin from the middle of the slab, {middle:g} m: "
+            f"{middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m (set both, "
+            "with scan.range)"
         )
     # lines that leave the wake, bins that reach the telescope
     directions = sensor.directions

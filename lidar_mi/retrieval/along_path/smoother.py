@@ -384,7 +384,7 @@ def smoothed(
 
 
 def _inflation(square: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Mean square of each slab and its neighbours where it is beyond chance, else 1."""
+    """Mean square of each slab and its neighbours where it is significant, else 1."""
     three = np.ones(3)
     total, freedom = (np.convolve(a, three)[1:-1] for a in (square, number))
     freedom = np.maximum(freedom, 1.0)

@@ -64,7 +64,7 @@ class Standing(NamedTuple):
         return found._replace(d=d, covariance=found.covariance / left**2 + more)
 
     def __str__(self) -> str:
-        return f"{self.fraction:.1%} of the squared slopes at rest" if self.fraction else ""
+        return f"{self.fraction:.1%} of the texture does not move" if self.fraction else ""
 
 
 def standing(
@@ -98,16 +98,14 @@ def standing(
     windows : Windows
     false_alarm : float
     """
-    first, second, known, d = warped(images[:2], found, windows)
+    left, mean, known, d = residual(images[:2], found, windows)
     speed = d.norm(dim=0)
     use = known & (speed > _SLOWEST)
     use[:_RIM] = use[-_RIM:] = False
     use[:, :_RIM] = use[:, -_RIM:] = False
     if not bool(use.any()):
         return Standing()
-    left = torch.where(known, second - first, 0.0)
     limit = _CLIPPED * 1.4826 * left[use].abs().median()
-    mean = (first + second) / 2
     shift = moved(mean, d / 2) - moved(mean, -d / 2)
     excess, power = _along_and_across(left.clamp(-limit, limit), d / speed.clamp(min=1e-6))
     whole, _ = _along_and_across(shift, d / speed.clamp(min=1e-6))
@@ -132,21 +130,35 @@ def standing(
     return Standing(fraction, stderr)
 
 
-def warped(
+def residual(
     images: Sequence[torch.Tensor], found: Displacement, windows: Windows
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Two images over their means at mid-time, where both are known, and the displacement, px."""
+    """Difference and mean of two images over their means at mid-time, where known, the motion, px.
+
+    The difference is without the means of its columns and rows: lines that have an offset of their
+    own in each image have structure across and along the motion too.
+    """
     weights = [
         linear_weights(windows.centres(axis).to(found.d), torch.arange(n).to(found.d))
         for axis, n in enumerate(windows.shape)
     ]
     one, two = (working(image) for image in images)
     d = separable(found.d.nan_to_num(0.0), weights).to(one)
-    known = torch.isfinite(one) & torch.isfinite(two)
+    lost = separable((~torch.isfinite(found.d)).any(0).to(found.d), weights) > 0
+    known = torch.isfinite(one) & torch.isfinite(two) & ~lost
     one, two = (torch.where(known, i / i[known].mean(), 1.0) for i in (one, two))
     hole = (~known).to(one)
     known = (moved(hole, -d / 2) < 0.1) & (moved(hole, d / 2) < 0.1)
-    return moved(one, -d / 2), moved(two, d / 2), known, d
+    first, second = moved(one, -d / 2), moved(two, d / 2)
+    difference = torch.where(known, second - first, torch.nan)
+    return without_lines(difference).nan_to_num(0.0), (first + second) / 2, known, d
+
+
+def without_lines(field: torch.Tensor) -> torch.Tensor:
+    """A field (z, y) less the means of its columns and of its rows."""
+    for axis in (0, 1):
+        field = field - field.nanmean(axis, keepdim=True)
+    return field
 
 
 def _along_and_across(image: torch.Tensor, unit: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

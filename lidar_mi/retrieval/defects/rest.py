@@ -69,7 +69,7 @@ class AtRest(NamedTuple):
     pattern: FixedPattern
 
     def __str__(self) -> str:
-        parts = {"at rest": self.structure, "of one image alone": self.stray.any(0)}
+        parts = {"at rest": self.structure, "in one image only": self.stray.any(0)}
         said = [
             f"{int(p.sum())} ({p.double().mean():.2g} of all) {name}"
             for name, p in parts.items()

@@ -87,7 +87,8 @@ def differences(
 ) -> Differences:
     """The components of the differences about a fitted flow, estimated by REML.
 
-    A fit leaves of the differences r = R D, with R = I - J C J^T W and the posterior covariance C.
+    The residuals of a fit are r = R D of the differences, with R = I - J C J^T W and the posterior
+    covariance C.
     Random fields of every component are sent through R. So are flows drawn from the prior, of
     which R J C (P u) is left with the prior's precision P. Squares of the residuals, by three
     scales and by place, have gamma distributions whose means are sums of those of the components.
@@ -96,7 +97,7 @@ def differences(
     unresolved motion is 1 where the prior's spectrum goes on beyond the splines, and at most.
 
     What differs from the sum of the components by place, and by wavenumber, multiplies it: the
-    variance of the ratio beyond chance says how freely (`_shrunk`).
+    variance of the ratio, less that of its sampling, says how freely (`_shrunk`).
 
     Parameters
     ----------
@@ -391,7 +392,7 @@ def _motion_beyond(shape: Sequence[int], mesh: Mesh, like: torch.Tensor, seed: i
 def _residual_operator(
     linear: Linear, mesh: Mesh, response: Response | None
 ) -> Callable[[torch.Tensor], torch.Tensor]:
-    """What a fit leaves of differences (draws, ...), to first order."""
+    """Residuals of a fit to differences (draws, ...), to first order."""
     slope, weight = working(linear.slope), working(linear.weight)
 
     def left(differences: torch.Tensor) -> torch.Tensor:
@@ -407,7 +408,7 @@ def _residual_operator(
 def _flows_left(
     linear: Linear, mesh: Mesh, prior: Prior, response: Response | None
 ) -> torch.Tensor:
-    """What a fit leaves of the differences by flows drawn from the prior, (draws, ...)."""
+    """Residuals of a fit to the differences by flows drawn from the prior, (draws, ...)."""
     slope = working(linear.slope)
     if response is None:
         return torch.zeros_like(slope[:1]).expand(_DRAWS[mesh.dims], *slope.shape[1:])

@@ -52,7 +52,7 @@ class Images(NamedTuple):
     given_weight : torch.Tensor, shape of an image
         The same by the noise as given.
     stack : torch.Tensor, shape (images, ...)
-        The images, of one brightness.
+        The images, with normalised intensity.
     blur : float
         Standard deviation of the Gaussian that blurred the images, px.
     known_noise : float

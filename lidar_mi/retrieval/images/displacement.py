@@ -5,6 +5,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
+from torch.nn.functional import pad
 
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.quantity import Quantity
@@ -46,6 +47,12 @@ class Displacement(NamedTuple):
     def dy(self) -> torch.Tensor:
         """Displacement along y."""
         return self.d[-1]
+
+    def medians(self) -> "Displacement":
+        """Of 3 x 3 vectors of images, without chance peaks; NaN where no vector is known."""
+        wide = pad(self.d, (1, 1, 1, 1), value=torch.nan)
+        around = wide.unfold(-2, 3, 1).unfold(-2, 3, 1).flatten(-2)
+        return self._replace(d=around.nanmedian(-1).values)
 
     @classmethod
     def empty(cls, windows: Windows, like: torch.Tensor) -> "Displacement":

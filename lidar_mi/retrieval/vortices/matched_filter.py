@@ -88,7 +88,7 @@ def matched_filter(
     Parameters
     ----------
     pair : torch.Tensor, shape (2, z, y)
-        Finite, of one brightness.
+        Finite, with normalised intensity.
     spacing : (float, float)
         Along y and z, m.
     dt : float

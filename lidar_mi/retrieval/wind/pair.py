@@ -185,6 +185,15 @@ def _vectors(
     seen = clean.masked() if method.centred else clean.filled
     estimate = _estimator(method, given, seen[2:], validation, settings)
     found = estimate(*seen[:2], stride=windows.stride)
+    pair: Sequence[torch.Tensor] = seen[:2]
+    pattern, copy, unexplained = Standing(), Copy(), False
+    tested = checks and not (given.times and method.timed)
+    if tested and len(seen) == 2 and not found.quantities:
+        again = partial(estimate, stride=windows.stride)
+        field = Displacement.medians if method.local else Displacement._replace
+        raw, (found, copy, pair) = pair, without_copy(again, found, pair, windows, field)
+        unexplained = copy.significant and pair is raw
+        found = copy.widened(found)
     flag = clean.defects.flags(found, clean.raw, windows, method.centred)
     if method.local:
         blind = (flag & Flag.NON_FINITE_INPUT.value) > 0
@@ -197,14 +206,20 @@ def _vectors(
         clear, covariance = clearly_textured(texture, *limits), None
         if standard_errors:
             covariance = bootstrap_covariance(
-                seen[:2], found, windows, estimate, method.centred, ~low, clear, given.noise
+                pair, found, windows, estimate, method.centred, ~low, clear, given.noise
             )
             flag = flag | of_bootstrap(covariance)
-        found = found._replace(covariance=covariance)
-    pattern, copy = Standing(), Copy()
-    if checks and not method.local and not (given.times and method.timed):
-        found, pattern, copy, spoilt = _without_pattern(found, seen, windows, estimate)
-        flag = flag | spoilt
+        found = copy.widened(found._replace(covariance=covariance))
+    if tested and not method.local and found.covariance is not None:
+        pattern = standing(pair, found, windows)
+    # parameters that are fitted in addition to the vectors would stay biased
+    if pattern.spoils or (pattern.fraction and found.quantities):
+        flag = flag | Flag.AT_REST.value
+    # what no copy explains and no pattern either
+    elif unexplained and not pattern.fraction:
+        flag = flag | Flag.AT_REST.value
+    else:
+        found = pattern.corrected(found)
     if method.local:
         flag = flag | _flags_among_neighbours(found.d, low, windows, validation)
     if checks and method.reach:
@@ -241,33 +256,6 @@ def _estimator(
     windows = given.windows
     options = {name: offered[name] for name in method.options}
     return partial(method.find, template=windows.template, search=windows.search, **options)
-
-
-def _without_pattern(
-    found: Displacement,
-    images: Sequence[torch.Tensor],
-    windows: Windows,
-    estimate: Callable[..., Displacement],
-) -> tuple[Displacement, Standing, Copy, int]:
-    """A fitted field without the bias by what is at rest in both images, or flags where it stays.
-
-    That is a faint pattern, or a copy of one image in the other.
-    """
-    if found.covariance is None:
-        return found, Standing(), Copy(), 0
-    raw = pair = images[:2]
-    copy = Copy()
-    if len(images) == 2 and not found.quantities:
-        again = partial(estimate, stride=windows.stride)
-        found, copy, pair = without_copy(again, found, pair, windows)
-    pattern = standing(pair, found, windows)
-    # parameters that are fitted in addition to the vectors would stay biased
-    spoilt = pattern.spoils or (pattern.fraction and found.quantities)
-    # what no copy explains and no pattern either
-    spoilt = spoilt or (copy.significant and pair is raw and not pattern.fraction)
-    if spoilt:
-        return found, pattern, copy, Flag.AT_REST.value
-    return pattern.corrected(found), pattern, copy, 0
 
 
 def _flags_among_neighbours(

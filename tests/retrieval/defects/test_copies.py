@@ -9,6 +9,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.retrieval.defects.copies import Copy, copy_at_rest
+from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
@@ -54,13 +55,13 @@ def found_in(images):
     return copy_at_rest([torch.as_tensor(i) for i in images], *true_displacement())
 
 
-def retrieved(images):
+def retrieved(images, method="variational"):
     axes = {
         name: (name, 0.5 * np.arange(n), {"units": "m"})
         for name, n in zip("zy", SHAPE, strict=True)
     }
     one, two = (xr.DataArray(image, axes, ("z", "y")) for image in images)
-    return retrieve_wind(one, two, 0.1, windows=WindowSizes(8, 16, 4))
+    return retrieve_wind(one, two, 0.1, method, windows=WindowSizes(8, 16, 4))
 
 
 def normalised(wind):
@@ -122,6 +123,41 @@ def test_wind_is_that_of_the_air(fraction):
     # errors of one pair share that of the fraction: chi-square of one degree of freedom
     assert 0.3 < np.mean(error**2) < 4.0
     assert "at rest" in wind.attrs["copy_at_rest"]
+
+
+@pytest.mark.parametrize("method", ["multipass", "cc"])
+def test_windows_give_the_wind_of_the_air(method):
+    """With 20 % of image 1 in image 2 they were 20 % too slow, stated 3 % and 10 %."""
+    wind = retrieved(pair(461, 0.2), method)
+    valid, error = normalised(wind)
+    assert valid.mean() > 0.8
+    assert np.mean(np.abs(error) > 4) < 0.01
+    fraction = float(wind.attrs["copy_at_rest"].split()[0]) / 100
+    assert fraction == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("method", ["multipass", "cc"])
+def test_windows_without_a_copy_have_none(method):
+    """Three pairs; where an offset of each column is new in each image as well."""
+    for seed in (463, 464, 465):
+        images = pair(seed, 0.0)
+        if seed == 465:
+            random = np.random.default_rng(seed)
+            images = [image + 0.03 * random.standard_normal(SHAPE[1]) for image in images]
+        assert "copy_at_rest" not in retrieved(images, method).attrs
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_offsets_of_lines_are_no_copy_and_no_pattern(axis):
+    """Of 3 % in each image: 8 pairs, at false alarms of 0.5 and 0.1 %."""
+    true, windows = true_displacement()
+    for seed in range(470, 478):
+        random = np.random.default_rng(seed)
+        size = [1, 1]
+        size[axis] = SHAPE[axis]
+        images = [torch.as_tensor(i + 0.03 * random.standard_normal(size)) for i in pair(seed, 0.0)]
+        assert not copy_at_rest(images, true, windows).significant
+        assert standing(images, true, windows) == Standing()
 
 
 @pytest.mark.slow
