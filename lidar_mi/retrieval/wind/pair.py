@@ -190,7 +190,7 @@ def _vectors(
     tested = checks and not (given.times and method.timed)
     if tested and len(seen) == 2 and not found.quantities:
         again = partial(estimate, stride=windows.stride)
-        field = Displacement.medians if method.local else Displacement._replace
+        field = Displacement.medians if method.local else lambda one: one
         raw, (found, copy, pair) = pair, without_copy(again, found, pair, windows, field)
         unexplained = copy.significant and pair is raw
         found = copy.widened(found)
