@@ -125,5 +125,7 @@ def _show(found: "xr.Dataset") -> None:
     ]
     heads = ("height, m", "u (east), m/s", "v (north), m/s", "w (up), m/s", "residual", "lines")
     time = str(one["time"].values)[:19].replace("T", " ")
-    note = f"{int(valid.sum())} of {valid.size} winds are valid, of {valid.shape[0]} profiles."
+    number = valid.shape[0]
+    profiles = f"{number} profile{'s' if number > 1 else ''}"
+    note = f"{int(valid.sum())} of {valid.size} winds are valid, of {profiles}."
     print_table(Table(f"wind, {time} UTC", rows, heads, note))

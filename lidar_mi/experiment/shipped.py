@@ -181,7 +181,9 @@ def _found_shipped(name: str | Path, kinds: Sequence[_Kind]) -> Path:
         shipped = _folder(kind) / file
         if path.parent == Path() and shipped.is_file():
             return shipped
-    close = difflib.get_close_matches(path.stem, [n for kind in kinds for n in _names(kind)], 1)
+    close = difflib.get_close_matches(
+        path.stem.lower(), [n for kind in kinds for n in _names(kind)], 1
+    )
     hint = f"did you mean {close[0]}? Expected" if close else "expected"
     raise InputError(
         f"{name}: no such file; {hint} {kinds[0].called} or one of {', '.join(_names(kinds[0]))}"

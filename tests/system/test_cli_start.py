@@ -70,7 +70,14 @@ def test_a_new_file_is_what_it_was_made_of(there, lidar_mi, shipped):
     assert (code, err) == (0, "") and "lidar-mi check mine.yaml" in out
     text = (there / "mine.yaml").read_text()
     assert yaml.safe_load(text)["name"] == "mine" and max(map(len, text.splitlines())) <= 200
-    assert _all(there / "mine.yaml") == _all(shipped_file(shipped))
+    expected = _all(shipped_file(shipped))
+    for one in expected.values():
+        extinction = (one.get("wake") or {}).get("extinction") or {}
+        # one's own air has molecules
+        if str(extinction.get("molecules")).startswith("0.0 "):
+            extinction["molecules"] = "auto"
+            assert "# Molecules of the site's air scatter as well" in text
+    assert _all(there / "mine.yaml") == expected
     assert f"lidar-mi {'fly' if shipped in flights() else 'run'} mine.yaml" in text
 
 

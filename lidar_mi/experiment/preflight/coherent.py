@@ -28,7 +28,10 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
     step = ""
     if scan.kind in ("rhi", "ppi"):
         angle = scan.rate * scan.accumulation
-        step = f", {math.degrees(angle):.3g} deg or {angle * signal.range:.3g} m apart"
+        # lines of a cone are nearer to each other the steeper they look
+        level = math.cos(scan.elevation) if scan.kind == "ppi" else 1.0
+        apart = f"{angle * level * signal.range:.3g} m at {signal.range:g} m"
+        step = f", {math.degrees(angle):.3g} deg or {apart} apart"
     count = int(np.unique(lines.sweep).size)
     return [
         ("laser", f"{shown(laser.wavelength, 'nm')}, pulses of {laser.pulse_length:g} m"),

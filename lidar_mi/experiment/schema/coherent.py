@@ -4,6 +4,7 @@ import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
+from scipy.constants import speed_of_light
 
 from lidar_mi.experiment.schema.air import LogarithmicShear, Turbulence
 from lidar_mi.experiment.schema.section import Section
@@ -40,7 +41,7 @@ class CoherentLaser(Section):
     gate_spacing: Annotated[Length, Within(0.5, 1000, "gates that overlap or do not")] = Field(
         10.0, description="from one gate to the next"
     )
-    first_gate: Annotated[Length, Within(1, 1e5, "the troposphere")] = Field(
+    first_gate: Annotated[Length, Within(1, 1e5, "farther than lidars of winds see")] = Field(
         400.0, description="distance of the first gate's middle"
     )
     gates: Annotated[int, Within(1, 10000, "100 km of gates that are 10 m apart")] = Field(
@@ -59,6 +60,17 @@ class CoherentLaser(Section):
             raise ValueError(
                 f"first_gate: {self.first_gate:g} m is not allowed with gates of "
                 f"{self.gate_length:g} m; expected more than half of them"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _echoes_return_before_the_next_pulse(self) -> Self:
+        last = self.first_gate + (self.gates - 1) * self.gate_spacing
+        farthest = speed_of_light / (2 * self.pulse_rate)
+        if last > farthest:
+            raise ValueError(
+                f"gates: the last at {last:g} m is not allowed; expected at most {farthest:.4g} m, "
+                "from where echoes return before the next pulse (pulse_rate)"
             )
         return self
 
@@ -136,7 +148,7 @@ class CoherentSignal(Section):
     cnr: Annotated[Number, Within(-60, 60, "dB; below -25 dB nothing is found")] = Field(
         -5.0, description="carrier-to-noise ratio at the range, dB"
     )
-    range: Annotated[Length, Within(1, 1e5, "the troposphere")] = Field(
+    range: Annotated[Length, Within(1, 1e5, "farther than lidars of winds see")] = Field(
         700.0, description="at which that is the ratio, in the background's extinction"
     )
     profile: Literal["lidar_equation", "constant"] = Field(

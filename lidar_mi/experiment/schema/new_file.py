@@ -41,6 +41,10 @@ def new_file(name: str, shipped: str, path: Path, command: str) -> str:
         YAML, with a comment on every key and the names of the keys that a section has besides.
     """
     data = read_keys(path) | {"name": name}
+    # the paper's air is that of the shipped experiments; one's own is real
+    real = data.get("wake", {}).get("extinction", {}).get("molecules") == 0
+    if real:
+        data["wake"]["extinction"]["molecules"] = "auto"
     commands = {
         "check": f"lidar-mi check {name}.yaml",
         "run": f"lidar-mi {command} {name}.yaml",
@@ -49,6 +53,8 @@ def new_file(name: str, shipped: str, path: Path, command: str) -> str:
     head = _HEAD.format(
         name=name, shipped=shipped, width=max(map(len, commands.values())), **commands
     )
+    if real:
+        head += "# Molecules of the site's air scatter as well; in the shipped one none do.\n"
     variants = data.pop("variants", {})
     lines = list(_section(data, "", 0, set()))
     absent = [key for key in sections() if key not in data]

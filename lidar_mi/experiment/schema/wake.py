@@ -139,14 +139,16 @@ class ExtinctionMapping(Section):
     aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
     background: Annotated[Extinction, Within(0, 10, "visibility is 0.3 m in the densest smoke")] = (
         Field(
-            quantity("0.1 / km"), description="extinction without exhaust; also of the environment"
+            quantity("0.1 / km"),
+            description="extinction by aerosol without exhaust, also of the environment; 3.9 over "
+            "the visibility at green wavelengths",
         )
     )
     maximum: Annotated[
         Extinction, Within(1e-12, 10, "from the thermosphere to the densest smoke")
     ] = Field(
         quantity("1.8 / km"),
-        description="at the largest tracer concentration (or speed); above the background",
+        description="in all, at the largest tracer concentration (or speed); above background",
     )
     molecules: (
         Literal["auto"]

@@ -67,7 +67,7 @@ def image_remarks(
         *_of_the_speed(wake, platform, retrieval, volume, truth.wind, plans[0]),
         *_of_the_light(lidar, scan, plans[0]),
         *_of_the_pattern(scan),
-        *_of_the_molecules(wake.extinction, truth, scattering, air, clear_air),
+        *_of_the_molecules(wake.extinction, truth, scattering, air, clear_air, site),
         *sounding,
     ]
 
@@ -163,8 +163,14 @@ def _of_the_molecules(
     scattering: Scattering,
     air: Scatterer,
     clear_air: ClearAir,
+    site: Site,
 ) -> list[str]:
-    """Molecules that a file does not ask for, as none of before they were the default does."""
+    """Molecules that a file does not ask for, as none of before they were, or leaves out."""
+    if mapping.molecules == 0 and site.model_fields_set:
+        return [
+            "site: the images have none of its air, as wake.extinction.molecules is 0; expected "
+            "auto, by which molecules scatter"
+        ]
     if "molecules" in mapping.model_fields_set or not clear_air.extinction:
         return []
     fractions = backscatter_fractions(mapping, truth, air, clear_air)

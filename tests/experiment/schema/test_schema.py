@@ -338,6 +338,11 @@ FAULTS = [
         "doppler.laser: first_gate: 15 m is not allowed with gates of 30 m; expected more",
     ),
     (
+        # c / 2 over 15 kHz
+        "doppler={kind: coherent, laser: {pulse_rate: 15 kHz, gates: 961}}",
+        "doppler.laser: gates: the last at 10000 m is not allowed; expected at most 9993 m, ",
+    ),
+    (
         "doppler={kind: coherent, passage: {decay_time: 9 s, dissipation_rate: 1e-3}}",
         "doppler.passage: expected one of decay_time and dissipation_rate",
     ),

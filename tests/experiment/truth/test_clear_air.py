@@ -150,6 +150,14 @@ def test_a_file_that_says_nothing_is_told_of_its_molecules():
     assert not [text for text in prepare(experiment()).warnings if "molecules" in text]
 
 
+def test_a_site_of_whose_air_the_images_have_nothing_is_told():
+    aerosol_alone = {"extinction": {"molecules": 0}}
+    told = prepare(experiment(site={"altitude": "600 m"}, wake=aerosol_alone))
+    assert [text for text in told.warnings if text.startswith("site: the images have none")]
+    asked = prepare(experiment(site={"altitude": "600 m"}))
+    assert not [text for text in asked.warnings if text.startswith("site")]
+
+
 @pytest.mark.parametrize("altitude, pressure, temperature", STANDARD)
 def test_a_doppler_lidar_is_in_the_air_of_the_site(altitude, pressure, temperature):
     """355 nm: 2.759e-26 cm^2 a molecule (Bodhaine et al. 1999), 8.0e-6 / m / sr at sea level."""
