@@ -68,7 +68,7 @@ def test_beams_wider_than_a_template_are_reported(tmp_path, quick):
     assert "beams are 10 m wide at 5001" in warnings[0] and "template of 4 m" in warnings[0]
     assert "backscatter, cc: no vector is valid; 100 % have the flag " in warnings[1]
     # a few samples of a beam of 5 km
-    assert "render.samples_per_beam: no vector is valid, and noise of the images" in warnings[2]
+    assert "render.samples_per_beam: no vector is valid with as much noise again" in warnings[2]
     assert metrics["backscatter.cc.valid_fraction"] == 0
     page = (tmp_path / "run" / "report.html").read_text()
     log = (tmp_path / "run" / "log.txt").read_text()

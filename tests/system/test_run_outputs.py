@@ -24,6 +24,7 @@ from tests.support.experiments import FIGURES, SOURCES
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 METHODS = "variational", "cc"
+COVERAGE = [f"coverage_{of}_{name}" for of in (68, 95) for name in "vw"]
 
 STATISTICS = [
     f"{statistic}_{name}"
@@ -119,7 +120,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
     expected |= {
         f"{source}.{method}.{key}"
         for source, method, key in product(
-            SOURCES, METHODS, ("stderr_v", "stderr_w", "no_skill_fraction")
+            SOURCES, METHODS, ("stderr_v", "stderr_w", "no_skill_fraction", *COVERAGE)
         )
     }
     # the noise of an image that was rendered is known, and so how well a wind can be found in it
@@ -161,7 +162,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
     for none in (f"extinction_without_texture.{method}." for method in METHODS):
         assert metrics[f"{none}valid_fraction"] == 0
         expected -= {f"{none}{part}{s}" for part in ("", "outside_cores.") for s in STATISTICS}
-        expected -= {f"{none}{q}" for q in ("stderr_v", "stderr_w", "no_skill_fraction")}
+        expected -= {f"{none}{q}" for q in ("stderr_v", "stderr_w", "no_skill_fraction", *COVERAGE)}
     assert set(metrics) == expected
 
 

@@ -92,7 +92,8 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
     known = {key for key, values in metrics.items() if np.isfinite(values).any()}
     best = _best_method(metrics, known)
     vortex = [vortex_key(Origin.IMAGES, f"error_{q}") for q in ("circulation_5_15", "position")]
-    head, components = ("sensor", "uvw") if "sensor.rmse_w" in known else (best, "vw")
+    both = any(f"sensor.rmse_{name}" in known for name in "uvw")
+    head, components = ("sensor", "uvw") if both else (best, "vw")
     wanted = [
         # an error beside how often it lies within what is stated
         *(f"{head}.{what}_{name}" for name in components for what in ("rmse", "coverage_95")),
