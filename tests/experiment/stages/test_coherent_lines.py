@@ -209,7 +209,7 @@ def test_a_run_writes_files_that_are_read_again(tmp_path):
         ),
         ({}, {"file": "wake_volume_40s.nc"}, "wake.x: missing; wake_volume_40s.nc has 20 planes"),
         (
-            {"laser": {"gates": 10000}, "scan": {"accumulation": "1 ms"}},
+            {"laser": {"gates": 10000, "pulse_rate": "1 kHz"}, "scan": {"accumulation": "1 ms"}},
             PAIR,
             "doppler.scan: 4.8e+08 cells are not allowed",
         ),
