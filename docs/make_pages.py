@@ -6,9 +6,10 @@ They are ``docs/reference``, ``docs/api``, ``docs/plugins`` and ``docs/validatio
 pages of two of these.
 """
 
-import os
 import runpy
 from pathlib import Path
+
+from lidar_mi.io.text import write_text
 
 DOCS = Path(__file__).parent
 SCRIPTS = (
@@ -35,9 +36,7 @@ def write() -> None:
         if page.exists() and page.read_text(encoding="utf-8") == text:
             continue
         page.parent.mkdir(exist_ok=True)
-        part = page.with_name(f".{page.name}.{os.getpid()}.part")
-        part.write_text(text, encoding="utf-8")
-        part.replace(page)
+        write_text(page, text)
     for folder in FOLDERS:
         for page in (DOCS / folder).glob("*.md"):
             if f"{folder}/{page.name}" not in made:
