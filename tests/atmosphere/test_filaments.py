@@ -137,7 +137,12 @@ def test_linking():
 
 
 @pytest.mark.parametrize(
-    ("amplitude", "model"), [(10.0, "lamb_oseen"), (10.0, "burnham_hallock"), (40.0, "lamb_oseen")]
+    ("amplitude", "model"),
+    [
+        (10.0, "lamb_oseen"),
+        pytest.param(10.0, "burnham_hallock", marks=pytest.mark.slow),
+        pytest.param(40.0, "lamb_oseen", marks=pytest.mark.slow),
+    ],
 )
 def test_table_against_the_sum(amplitude, model):
     """Within 1 % of the largest swirl anywhere, 0.2 % rms; also periods away."""

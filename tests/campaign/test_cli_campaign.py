@@ -40,6 +40,7 @@ def test_shipped_campaigns_can_be_run(tmp_path, name):
     assert len(coarse.points) < len(whole.points) / 3
 
 
+@pytest.mark.slow
 def test_points_of_a_job_array_are_collected(tmp_path, command, capsys):
     path = described(tmp_path, sweep={"retrieval.template": [6, 8]})
     out = tmp_path / "out"

@@ -63,6 +63,7 @@ def test_the_wake_of_an_aircraft_reaches_the_path():
     assert dict(described_wake(experiment))["vortices when met"].startswith("of an A388, ")
 
 
+@pytest.mark.slow
 def test_flights_through_filaments():
     """Without waves the roll is that in the straight pair; through rings the flight has no truth
     of vortices where a plane cuts none, and goes on."""

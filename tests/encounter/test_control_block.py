@@ -304,6 +304,7 @@ def with_losses(block, lost, run):
     return block | {"loss_transition": np.array([[1 - begin, begin], [1 / run, 1 - 1 / run]])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("forward", "lost"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.05)])
 def test_predicted_roll_agrees_with_flights(block, weather, forward, lost):
     """Within 10 %: the variance of roll of nonlinear flights, by the roll model and its aileron.

@@ -65,6 +65,7 @@ def test_the_wind_is_by_the_most_accurate_method(images):
     assert found.pair.reasons == (SKIPPED,) and found.flags == (f"wind: {SKIPPED}",)
 
 
+@pytest.mark.slow
 def test_the_next_slab_starts_from_the_last_one():
     """Half a pixel on, with other texture: as accurate as from nothing."""
     near, far = (Estimator(load_experiment("wake_sensor")) for _ in range(2))

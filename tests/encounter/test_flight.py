@@ -78,6 +78,7 @@ def test_commands_keep_the_limits(flights, experiment):
     assert np.allclose(flights.series["control_roll_moment"], power * deflection)
 
 
+@pytest.mark.slow
 def test_what_was_seen_is_not_forgotten(experiment):
     """A lidar that goes blind after the tenth slab: those slabs are still ahead, and steered by."""
     blind = SyntheticLidar(wake_along_path(experiment), blind=lambda number: number > 10)

@@ -58,6 +58,7 @@ def test_scans_of_others_do_not_count(tmp_path, scan):
     assert store.read(3, POSE) is None
 
 
+@pytest.mark.slow
 def test_a_flight_that_was_stopped_goes_on(tmp_path, monkeypatch):
     """The scans made before are not made again; the flight is that which was not stopped."""
     monkeypatch.setattr("lidar_mi.encounter.fly.write_report", lambda *_: None)

@@ -71,6 +71,7 @@ def test_each_wind_starts_from_the_last_one(here, drifting):
     assert np.mean(near[1:]) < 1.06**2 * np.mean(far[1:])
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own_finds_the_same(here, drifting):
     winds = InOwnProcess(ImageMethod.VARIATIONAL, WINDOWS)
     for (one, *_), (other, _, seconds) in zip(here, winds_of(winds, drifting), strict=True):
@@ -88,6 +89,7 @@ def doubled(wind):
     return wind.assign(v=2 * wind["v"]), ("doubled",)
 
 
+@pytest.mark.slow
 def test_a_wind_is_completed_where_it_is_found_and_the_next_starts_without(here, drifting):
     """In a process of its own; the next slab starts from the images' wind."""
     winds = InOwnProcess(ImageMethod.VARIATIONAL, WINDOWS)

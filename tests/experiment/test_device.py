@@ -111,6 +111,7 @@ def computed(monkeypatch):
     return names
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_all_winds_and_vortices_of_a_run_are_retrieved_there(computed):
     """Bound, winds, texture sweep, budget, noise of the simulation, vortices."""

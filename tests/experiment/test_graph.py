@@ -235,6 +235,7 @@ def counted(monkeypatch):
     gc.collect()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_a_run_in_memory_writes_nothing_and_computes_each_stage_once(
     tmp_path, monkeypatch, counted

@@ -284,9 +284,13 @@ def test_shipped_experiments_are_documented():
 @pytest.mark.parametrize(
     ("name", "one"),
     [
-        # carrying air on in three dimensions takes 4 to 12 s
+        # carrying air on in three dimensions and reading a series of states take 4 to 30 s
         pytest.param(
-            name, one, marks=[pytest.mark.slow] * (name in ("wake_3d", "turbine")), id=name
+            name,
+            one,
+            marks=[pytest.mark.slow]
+            * (name in ("wake_3d", "turbine", "real_wakes", "wake_changing")),
+            id=name,
         )
         for name, one in shipped()
     ],

@@ -78,6 +78,7 @@ def test_calibrated_instrument():
     assert abs(float((normal**2).sum()) / (PULSES - 1) - 1) < 4 * math.sqrt(2 / (PULSES - 1))
 
 
+@pytest.mark.slow
 def test_camera_that_is_tilted_out_of_focus_and_distorts():
     """Defects of the true camera; each alone is in the table of defects."""
     camera = CAMERA | {"tilt": ["0.5 deg", "0 deg"], "distortion": 0.002, "defocus": "50 um"}
@@ -110,6 +111,7 @@ def test_hot_and_dead_pixels_are_masked():
     assert 47 + 10 <= left_out <= 2 * 47 + 5
 
 
+@pytest.mark.slow
 def test_frames_of_the_calibration_drift():
     """Random walks of laser and etalon: found as drift, with its size in the systematic error."""
     quiet, drifting = (

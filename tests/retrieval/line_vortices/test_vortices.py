@@ -38,8 +38,12 @@ def errors(one, found):
     ("family", "options"),
     [
         (PAIR, {}),
-        (replace(PAIR, profile="burnham_hallock"), {"profile": "burnham_hallock"}),
-        (GROUND, {"ground": -2.0}),
+        pytest.param(
+            replace(PAIR, profile="burnham_hallock"),
+            {"profile": "burnham_hallock"},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(GROUND, {"ground": -2.0}, marks=pytest.mark.slow),
         (SINGLE, {"kind": "single"}),
     ],
     ids=["pair", "burnham_hallock", "ground", "single"],
