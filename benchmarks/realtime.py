@@ -20,9 +20,9 @@ from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.slab_winds import without_old_garbage
 from lidar_mi.encounter.slabs import gates_of
-from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.schema.reading import load_experiment
 
 from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, Pair, drifting_pair_images
 from .report import Comparison, Row, row

@@ -11,9 +11,6 @@ from .experiment.export import export
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
 from .experiment.results import Run
 from .experiment.run import run
-from .experiment.schema.experiment import Experiment
-from .experiment.schema.reading import load_experiment
-from .experiment.shipped import campaigns, experiments, scene_file
 from .experiment.truth.extinction import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
@@ -37,6 +34,9 @@ from .retrieval.wind.pair import retrieve_wind
 from .retrieval.wind.series import retrieve_winds
 from .retrieval.wind.standard_errors import standard_errors
 from .retrieval.wind.volume import retrieve_wind_volume
+from .schema.experiment import Experiment
+from .schema.reading import load_experiment
+from .schema.shipped import campaigns, experiments, scene_file
 from .system.doctor import doctor
 
 __version__: str

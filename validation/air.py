@@ -13,7 +13,7 @@ from lidar_mi.atmosphere.air.turbulence import turbulence
 from lidar_mi.encounter.aircraft import Commands, loads_in_wind
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 from tests.support.turbulence import (
     correlations,
     finer_variance,

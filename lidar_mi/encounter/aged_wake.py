@@ -7,8 +7,8 @@ from lidar_mi.atmosphere.filament_path import FilamentsAlongPath
 from lidar_mi.atmosphere.wake_decay import sarpkaya_decay_time
 from lidar_mi.atmosphere.wake_path import PairAlongPath
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.encounter import Encounter, WakeInTime
-from lidar_mi.experiment.schema.wake import VortexPair
+from lidar_mi.schema.encounter import Encounter, WakeInTime
+from lidar_mi.schema.wake import VortexPair
 
 
 def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | FilamentsAlongPath:

@@ -16,13 +16,13 @@ from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema import air as schema
-from lidar_mi.experiment.schema import encounter as flight
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.section import Section
 from lidar_mi.experiment.truth.turbulent_air import turbulence_scales, turbulent_air
 from lidar_mi.io.wake_file import read_wake
+from lidar_mi.schema import air as schema
+from lidar_mi.schema import encounter as flight
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.section import Section
 from lidar_mi.units import AS_GIVEN
 
 # Planes across the path, in separations from the middle, over which a wake's drift is averaged.
@@ -60,8 +60,8 @@ def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir
 
     Parameters
     ----------
-    air : lidar_mi.experiment.schema.air.Air
-    path : lidar_mi.experiment.schema.encounter.Path
+    air : lidar_mi.schema.air.Air
+    path : lidar_mi.schema.encounter.Path
         Heights are above its ground; turbulence and gusts are those at its start.
     seed : int
         Of the experiment.

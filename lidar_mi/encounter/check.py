@@ -16,9 +16,9 @@ from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.preflight import check as preflight
 from lidar_mi.experiment.run import prepare
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.truth.clear_air import site_altitude
 from lidar_mi.progress import Notice
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import shown
 
 # A path misses the wake where no rolling moment reaches this fraction of the ailerons'.

@@ -16,14 +16,14 @@ from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.slabs import Gates
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.line_frames import PULSES, LineImages, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings, ring_instrument
 from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.sensor import Sensor
 
 if TYPE_CHECKING:
     import torch

@@ -14,12 +14,12 @@ from lidar_mi.encounter.doppler import LineFrames
 from lidar_mi.encounter.estimate import SKIPPED
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, InThisProcess, clock_of
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import retrieval_device, window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.acceptance import no_fit
 from lidar_mi.retrieval.vortices.image_fit import detected_fit, started_fit
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.schema.experiment import Experiment
 
 
 class SlabEstimate(NamedTuple):

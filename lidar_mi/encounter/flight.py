@@ -41,9 +41,9 @@ from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.strip_loads import StripLoads
 from lidar_mi.encounter.user_controller import name_of, user_controller
 from lidar_mi.encounter.wake import encounter_of
-from lidar_mi.experiment.schema.encounter import Encounter
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.progress import Notice
+from lidar_mi.schema.encounter import Encounter
+from lidar_mi.schema.experiment import Experiment
 
 if TYPE_CHECKING:
     from lidar_mi.encounter.preview import Lidar

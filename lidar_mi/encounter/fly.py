@@ -24,10 +24,10 @@ from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.device import devices_in_words, on_its_device
 from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.plots import plot_flights
 from lidar_mi.progress import Notice, progress
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import load_experiment
 from lidar_mi.tables import Table, Tabular
 
 if TYPE_CHECKING:

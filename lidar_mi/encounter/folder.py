@@ -23,11 +23,11 @@ from lidar_mi.experiment.folder.records import (
     read_record,
 )
 from lidar_mi.experiment.folder.run_folder import FIGURES, held, made_by, new_record, write_verdict
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.io.text import encoded
 from lidar_mi.io.yaml import to_yaml
+from lidar_mi.schema.experiment import Experiment
 
 ANIMATION, VIDEO, SCANS = "approach.gif", "approach.mp4", "scans"
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.constants import g
 
 from lidar_mi.encounter.strips import TAIL_ASPECT_RATIO, finite_span_slope
-from lidar_mi.experiment.schema.encounter import Aircraft
+from lidar_mi.schema.encounter import Aircraft
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def bending_of(
 
     Parameters
     ----------
-    aircraft : lidar_mi.experiment.schema.encounter.Aircraft
+    aircraft : lidar_mi.schema.encounter.Aircraft
         The lift slope of its sections, the wing's part of the mass.
     mass, pressure, speed : float
         kg, dynamic pressure in Pa, m/s.
@@ -154,7 +154,7 @@ def derivatives_of(aircraft: Aircraft, speed: float, density: float) -> np.ndarr
 
     Parameters
     ----------
-    aircraft : lidar_mi.experiment.schema.encounter.Aircraft
+    aircraft : lidar_mi.schema.encounter.Aircraft
     speed : float
         V, m/s.
     density : float

@@ -29,7 +29,7 @@ from lidar_mi.encounter.strips import (
     roll_damping,
     wing_strips,
 )
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 
 # z, vertical speed, pitch, pitch rate, roll, roll rate
 _Z, _HEAVE, _ROLL, _STATES = 0, slice(1, 4), slice(4, 6), 6
@@ -40,8 +40,8 @@ class HeaveModel:
 
     Parameters
     ----------
-    aircraft : lidar_mi.experiment.schema.encounter.Aircraft
-    path : lidar_mi.experiment.schema.encounter.Path
+    aircraft : lidar_mi.schema.encounter.Aircraft
+    path : lidar_mi.schema.encounter.Path
         Speed and altitude.
     """
 

@@ -37,9 +37,9 @@ from lidar_mi.encounter.strips import (
     wing_strips,
 )
 from lidar_mi.errors import InputError, one_line
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
 from lidar_mi.instrument.motion import attitude
 from lidar_mi.io.jsbsim_files import AXES
+from lidar_mi.schema.encounter import Aircraft, Path
 
 if TYPE_CHECKING:
     from jsbsim import FGFDMExec
@@ -57,9 +57,9 @@ class JSBSimAircraft:
 
     Parameters
     ----------
-    aircraft : lidar_mi.experiment.schema.encounter.Aircraft
+    aircraft : lidar_mi.schema.encounter.Aircraft
         Its model, the lift slope of the sections, the rate of the controls.
-    path : lidar_mi.experiment.schema.encounter.Path
+    path : lidar_mi.schema.encounter.Path
         Speed, climb angle and altitude.
 
     Raises

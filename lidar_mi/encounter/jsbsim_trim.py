@@ -13,8 +13,8 @@ import numpy as np
 from scipy.constants import foot
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.encounter import Path
 from lidar_mi.io.jsbsim_files import shipped_aircraft, write_aircraft_in_wake
+from lidar_mi.schema.encounter import Path
 
 if TYPE_CHECKING:
     from jsbsim import FGFDMExec, FGLogger
@@ -50,7 +50,7 @@ def check_aeroplane(name: str, path: Path) -> None:
     ----------
     name : str
         Of an aircraft of JSBSim.
-    path : lidar_mi.experiment.schema.encounter.Path
+    path : lidar_mi.schema.encounter.Path
 
     Raises
     ------
@@ -92,7 +92,7 @@ def trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec
     ----------
     name : str
         Of an aircraft of JSBSim.
-    path : lidar_mi.experiment.schema.encounter.Path
+    path : lidar_mi.schema.encounter.Path
     flap_settings : sequence of float
         0 to 1, in the order in which they are tried; see `LARGEST_INCIDENCE`.
 

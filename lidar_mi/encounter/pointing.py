@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.instrument.motion import PLACES, Pose
 from lidar_mi.instrument.reported import Reported, reported_pose
+from lidar_mi.schema.experiment import Experiment
 
 
 def pointing_error(experiment: Experiment, number: int, time: float) -> Rotation | None:

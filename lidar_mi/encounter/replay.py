@@ -22,10 +22,10 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import value_at
 from lidar_mi.experiment.export_flight import FLIGHT_FILES
 from lidar_mi.experiment.folder.records import read_record
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import in_si, settings
 from lidar_mi.io.netcdf import read_netcdf
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import in_si, settings
 
 NOT_RECORDED = "the recorded flight has no estimate of this scan"
 

@@ -22,10 +22,10 @@ from lidar_mi.encounter.folder import ANIMATION, VIDEO, EncounterFolder
 from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import dump
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.film import VIDEO_EXTRA, as_mp4, frame_as_webp, write_gif
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import dump
 
 # Frames of a report without a video.
 _SLIDER_FRAMES = 40

@@ -11,7 +11,7 @@ import numpy as np
 from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
 from lidar_mi.encounter.aircraft import LARGEST_ROLL, AircraftState, Commands, Limits, deflected
 from lidar_mi.encounter.strips import Loads, roll_damping, wing_strips
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 
 
 class RollModel:
@@ -19,8 +19,8 @@ class RollModel:
 
     Parameters
     ----------
-    aircraft : lidar_mi.experiment.schema.encounter.Aircraft
-    path : lidar_mi.experiment.schema.encounter.Path
+    aircraft : lidar_mi.schema.encounter.Aircraft
+    path : lidar_mi.schema.encounter.Path
         Speed and altitude.
     """
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidar_mi.experiment.schema.encounter import Encounter
+from lidar_mi.schema.encounter import Encounter
 
 if TYPE_CHECKING:  # slabs are described without torch
     from lidar_mi.retrieval.vortices.pair import VortexPairFit

@@ -14,9 +14,9 @@ from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.export_flight import FLIGHT_FILES
 from lidar_mi.experiment.folder.records import RECORD, read_record
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import check
 from lidar_mi.io.netcdf import read_netcdf
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import check
 
 MARGIN = 8
 """Planes before and after those of a flight in which the wind is known."""

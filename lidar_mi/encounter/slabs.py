@@ -18,12 +18,12 @@ from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.memory import Footprint
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.clear_air import clear_air
 from lidar_mi.experiment.truth.flows import analytic_axes
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import beam_reach
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.wake import Wake
 
 # Nodes of the texture: 64 MB in double precision.
 _TEXTURE_NODES = 8_000_000

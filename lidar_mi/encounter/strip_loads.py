@@ -19,8 +19,8 @@ from scipy.constants import g
 
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Wind
 from lidar_mi.encounter.strips import Loads, Strips, wake_loads
-from lidar_mi.experiment.schema.aerodynamics import Aerodynamics
 from lidar_mi.instrument.motion import attitude
+from lidar_mi.schema.aerodynamics import Aerodynamics
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,6 @@ from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.device import on_its_device
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages.rendering import PILOT_SEED
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector_noise import noisy_scan
@@ -39,6 +37,8 @@ from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.images.common_grid import resample
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import load_experiment
 
 NO_EARLIER_SCAN = "no earlier scan of this slab"
 LITTLE_OVERLAP = "the two scans have less than half of the image in common"

@@ -13,13 +13,13 @@ from lidar_mi.atmosphere.wake_period import Closing, Ends, one_period
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.encounter.aged_wake import analytic_wake, described_pair
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema.encounter import Encounter
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.extinction import extinction_of
 from lidar_mi.experiment.truth.flows import tracers_of
 from lidar_mi.io.wake_file import read_wake
+from lidar_mi.schema.encounter import Encounter
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.wake import Wake
 
 
 def encounter_of(experiment: Experiment) -> Encounter:

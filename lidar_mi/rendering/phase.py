@@ -63,7 +63,7 @@ def scatterer(
 
     Parameters
     ----------
-    scattering : lidar_mi.experiment.schema.scattering.Scattering
+    scattering : lidar_mi.schema.scattering.Scattering
         Its own albedo, if given, replaces that of the scatterers.
     folder : path
         Of the tables.

@@ -21,8 +21,8 @@ from lidar_mi.assessment.report.page import Film, page
 from lidar_mi.experiment import study
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.io.film import frame_as_webp
+from lidar_mi.schema import reading as config
 from tests.support import figure_rules, page_rules
 from tests.support.campaign_results import campaign, sweep
 from tests.support.encounter_results import made_up_flights

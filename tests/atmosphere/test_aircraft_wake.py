@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from lidar_mi.atmosphere.aircraft_wake import TYPES, wake_of
-from lidar_mi.experiment.schema.wake import VortexPair
+from lidar_mi.schema.wake import VortexPair
 
 
 def test_the_pair_carries_the_aircraft():

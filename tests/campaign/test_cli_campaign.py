@@ -12,7 +12,7 @@ from lidar_mi.campaign.engine import prepare_campaign
 from lidar_mi.campaign.slurm import slurm_cluster
 from lidar_mi.cli.app import main
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.shipped import campaigns
+from lidar_mi.schema.shipped import campaigns
 from tests.support.campaigns import described
 
 

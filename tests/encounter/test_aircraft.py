@@ -10,7 +10,7 @@ import pytest
 from lidar_mi.encounter.aircraft import AircraftState, Commands, Limits, deflected, loads_in_wind
 from lidar_mi.encounter.strips import fin_strips, wing_strips
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.reading import load_experiment
+from lidar_mi.schema.reading import load_experiment
 
 WING = wing_strips(28.9, 108.8, 5.3)
 

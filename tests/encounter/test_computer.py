@@ -10,8 +10,8 @@ import lidar_mi as lm
 from lidar_mi.encounter.computer import Cores
 from lidar_mi.encounter.estimate import SKIPPED
 from lidar_mi.encounter.estimator import SlabEstimate
-from lidar_mi.experiment.schema.reading import check
 from lidar_mi.retrieval.vortices.acceptance import no_fit
+from lidar_mi.schema.reading import check
 from tests.support.encounters import small_encounter
 from tests.support.synthetic_lidar import encounter_keys
 

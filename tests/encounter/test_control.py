@@ -21,7 +21,7 @@ from lidar_mi.encounter.control import (
 )
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 
 STEP = 1 / 30
 CROSSING = np.tan(np.radians(10))

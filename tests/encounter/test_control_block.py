@@ -28,9 +28,9 @@ from lidar_mi.encounter.sensor_samples import estimated_gusts, flights_in, sampl
 from lidar_mi.encounter.slab_recorder import SlabRecorder
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.reading import check, settings
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.yaml import to_yaml
+from lidar_mi.schema.reading import check, settings
 from tests.support.markov_chain import chain
 from tests.support.synthetic_lidar import encounter_keys
 

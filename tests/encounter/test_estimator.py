@@ -9,7 +9,7 @@ from benchmarks.cases import drifting_pair_images, vortex_pair_images
 from benchmarks.realtime import UNFORESEEN
 from lidar_mi.encounter.estimate import SKIPPED
 from lidar_mi.encounter.estimator import Estimator
-from lidar_mi.experiment.schema.reading import load_experiment
+from lidar_mi.schema.reading import load_experiment
 from tests.support.vortex_pairs import uneven, vector
 
 DT = 0.1

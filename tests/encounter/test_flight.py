@@ -14,7 +14,7 @@ from lidar_mi.encounter.aircraft import Commands
 from lidar_mi.encounter.flight import aircraft_of, simulate_flights
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
 

@@ -17,9 +17,9 @@ from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.reading import check
 from lidar_mi.instrument.scan import Scan
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.reading import check
 from tests.support.command_line import in_process
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 

@@ -21,7 +21,7 @@ from lidar_mi.encounter.heave import aileron_lift, derivatives_of, wing_place
 from lidar_mi.encounter.heave_model import HeaveModel
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 
 SPEED, AREA, SPAN, MASS = 75.0, 108.8, 28.9, 48500.0
 CHORD, RATIO = AREA / SPAN, SPAN**2 / AREA

@@ -19,7 +19,7 @@ from lidar_mi.encounter.preview import preview_in
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import encounter_keys
 
 

@@ -24,7 +24,7 @@ from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 
 pytest.importorskip("jsbsim")
 

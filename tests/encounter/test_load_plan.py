@@ -18,7 +18,7 @@ from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.planning import KNOTS, TRAVEL, least_travel
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads, wake_loads
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 
 STEP, SPEED, LENGTH, GUST = 0.02, 75.0, 100.0, 10.0
 ENTRY = 3.0  # s

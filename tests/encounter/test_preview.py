@@ -11,7 +11,7 @@ from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.encounter.aircraft import AircraftState
 from lidar_mi.encounter.preview import WakeTracker
 from lidar_mi.encounter.wake import wake_along_path
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
 PERIOD, STRIDE = 0.1, 7.5

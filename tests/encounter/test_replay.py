@@ -16,7 +16,7 @@ from lidar_mi.encounter.replay import NOT_RECORDED, recorded_flight, recorded_li
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.command_line import in_process
 from tests.support.synthetic_lidar import STDERR, SyntheticLidar, encounter_keys
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from lidar_mi.encounter.aircraft import Commands
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 
 
 def model(**aircraft):

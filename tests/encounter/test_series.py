@@ -14,7 +14,7 @@ from lidar_mi.encounter.preview import Slab, WakeTracker
 from lidar_mi.encounter.series import QUANTITIES, FlightRecorder, flights_dataset, track_dataset
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.encounter.wake import wake_along_path
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import STDERR, SyntheticLidar, encounter_keys
 
 

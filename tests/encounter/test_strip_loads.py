@@ -16,8 +16,8 @@ from lidar_mi.encounter.aircraft import loads_in_wind
 from lidar_mi.encounter.heave_model import HeaveModel
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strip_loads import KUESSNER, WAGNER, Memory, StripLoads
-from lidar_mi.experiment.schema.aerodynamics import Aerodynamics
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.aerodynamics import Aerodynamics
+from lidar_mi.schema.encounter import Aircraft, Path
 
 FREQUENCIES = np.array([0.001, 0.01, 0.03, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0])
 MASS = 48500.0

@@ -9,7 +9,7 @@ from lidar_mi.encounter.aircraft import Commands
 from lidar_mi.encounter.user_controller import name_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import encounter_keys
 
 

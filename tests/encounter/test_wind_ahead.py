@@ -21,10 +21,10 @@ from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.encounter.wind_ahead import WindAhead
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
 from lidar_mi.retrieval.along_path.vectors import slab_vectors
 from lidar_mi.retrieval.vortices.model import widened
 from lidar_mi.retrieval.vortices.model import wind as pair_wind
+from lidar_mi.schema.reading import check
 from tests.support.slab_winds import STRIDE, Slabs, calm, turbulent
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 

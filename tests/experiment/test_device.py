@@ -13,9 +13,9 @@ from lidar_mi.encounter.virtual_lidar import VirtualLidar
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import device, run
 from lidar_mi.experiment.device import devices_in_words, on_its_device
-from lidar_mi.experiment.schema.reading import settings
 from lidar_mi.rendering.settings import VARIANTS
 from lidar_mi.rendering.variant import has_cuda
+from lidar_mi.schema.reading import settings
 from tests.support.encounters import small_encounter
 from tests.support.experiments import check, small
 

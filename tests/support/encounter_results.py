@@ -8,7 +8,7 @@ import xarray as xr
 from lidar_mi.encounter.flight import FlightData, simulate_flights
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
 

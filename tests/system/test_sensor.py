@@ -24,7 +24,6 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import judged
 from lidar_mi.experiment.preflight import check
 from lidar_mi.experiment.run import prepare, run
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages.sensor import (
     combine_settings,
     doppler_alone,
@@ -33,6 +32,7 @@ from lidar_mi.experiment.stages.sensor import (
 )
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
+from lidar_mi.schema import reading as config
 from tests.support.experiments import (
     QUICK_DOPPLER,
     leave_out_figures,

@@ -24,7 +24,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment import study
 from lidar_mi.experiment.describe import sections
-from lidar_mi.experiment.schema import reading as config
+from lidar_mi.schema import reading as config
 from tests.support.experiments import leave_out_figures
 
 SCENES = Path(str(files("lidar_mi.scenes"))).resolve()

@@ -8,12 +8,11 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, Plate, mark_cores, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, mark_cores, save_all
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, line_places
 

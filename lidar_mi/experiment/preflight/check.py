@@ -18,10 +18,6 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.preflight.coherent import coherent_rows, passage_rows
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.sensor import Sensor
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_remarks import window_reach
 from lidar_mi.experiment.stages.light_budget import (
     backscatter_fractions,
@@ -40,6 +36,10 @@ from lidar_mi.progress import Notice, without_warnings
 from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.samples import Samples
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.sensor import Sensor
+from lidar_mi.schema.wake import Wake
 from lidar_mi.units import shown
 
 LEAST_SHOWN = 0.5

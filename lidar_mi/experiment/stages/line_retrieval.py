@@ -9,13 +9,13 @@ from threadpoolctl import threadpool_limits
 from lidar_mi.atmosphere.vortex import Model
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.coherent import CoherentDoppler
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.coherent_lines import coherent_lidar, ring_fraction, true_vortices
 from lidar_mi.experiment.truth.passing_wake import PassingWake
 from lidar_mi.instrument.coherent.measurement import START
 from lidar_mi.instrument.coherent.scans import directions
+from lidar_mi.schema.coherent import CoherentDoppler
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.wake import Wake
 
 _UNEVEN_ECHO = 1 << 8
 _UNEVEN, _PART = 1.5, 0.99

@@ -16,17 +16,17 @@ from lidar_mi.assessment.metrics.errors import commonest_flag
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.sensor import Sensor
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.sensor import Sensor
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 # Lines of sight per least-squares vector of the Doppler lidar alone: one and those around it.
 _AROUND = 9

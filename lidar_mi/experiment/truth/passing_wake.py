@@ -21,14 +21,14 @@ from lidar_mi.atmosphere.wake_decay import sarpkaya_decay_time
 from lidar_mi.atmosphere.wake_path import Components
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema.coherent import AirAtTheGround, CoherentDoppler, Passage
-from lidar_mi.experiment.schema.wake import ExtinctionMapping, VortexPair, Wake
 from lidar_mi.experiment.truth.extinction import extinction_of
 from lidar_mi.experiment.truth.flows import tracers_of
 from lidar_mi.experiment.truth.turbulent_air import turbulent_air
 from lidar_mi.instrument.coherent.weighting import Signal
 from lidar_mi.io.wake_file import read_wake
+from lidar_mi.schema.coherent import AirAtTheGround, CoherentDoppler, Passage
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.wake import ExtinctionMapping, VortexPair, Wake
 
 _OUTER = (15.0, 12.0, 10.0, 8.0)  # m, of the rings over which circulation is averaged
 

@@ -14,8 +14,8 @@ from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.preflight.check import sections
 from lidar_mi.experiment.run import finish, prepare
-from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.light_budget import light_budget
+from lidar_mi.schema import reading
 from tests.support.command_line import in_process, words_of
 
 WAKE = {

@@ -13,7 +13,6 @@ from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.reading import check
 from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
 from lidar_mi.experiment.stages.ring_images import exposed_frames, ring_instrument
 from lidar_mi.experiment.stages.ring_instrument import pixel_noise
@@ -22,6 +21,7 @@ from lidar_mi.experiment.stages.ring_velocities import speeds_to_laser
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
+from lidar_mi.schema.reading import check
 
 # 4 x 4 of the default camera's pixels in one
 CAMERA = {"width": 240, "height": 195, "pixel": "29.6 um"}

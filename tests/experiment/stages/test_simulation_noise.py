@@ -16,8 +16,6 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.preflight.cost import with_number
 from lidar_mi.experiment.run import finish, prepare
-from lidar_mi.experiment.schema import reading
-from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.stages.rendering import (
     IMAGES,
@@ -29,6 +27,8 @@ from lidar_mi.experiment.stages.rendering import (
 from lidar_mi.experiment.stages.simulation_noise import simulation_noise
 from lidar_mi.experiment.stages.winds import cross_flow_winds
 from lidar_mi.rendering.samples import noise_ratio
+from lidar_mi.schema import reading
+from lidar_mi.schema.reading import load_experiment
 
 pytestmark = pytest.mark.usefixtures("variant")
 

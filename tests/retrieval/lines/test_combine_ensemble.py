@@ -22,10 +22,10 @@ from scipy.ndimage import gaussian_filter
 from lidar_mi.atmosphere.texture import gaussian_field
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.experiment.input_files import find_file
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
 from lidar_mi.retrieval.lines.combine import combine
+from lidar_mi.schema.input_files import find_file
 
 Y, Z = np.arange(-49.0, 49.1), np.arange(-31.0, 31.1)
 GRID_Y, GRID_Z = np.meshgrid(Y, Z)

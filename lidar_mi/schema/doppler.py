@@ -5,14 +5,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from lidar_mi.experiment.schema.rings import Assumed, Reference, RingCalibration
-from lidar_mi.experiment.schema.section import Section, each_once
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.rendering.settings import FringeSettings
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
+from lidar_mi.schema.rings import Assumed, Reference, RingCalibration
+from lidar_mi.schema.section import Section, each_once
 from lidar_mi.units import Number, Speed, Temperature, Within, to_si
 
 

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lidar_mi.experiment.schema.keys import OF_A_FILE, explain, keys_of, sections
-from lidar_mi.experiment.schema.reading import read_keys
 from lidar_mi.io.yaml import to_yaml_line
+from lidar_mi.schema.keys import OF_A_FILE, explain, keys_of, sections
+from lidar_mi.schema.reading import read_keys
 
 _WIDTH = 100
 _HEAD = """\

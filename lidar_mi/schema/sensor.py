@@ -4,10 +4,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidar_mi.experiment.schema.section import Section
 from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors
 from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.section import Section
 from lidar_mi.units import Frequency, Speed, Time, Within
 
 

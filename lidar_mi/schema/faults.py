@@ -8,7 +8,7 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from lidar_mi.experiment.schema.section import section_in, tagged_section
+from lidar_mi.schema.section import section_in, tagged_section
 from lidar_mi.units import Unit, Within, to_si
 
 A_NAME = "at most 100 letters, digits, _, . and -, a letter or digit first"

@@ -6,8 +6,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 from scipy.constants import speed_of_light
 
-from lidar_mi.experiment.schema.air import LogarithmicShear, Turbulence
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.air import LogarithmicShear, Turbulence
+from lidar_mi.schema.section import Section
 from lidar_mi.units import (
     Angle,
     AngularRate,

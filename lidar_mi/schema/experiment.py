@@ -9,22 +9,22 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
-from lidar_mi.experiment.schema.coherent import CoherentDoppler
-from lidar_mi.experiment.schema.doppler import Doppler, at_site
-from lidar_mi.experiment.schema.encounter import Encounter
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.scattering import Scattering
-from lidar_mi.experiment.schema.section import Section
-from lidar_mi.experiment.schema.sensor import Sensor
-from lidar_mi.experiment.schema.site import Site
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.coherent import CoherentDoppler
+from lidar_mi.schema.doppler import Doppler, at_site
+from lidar_mi.schema.encounter import Encounter
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.scattering import Scattering
+from lidar_mi.schema.section import Section
+from lidar_mi.schema.sensor import Sensor
+from lidar_mi.schema.site import Site
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 from lidar_mi.tables import Table, Tabular
 from lidar_mi.units import AS_GIVEN, Within
 

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.section import Section
 from lidar_mi.units import Angle, Length, Number, Shear, Speed, Time, Within, quantity
 
 _Place = Annotated[Length, Within(-1e5, 1e5, "an encounter")]

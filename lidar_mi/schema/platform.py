@@ -4,9 +4,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from lidar_mi.experiment.schema.section import Section
 from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
+from lidar_mi.schema.section import Section
 from lidar_mi.units import Speed, Time, Within
 
 

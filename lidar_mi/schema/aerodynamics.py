@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.section import Section
 from lidar_mi.units import Number, Within
 
 

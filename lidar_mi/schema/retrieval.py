@@ -4,8 +4,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidar_mi.experiment.schema.section import Section, each_once
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.section import Section, each_once
 from lidar_mi.units import Angle, Length, Number, Within
 
 

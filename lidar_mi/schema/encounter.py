@@ -5,10 +5,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from lidar_mi.experiment.schema.aerodynamics import Aerodynamics
-from lidar_mi.experiment.schema.air import Air
-from lidar_mi.experiment.schema.heave import HeaveKeys
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.aerodynamics import Aerodynamics
+from lidar_mi.schema.air import Air
+from lidar_mi.schema.heave import HeaveKeys
+from lidar_mi.schema.section import Section
 from lidar_mi.units import (
     Angle,
     AngularRate,

@@ -10,7 +10,7 @@ from scipy.constants import c
 
 import lidar_mi as lm
 from lidar_mi.experiment.run import prepare
-from lidar_mi.experiment.shipped import instrument_file, instruments
+from lidar_mi.schema.shipped import instrument_file, instruments
 
 PAGE = Path(__file__).parents[2] / "docs" / "instruments.md"
 # keys of the instrument, whose values are numbers with units

@@ -7,9 +7,9 @@ that is no longer found beside the experiment; a message that does not name the 
 import pytest
 
 import lidar_mi as lm
-from lidar_mi.experiment.schema.new_file import new_file
-from lidar_mi.experiment.schema.reading import dump, load, load_variants
-from lidar_mi.experiment.shipped import experiment_file, shipped_file
+from lidar_mi.schema.new_file import new_file
+from lidar_mi.schema.reading import dump, load, load_variants
+from lidar_mi.schema.shipped import experiment_file, shipped_file
 
 HERE = "name: here\nwake: {file: air.nc, time: 40 s}\nscan: {range: 300 m}\n"
 

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.section import Section
 from lidar_mi.units import Number, Within
 
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.section import Section
 from lidar_mi.units import Length, Within
 
 

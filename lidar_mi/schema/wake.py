@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from lidar_mi.atmosphere.aircraft_wake import TYPES, aircraft_type, wake_of
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.section import Section
 from lidar_mi.units import (
     Circulation,
     Extinction,

@@ -10,9 +10,9 @@ import yaml
 from pydantic import BaseModel
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.coherent import CoherentDoppler
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import check, dump, load
+from lidar_mi.schema.coherent import CoherentDoppler
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import check, dump, load
 from lidar_mi.units import Unit, Within
 
 LEAST = "name: least\nwake: {file: wake.nc}\n"

@@ -5,7 +5,7 @@ from typing import Annotated, Self, TypeVar
 from pydantic import Field, model_validator
 
 from lidar_mi.description import Description
-from lidar_mi.experiment.schema.section import Section
+from lidar_mi.schema.section import Section
 from lidar_mi.units import Angle, Frequency, Length, Number, Temperature, Within
 
 _Tilt = Annotated[Angle, Within(-0.5, 0.5, "as of the camera")]

@@ -21,10 +21,10 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.faults import A_NAME
-from lidar_mi.experiment.schema.section import section_in, sections_in, tagged_section
 from lidar_mi.io.yaml import to_yaml_line
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.faults import A_NAME
+from lidar_mi.schema.section import section_in, sections_in, tagged_section
 from lidar_mi.units import Unit, Within, usual
 
 OF_A_FILE = {

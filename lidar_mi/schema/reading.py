@@ -11,11 +11,11 @@ from pydantic import ValidationError
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.experiment import BACKSCATTER, NAME, Experiment
-from lidar_mi.experiment.schema.faults import first_fault
-from lidar_mi.experiment.schema.site import Site
-from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
+from lidar_mi.schema.experiment import BACKSCATTER, NAME, Experiment
+from lidar_mi.schema.faults import first_fault
+from lidar_mi.schema.shipped import experiment_file
+from lidar_mi.schema.site import Site
 from lidar_mi.units import AS_GIVEN
 
 RESERVED_NAMES = (
