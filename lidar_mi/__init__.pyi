@@ -1,11 +1,11 @@
 """The public names: what ``import lidar_mi as lm`` offers, and where each is made."""
 
+from .aircraft.pose import AircraftPose
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
-from .encounter.export_control import export_control
+from .encounter.control_block.export import export_control
 from .encounter.fly import Flights, fly
-from .encounter.pose import AircraftPose
-from .encounter.virtual_lidar import VirtualLidar
+from .encounter.lidar.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los

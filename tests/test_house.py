@@ -20,13 +20,13 @@ PACKAGE = ROOT / "lidar_mi"
 ARROWS = {
     "system": set(),
     "atmosphere": set(),
-    "instrument": {"atmosphere.line"},
-    "retrieval": {"atmosphere.vortex", "instrument.coherent.weighting"},
+    "instrument": {"atmosphere.scattering.line"},
+    "retrieval": {"atmosphere.vortices.vortex", "instrument.coherent.weighting"},
     "io": {
-        "atmosphere.aerosols",
-        "atmosphere.particle_scattering",
+        "atmosphere.scattering.aerosols",
+        "atmosphere.scattering.particle_scattering",
         "atmosphere.regrid",
-        "atmosphere.scattering",
+        "atmosphere.scattering.tables",
         "retrieval.vortices.model",
         "retrieval.vortices.pair",
     },
@@ -34,6 +34,7 @@ ARROWS = {
     "inversion": {"instrument", "rendering", "retrieval"},
     "schema": {"atmosphere", "instrument", "io", "rendering.settings", "retrieval.method_names"},
     "assessment": {"atmosphere", "instrument", "retrieval", "io", "schema"},
+    "aircraft": {"atmosphere", "instrument", "io", "schema"},
     "experiment": {
         "atmosphere",
         "instrument",
@@ -65,6 +66,7 @@ ARROWS = {
         "assessment",
         "io",
         "schema",
+        "aircraft",
         "experiment",
         "system",
     },
@@ -75,6 +77,8 @@ gate; `io` builds those
 that its files hold; only `experiment` and what lies above it see all."""
 
 FLOORS = {
+    "atmosphere": (("scattering",), ("vortices",), ("air",)),
+    "encounter": (("lidar",), ("ahead",), ("control_block",)),
     "assessment": (("metrics",), ("figures",), ("report",)),
     "experiment": (("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (

@@ -55,7 +55,7 @@ def complete_scene(incomplete: str) -> list[str]:
 
 def complete_contents(incomplete: str) -> list[str]:
     """Files and folders that can be shown, and the names of scatterers."""
-    from lidar_mi.atmosphere.aerosols import AEROSOLS
+    from lidar_mi.atmosphere.scattering.aerosols import AEROSOLS
 
     return starting(incomplete, ("molecules", *AEROSOLS), "*.exr", "*.nc", "*.hpl", "*.txt")
 

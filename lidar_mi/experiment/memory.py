@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lidar_mi.atmosphere.wake import MOST_NODES
+from lidar_mi.atmosphere.vortices.wake import MOST_NODES
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, TypedDict
 
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.pointing import ScanPointing
 from lidar_mi.assessment.metrics.requirements import RequirementTable
 from lidar_mi.assessment.metrics.rings import RingBudget
 from lidar_mi.assessment.metrics.safety import ScanSafety
-from lidar_mi.atmosphere.line import Line
+from lidar_mi.atmosphere.scattering.line import Line
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.experiment.graph import Graph, Stage
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.stages.coherent_lines import check_scan, coherent_lines, passing_air

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import xarray as xr
 from rich.console import Console
 
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.experiment.folder.records import LOG, METRICS, REPORT, STUDY
 from lidar_mi.experiment.folder.run_folder import FIGURES, refuse_strangers
 from lidar_mi.experiment.log import Log, silent

@@ -138,8 +138,8 @@ def at_site(lidar: DopplerLidar, altitude: float, band: str) -> DopplerLidar:
     is that of molecules.
     """
     # loaded only where it is needed
-    from lidar_mi.atmosphere.molecules import molecular_scattering
-    from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+    from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+    from lidar_mi.atmosphere.scattering.molecules import molecular_scattering
 
     stated = lidar.model_fields_set
     found = {"altitude": altitude}

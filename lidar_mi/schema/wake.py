@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from lidar_mi.atmosphere.aircraft_wake import TYPES, aircraft_type, wake_of
+from lidar_mi.atmosphere.vortices.aircraft_wake import TYPES, aircraft_type, wake_of
 from lidar_mi.schema.section import Section
 from lidar_mi.units import (
     Circulation,
@@ -74,7 +74,7 @@ class VortexPair(Section):
                     raise ValueError(f"{name}: not allowed without aircraft")
             return self
         # loaded only where it is needed
-        from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+        from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
 
         kind = aircraft_type(self.aircraft)
         mass = kind.landing_mass if self.mass is None else self.mass

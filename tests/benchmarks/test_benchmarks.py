@@ -47,7 +47,7 @@ from benchmarks import (
     transient,
     velocimetry,
 )
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 
 
 def lines(comparison):

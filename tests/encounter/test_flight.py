@@ -8,12 +8,13 @@ sees the vortices, scans of slabs that nobody meets, an upset that is an error.
 import numpy as np
 import pytest
 
+from lidar_mi.aircraft.models import aircraft_of
+from lidar_mi.aircraft.state import Commands
 from lidar_mi.assessment.metrics.encounter import MET, encounter_metrics
 from lidar_mi.assessment.report.encounter import encounter_answer
-from lidar_mi.encounter.aircraft import Commands
-from lidar_mi.encounter.flight import aircraft_of, simulate_flights
-from lidar_mi.encounter.wake import wake_along_path
+from lidar_mi.encounter.flight import simulate_flights
 from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
 from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 

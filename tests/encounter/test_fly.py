@@ -14,9 +14,9 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.cli.fly import fly as command
 from lidar_mi.encounter.check import geometry
-from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.reading import check

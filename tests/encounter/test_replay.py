@@ -10,12 +10,12 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
-from lidar_mi.encounter.aircraft import Commands
-from lidar_mi.encounter.preview import WakeTracker
+from lidar_mi.aircraft.state import Commands
+from lidar_mi.encounter.ahead.preview import WakeTracker
 from lidar_mi.encounter.replay import NOT_RECORDED, recorded_flight, recorded_lidar
-from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
 from lidar_mi.schema.reading import check
 from tests.support.command_line import in_process
 from tests.support.synthetic_lidar import STDERR, SyntheticLidar, encounter_keys

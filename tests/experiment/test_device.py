@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import lidar_mi as lm
-from lidar_mi.encounter.virtual_lidar import VirtualLidar
+from lidar_mi.encounter.lidar.virtual_lidar import VirtualLidar
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import device, run
 from lidar_mi.experiment.device import devices_in_words, on_its_device
@@ -106,7 +106,7 @@ def computed(monkeypatch):
         return torch.device("cpu")
 
     monkeypatch.setattr("lidar_mi.retrieval.checks.device_of", device_of)
-    for module in ("lidar_mi.experiment.run", "lidar_mi.encounter.virtual_lidar"):
+    for module in ("lidar_mi.experiment.run", "lidar_mi.encounter.lidar.virtual_lidar"):
         monkeypatch.setattr(f"{module}.on_its_device", lambda experiment: experiment)
     return names
 

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi import load_experiment
-from lidar_mi.atmosphere.wake import resample
+from lidar_mi.atmosphere.vortices.wake import resample
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.memory import PER_ADVECTED, Footprint

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.molecules import molecular_table
+from lidar_mi.atmosphere.scattering.molecules import molecular_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar

@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.stats import norm
 
 from lidar_mi.atmosphere.texture import gaussian_field
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.assessment.metrics.sensor import limit_metrics, vector_metrics
 from lidar_mi.assessment.report import sensor as sensor_report
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log

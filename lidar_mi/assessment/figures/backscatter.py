@@ -29,9 +29,9 @@ from lidar_mi.assessment.figures.plates import (
     speed_of,
 )
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import deviations
 from lidar_mi.assessment.metrics.names import Source
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.plots import ARROWS, arrow_length
 
 

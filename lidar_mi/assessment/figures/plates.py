@@ -14,7 +14,7 @@ from matplotlib.quiver import Quiver
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from lidar_mi.assessment.figures.seen import TRUE_CORE, seen
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.png import write_png
 

@@ -13,7 +13,7 @@ from lidar_mi.assessment.figures.normalised_errors import (
     draw_normalised_errors,
 )
 from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, mark_cores, save_all
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, line_places
 
 _SPEED = "m s$^{-1}$"

@@ -23,7 +23,7 @@ from lidar_mi.assessment.figures.plates import (
     save_all,
 )
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 
 _SPEED = "m s$^{-1}$"
 _COMPONENTS = ("u", "v", "w")

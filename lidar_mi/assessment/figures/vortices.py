@@ -19,8 +19,8 @@ from lidar_mi.assessment.figures.plates import (
     speed_of,
 )
 from lidar_mi.assessment.figures.seen import TRUE_CORE
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.plots import ARROWS, arrow_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 from lidar_mi.retrieval.lines.combine import CombinedFlag
 
 COMPONENTS = ("u", "v", "w")

@@ -6,12 +6,12 @@ from typing import Any
 from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.names import Source, has_no_skill, wind_key
 from lidar_mi.assessment.metrics.requirements import Judged
 from lidar_mi.assessment.report.compliance import compliance
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.assessment.report.simulation import samples_of
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.schema.experiment import Experiment
 
 # rows of the table of results: key, name, unit

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
 from lidar_mi.assessment.metrics.requirements import RequirementTable, look_ahead
+from lidar_mi.atmosphere.vortices.cores import find_cores
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.graph import call

@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 from scipy.constants import c as SPEED_OF_LIGHT
 
-from lidar_mi.atmosphere.vortex import Model, Vortex, angular_velocity
-from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
+from lidar_mi.atmosphere.vortices.vortex import Model, Vortex, angular_velocity
+from lidar_mi.atmosphere.vortices.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.truth.passing_wake import PassingWake, echo, passing_wake

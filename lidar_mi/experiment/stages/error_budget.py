@@ -7,7 +7,6 @@ from typing import Any
 
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.assessment.metrics.error_budget import (
     error_budget,
     image_scale,
@@ -16,6 +15,7 @@ from lidar_mi.assessment.metrics.error_budget import (
 )
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.advection import advect, advect_to
+from lidar_mi.atmosphere.vortices.cores import Core, find_cores
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
+from lidar_mi.atmosphere.vortices.cores import find_cores
 from lidar_mi.description import Description
 from lidar_mi.experiment.stages.brightness import overlap
 from lidar_mi.experiment.stages.light_budget import (

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from lidar_mi.atmosphere.vortex import Model
+from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.stages.coherent_lines import coherent_lidar, ring_fraction, true_vortices

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, find_cores
+from lidar_mi.atmosphere.vortices.cores import Core, find_cores
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import But, Only, Store
 from lidar_mi.experiment.log import Log

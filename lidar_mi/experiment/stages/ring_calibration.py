@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidar_mi.atmosphere.line import laser_line
+from lidar_mi.atmosphere.scattering.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.stages.ring_images import (

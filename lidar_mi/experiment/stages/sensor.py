@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi import __version__
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import commonest_flag
 from lidar_mi.assessment.metrics.names import Source
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.truth.flows import moves_along

@@ -5,8 +5,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from lidar_mi.atmosphere.molecules import molecular_scattering
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.scattering.molecules import molecular_scattering
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Only
 from lidar_mi.instrument.lidar import BackscatterLidar

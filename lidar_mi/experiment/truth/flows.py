@@ -11,8 +11,8 @@ import xarray as xr
 
 from lidar_mi.atmosphere.advection import carrier
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
-from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
-from lidar_mi.atmosphere.wake import centre, check_nodes, resample
+from lidar_mi.atmosphere.vortices.vortex import pair_wake, vortex_pair
+from lidar_mi.atmosphere.vortices.wake import centre, check_nodes, resample
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Guard, call
 from lidar_mi.experiment.log import Log

@@ -12,14 +12,14 @@ import numpy as np
 import xarray as xr
 from scipy.integrate import cumulative_trapezoid
 
-from lidar_mi.assessment.metrics.cores import find_cores, ring_averages
 from lidar_mi.atmosphere.air.shear import LogarithmicShear
 from lidar_mi.atmosphere.air.turbulence import Turbulence
-from lidar_mi.atmosphere.ground_effect import PairAboveGround
-from lidar_mi.atmosphere.vortex import Vortex
-from lidar_mi.atmosphere.wake_decay import sarpkaya_decay_time
-from lidar_mi.atmosphere.wake_path import Components
-from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
+from lidar_mi.atmosphere.vortices.cores import find_cores, ring_averages
+from lidar_mi.atmosphere.vortices.ground_effect import PairAboveGround
+from lidar_mi.atmosphere.vortices.vortex import Vortex
+from lidar_mi.atmosphere.vortices.wake_decay import sarpkaya_decay_time
+from lidar_mi.atmosphere.vortices.wake_path import Components
+from lidar_mi.atmosphere.vortices.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.truth.extinction import extinction_of
 from lidar_mi.experiment.truth.flows import tracers_of

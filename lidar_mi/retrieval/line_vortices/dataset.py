@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.vortex import Model
+from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.retrieval.line_vortices.detection import Detection
 from lidar_mi.retrieval.line_vortices.fit import Fit
 from lidar_mi.retrieval.line_vortices.scan_plane import PlaneScan

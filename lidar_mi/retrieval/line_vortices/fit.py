@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from lidar_mi.atmosphere.vortex import Model
+from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.retrieval.line_vortices.swirl import OF_VORTEX, motion, node_angles, seen
 from lidar_mi.retrieval.line_vortices.turbulence import LENGTHS
 from lidar_mi.retrieval.line_vortices.window import Window

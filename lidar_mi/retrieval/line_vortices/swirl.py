@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from lidar_mi.atmosphere.vortex import LAMB_OSEEN_CONSTANT, Model
+from lidar_mi.atmosphere.vortices.vortex import LAMB_OSEEN_CONSTANT, Model
 from lidar_mi.instrument.coherent.weighting import CoherentLidar, range_weight
 
 OF_VORTEX = 4

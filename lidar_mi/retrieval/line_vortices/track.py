@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 import xarray as xr
 
-from lidar_mi.atmosphere.vortex import Model
+from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.retrieval.line_vortices.dataset import NUMBERS
 from lidar_mi.retrieval.line_vortices.swirl import OF_VORTEX, motion
 from lidar_mi.retrieval.vortices import kalman

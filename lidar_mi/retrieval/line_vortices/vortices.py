@@ -11,7 +11,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.atmosphere.vortex import Model
+from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.progress import Notice

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from lidar_mi.atmosphere.line import laser_line
+from lidar_mi.atmosphere.scattering.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log

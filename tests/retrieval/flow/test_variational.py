@@ -13,7 +13,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.cases import DT, SPACING, vortex_pair_images
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.bound import displacement_bound

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy
 
-from lidar_mi.atmosphere.vortex import tangential_speed
+from lidar_mi.atmosphere.vortices.vortex import tangential_speed
 from lidar_mi.instrument.coherent.weighting import range_weight
 from lidar_mi.retrieval.line_vortices.fit import Air, Assumptions, Problem, State, crossing_time
 from lidar_mi.retrieval.line_vortices.scan_plane import plane_scans

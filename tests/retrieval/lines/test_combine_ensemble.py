@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter
 
 from lidar_mi.atmosphere.texture import gaussian_field
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
 from lidar_mi.retrieval.lines.combine import combine

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.lines.common_time import at_common_time, estimated_drift

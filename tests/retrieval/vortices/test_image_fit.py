@@ -14,8 +14,8 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from benchmarks.cases import vortex_pair_images
-from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.atmosphere.wake_path import PairAlongPath
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.wake_path import PairAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.retrieval.images.spline import band_limited
