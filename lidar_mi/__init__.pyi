@@ -19,10 +19,10 @@ from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .rendering.labelled import to_xarray
 from .rendering.variant import use_variant
+from .retrieval.ground_vortices.vortices import fit_vortices_to_lines
+from .retrieval.ground_winds.winds import fit_winds_to_lines
 from .retrieval.images.common_grid import on_one_grid
 from .retrieval.images.quality import Flag
-from .retrieval.line_vortices.vortices import fit_vortices_to_lines
-from .retrieval.lines_of_sight.winds import fit_winds_to_lines
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
 from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines

@@ -83,10 +83,10 @@ FLOORS = {
     "experiment": (("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (
         ("extinction", "images", "rings"),
-        ("correlation", "channels", "lines", "lines_of_sight"),
+        ("correlation", "channels", "combined", "ground_winds"),
         ("flow", "defects"),
         ("along_path", "vortices"),
-        ("wind", "line_vortices"),
+        ("wind", "ground_vortices"),
     ),
 }
 """Folders of a room, the lowest floor first: each imports those of lower floors alone."""

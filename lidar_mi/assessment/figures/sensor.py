@@ -14,7 +14,7 @@ from lidar_mi.assessment.figures.normalised_errors import (
 )
 from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, mark_cores, save_all
 from lidar_mi.atmosphere.vortices.cores import Core
-from lidar_mi.retrieval.lines.vectors import COMPONENTS, line_places
+from lidar_mi.retrieval.combined.vectors import COMPONENTS, line_places
 
 _SPEED = "m s$^{-1}$"
 
@@ -27,8 +27,8 @@ def draw_all(
     Parameters
     ----------
     found : xr.Dataset or None
-        From `lidar_mi.retrieval.lines.combine.combine`, with the truth as u_true, v_true, w_true.
-        None: there is no wind.
+        From `combined.combine.combine`, with the truth as u_true, v_true, w_true. None: there is
+        no wind.
     lines : xr.Dataset
         From `lidar_mi.experiment.stages.lines.measure_lines`.
     """

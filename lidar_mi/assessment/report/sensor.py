@@ -9,7 +9,7 @@ from lidar_mi.assessment.metrics.requirements import Judged, look_ahead
 from lidar_mi.assessment.report.compliance import compliance
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.instrument.doppler_scan import PlatformErrors
-from lidar_mi.retrieval.lines.vectors import COMPONENTS
+from lidar_mi.retrieval.combined.vectors import COMPONENTS
 from lidar_mi.schema.experiment import Experiment
 
 

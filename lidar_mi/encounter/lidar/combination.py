@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.combined.combine import combine
 from lidar_mi.retrieval.common_error import with_common_error
-from lidar_mi.retrieval.lines.combine import combine
 
 
 @dataclass(frozen=True, eq=False)

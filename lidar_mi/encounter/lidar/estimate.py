@@ -25,8 +25,7 @@ class Estimate:
         Plane of the slab along the flight path, m.
     wind : xarray.Dataset or None, dims (z, y)
         v, w (m/s) with v_stderr, w_stderr, vw_correlation and flag; where there is a Doppler lidar,
-        u, v, w and their covariance from both (`lidar_mi.retrieval.lines.combine`). None before a
-        second scan.
+        u, v, w and their covariance from both (`combined.combine`). None before a second scan.
     pair : VortexPairFit or None
         The vortices in the slab's plane, at `time`; look at its `success` and `reasons` first.
     flags : tuple of str

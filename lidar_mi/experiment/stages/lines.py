@@ -27,7 +27,7 @@ from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_lines
 from lidar_mi.instrument.scan import Scan
-from lidar_mi.retrieval.lines.vectors import COMPONENTS
+from lidar_mi.retrieval.combined.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.schema.doppler import Doppler
 from lidar_mi.schema.input_files import find_file
