@@ -6,16 +6,19 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.vortices.cores import Core, Rings, find_cores, ring_averages
 from lidar_mi.atmosphere.vortices.vortex import Vortex
 from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
 from lidar_mi.atmosphere.vortices.wake_period import Closing, Ends, one_period
 from lidar_mi.atmosphere.vortices.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.truth.aged_wake import analytic_wake, described_pair
-from lidar_mi.experiment.truth.extinction import extinction_of
-from lidar_mi.experiment.truth.flows import tracers_of
-from lidar_mi.io.wake_file import read_wake
+from lidar_mi.experiment.truth.file_wake import (
+    Pairs,
+    pairs_in,
+    read_planes,
+    refuse_ages,
+    with_extinction,
+)
 from lidar_mi.schema.encounter import Encounter
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.input_files import find_file
@@ -74,19 +77,17 @@ def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> Vol
     if wake.second != "advect":
         value = wake.second if wake.stored is None else f"{wake.stored:g} s"
         raise InputError(f"wake.second: {value} is not allowed in an encounter; expected advect")
-    for key, given in (
-        ("age", encounter.wake.age),
-        ("decay_time", encounter.wake.decay_time),
-        ("dissipation_rate", encounter.wake.dissipation_rate),
-        ("crow.amplitude", encounter.wake.crow.amplitude),
-    ):
-        if given:
-            raise InputError(
-                f"encounter.wake.{key}: {given:g} is not allowed with wake.file; expected "
-                "wake.vortex_pair"
-            )
-    flow, cores, drift, _ = _period_of(wake, file, encounter, folder)
-    port, starboard = (tuple(_vortex(*one) for one in side) for side in cores)
+    aged = encounter.wake
+    refuse_ages(
+        "encounter.wake",
+        {
+            "age": aged.age,
+            "decay_time": aged.decay_time,
+            "dissipation_rate": aged.dissipation_rate,
+            "crow.amplitude": aged.crow.amplitude,
+        },
+    )
+    flow, (port, starboard), drift, _ = _period_of(wake, file, encounter, folder)
     both = [*port, *starboard]
     middle = np.mean([one.y for one in both]), np.mean([one.z for one in both])
     y, z = wake.centre or middle
@@ -109,7 +110,7 @@ def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> Vol
 
 def _period_of(
     wake: Wake, file: str, encounter: Encounter, folder: Path
-) -> tuple[xr.Dataset, "Sides", tuple[float, float], Closing]:
+) -> tuple[xr.Dataset, Pairs, tuple[float, float], Closing]:
     path = find_file(file, folder, "wake.file")
     # its time of change: a file that is written anew is read anew
     stamp, ends = path.stat().st_mtime_ns, encounter.wake
@@ -132,7 +133,7 @@ def described_wake(experiment: Experiment) -> list[tuple[str, str]]:
     along = wake_along_path(experiment)
     assert wake is not None and wake.file and isinstance(along, VolumeAlongPath)
     _, sides, _, closing = _period_of(wake, wake.file, encounter, experiment.folder)
-    strength = [np.array([abs(circulation) for _, circulation in side]) for side in sides]
+    strength = [np.array([abs(vortex.circulation) for vortex in side]) for side in sides]
     mean = float(np.mean(strength))
     rows = [("vortices when met", f"{mean:.4g} m^2/s, of {wake.file}, frozen in this state")]
     if closing.how == "uniform":
@@ -155,65 +156,14 @@ def described_wake(experiment: Experiment) -> list[tuple[str, str]]:
     return rows
 
 
-_OUTER = (15.0, 12.0, 10.0, 8.0)
-"""Outer radius of the rings over which circulation and drift of a vortex are averaged, m."""
-
-Section = tuple[Core, float]
-"""A core in a plane of a volume, and its circulation from 5 m to 15 m or less, m^2 s^-1."""
-
-
-Sides = tuple[list[Section], list[Section]]
-"""Port and starboard."""
-
-
 # check, flight and report need it again: cores in every plane take seconds to find
 @lru_cache(maxsize=2)
 def _volume(
     path: Path, stamp: int, keys: str, ends: Ends, length: float
-) -> tuple[xr.Dataset, Sides, tuple[float, float], Closing]:
-    """One period of a file's wake with its extinction, its cores by plane, its drift, its ends."""
+) -> tuple[xr.Dataset, Pairs, tuple[float, float], Closing]:
+    """One period of a file's wake with its extinction, its vortices, its drift, its ends."""
     wake = Wake.model_validate_json(keys)
-    needed, names = tracers_of(wake)
-    plane = wake.x if wake.depth == "plane" else None
-    flow = read_wake(path, wake.time, names, plane, require=needed)
-    if wake.depth == "plane" and flow.sizes["x"] > 1:
-        raise InputError(
-            f"wake.x: missing; {path.name} has {flow.sizes['x']} planes, expected one of "
-            f"{float(flow['x'][0]):g} to {float(flow['x'][-1]):g} m (or wake.depth: volume)"
-        )
+    flow = read_planes(path, wake, volume=wake.depth == "volume")
     flow, closing = one_period(flow, ends, length)
-    field = extinction_of(flow, wake.extinction, flow, None)
-    flow = flow[[n for n in "uvw" if n in flow]].assign(extinction=field)
-    sides: Sides = ([], [])
-    drifts = []
-    for index in range(flow.sizes["x"]):
-        section = flow.isel(x=index)
-        found = find_cores(section)
-        if len(found) != 2:
-            raise InputError(
-                f"wake.file: {path.name} has {len(found)} vortices in the plane x = "
-                f"{float(section['x']):g} m; expected two of opposite sense in every plane of an "
-                "encounter"
-            )
-        for side, core, partner in zip(sides, found, found[::-1], strict=True):
-            rings = _rings(section, core, partner)
-            if rings is None:
-                raise InputError(
-                    f"wake.file: {path.name} has vortices in the plane x = "
-                    f"{float(section['x']):g} m that are too close to each other or to the "
-                    f"volume's edge; expected {_OUTER[-1]:g} m of their own flow about them"
-                )
-            side.append((core, rings.circulation))
-            drifts.append((rings.v, rings.w))
-    v, w = np.mean(drifts, axis=0)
-    return flow, sides, (float(v), float(w)), closing
-
-
-def _rings(section: xr.Dataset, core: Core, partner: Core) -> Rings | None:
-    """Averages over the widest rings within the plane and around no other core."""
-    tried = (ring_averages(section, core, [partner], outer=outer) for outer in _OUTER)
-    return next((rings for rings in tried if rings is not None), None)
-
-
-def _vortex(core: Core, circulation: float) -> Vortex:
-    return Vortex(circulation, core.radius, core.y, core.z)
+    flow = with_extinction(flow, wake)
+    return flow, *pairs_in(flow, path.name), closing
