@@ -12,7 +12,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
-from lidar_mi.retrieval.defects.copies import Copy, without_copy
+from lidar_mi.retrieval.defects.copies import Copy, copy_at_rest, without_copy
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.defects.removal import CleanImages, as_they_are, without_defects
 from lidar_mi.retrieval.defects.sampling import no_structure, sampling
@@ -188,7 +188,11 @@ def _vectors(
     pair: Sequence[torch.Tensor] = seen[:2]
     pattern, copy, unexplained = Standing(), Copy(), False
     tested = checks and not (given.times and method.timed)
-    if tested and len(seen) == 2 and not found.quantities:
+    if tested and len(seen) == 2 and found.quantities:
+        # how it changes the parameters is not known
+        copy = copy_at_rest(pair, found, windows)
+        unexplained = copy.significant
+    elif tested and len(seen) == 2:
         again = partial(estimate, stride=windows.stride)
         field = Displacement.medians if method.local else lambda one: one
         raw, (found, copy, pair) = pair, without_copy(again, found, pair, windows, field)

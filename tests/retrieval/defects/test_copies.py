@@ -14,6 +14,9 @@ from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
+from validation.defects.families import BY_NAME
+from validation.defects.measure import errors
+from validation.defects.measure import retrieved as of_family
 
 SHAPE = 96, 112
 SHIFT = -0.6, 1.4
@@ -168,3 +171,14 @@ def test_two_percent_are_removed_or_within_the_errors():
     """In 95 % of the seeds at most 1 % of the vectors are beyond four stated errors."""
     beyond = [np.mean(np.abs(normalised(retrieved(pair(seed, 0.02)))[1]) > 4) for seed in range(20)]
     assert np.mean(np.array(beyond) <= 0.01) >= 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seed"), [("clean", 2), ("denoised", 1), ("denoised", 2)])
+def test_vortex_fits_to_copies_are_flagged(name, seed):
+    """Of denoised frames all vectors were beyond four stated errors, and valid."""
+    truth, images = BY_NAME[name].pair(seed, vortices=True)
+    wind = of_family(images, "vortex_fit")
+    error, stated, valid = errors(truth, wind)
+    assert valid.any() == (name == "clean") == ("copy_at_rest" not in wind.attrs)
+    assert (np.abs(error / stated)[:, valid] < 4).all()
