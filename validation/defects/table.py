@@ -92,7 +92,8 @@ def markdown(found: Sequence[Outcome]) -> str:
         table.append(f"| {' | '.join([*head, *cells])} |")
     legend = (
         "Valid vectors (%) / those of them that are wrong (%) / variance of normalised errors; of "
-        "clean images the lost vectors (%) in brackets. Bold: more than is required."
+        "clean images the lost vectors (%) in brackets. Bold: more than is required. Empty: "
+        "not counted."
     )
     return "\n".join(table) + f"\n\n{legend}"
 

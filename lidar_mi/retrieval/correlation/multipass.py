@@ -395,8 +395,12 @@ def _solved(
     # without texture the matrix is singular: such windows get a solution that is not used
     floor = 1e-9 * spread.mean(-1, keepdim=True) + ~textured[..., None]
     normal = normal + torch.diag_embed(prior + floor)
-    root = torch.linalg.cholesky(normal)
     unit = torch.eye(normal.shape[-1], dtype=spread.dtype, device=spread.device)
+    root, failed = torch.linalg.cholesky_ex(normal)
+    # where few voxels are known the sums' rounding may be more than the floor
+    singular = (failed > 0)[..., None, None]
+    normal, root = (torch.where(singular, unit, part) for part in (normal, root))
+    textured = textured & (failed == 0)
     right = torch.cat([wanted[..., None], unit[:, :: dims + 1].expand(*wanted.shape, dims)], -1)
     answer = torch.cholesky_solve(right, root)
     solution, inverse = answer[..., 0], answer[..., 1:]

@@ -13,6 +13,9 @@ import lidar_mi as lm
 from lidar_mi.retrieval.defects.sampling import sampling
 from lidar_mi.retrieval.defects.voxels import outstanding
 from tests.support.volumes import DT, SPACING, volume
+from validation.defects.families import BY_NAME
+from validation.defects.measure import errors
+from validation.defects.measure import retrieved as of_family
 
 MOTION = np.array([0.5, -0.4, 0.8])
 """Voxels along x, z, y: u, w, v of 2.5, -2, 4 m/s."""
@@ -70,3 +73,9 @@ def test_wind_among_hot_voxels(method, fraction, height):
     score = [(wind[c] - true[c]).values[good] / wind[f"{c}_stderr"].values[good] for c in "uwv"]
     assert (np.abs(score) > 4).any(0).mean() <= 0.01
     assert "replaced voxels" in wind.attrs["defects"]
+
+
+def test_windows_of_few_known_voxels_do_not_end_the_retrieval():
+    """Sums of single precision over dead voxels: a matrix that is not positive definite."""
+    air, volumes = BY_NAME["dead voxels"].pair(1)
+    assert not errors(air, of_family(volumes, "correlation"))[2].any()
