@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_mi.cli.exit_codes import end_without_result
 from lidar_mi.cli.options import Overwrite, complete_method
 from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.errors import InputError
@@ -121,7 +122,10 @@ def retrieve(
     device: Annotated[str, typer.Option(help="That computes: cpu, cuda, or auto.")] = "cpu",
     overwrite: Overwrite = False,
 ) -> None:
-    """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from many."""
+    """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from many.
+
+    Exit code 1: no vector is valid; the file says why.
+    """
     import numpy as np
     import xarray as xr
 
@@ -131,12 +135,13 @@ def retrieve(
     from lidar_mi.io.wind_file import SERIES, SUFFIXES, write_wind
     from lidar_mi.retrieval.images.common_grid import on_one_grid
     from lidar_mi.retrieval.images.gridding import on_nodes
-    from lidar_mi.retrieval.wind.methods import METHODS
     from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
     from lidar_mi.retrieval.wind.pair import retrieve_wind
+    from lidar_mi.retrieval.wind.pair_input import method_of
     from lidar_mi.retrieval.wind.series import retrieve_winds
     from lidar_mi.retrieval.wind.synchronised import synchronised
 
+    settings_of = method_of(method).options
     check_target(out, files, overwrite=overwrite, suffixes=SUFFIXES if pairs is None else SERIES)
     drawn = out.with_suffix(".png") if picture and pairs is None else None
     if drawn is not None:
@@ -150,7 +155,7 @@ def retrieve(
     paths = [path for path, frames in asked for _ in frames]
     chosen = None if pairs is None else _pairs(pairs, len(paths))
     more = len(paths) > 2 and chosen is None
-    if more and method in METHODS and "more" not in METHODS[method].options:
+    if more and "more" not in settings_of:
         raise InputError(
             f"{len(paths)} images are not allowed with --method {method}; expected two, --pairs "
             "all (a wind from each pair), or --method variational (one wind from all)"
@@ -235,6 +240,8 @@ def retrieve(
         output.print(f"picture  {drawn}")
     if lost:
         output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
+    if not (wind["flag"] == 0).any():
+        end_without_result(f"no valid vector of {wind['flag'].size}", wind["flag"])
 
 
 def _in_pixels(wind: "xr.Dataset", *, per_frame: bool) -> "xr.Dataset":

@@ -107,13 +107,14 @@ def _show(found: "xr.Dataset") -> None:
     """A table of valid winds, a few heights of the first profile, and how many there are."""
     import numpy as np
 
-    from lidar_mi.tables import Table, with_error
+    from lidar_mi.tables import Table, shown_part, with_error
 
     valid = (found["flag"] == 0).values
     profile = int(np.argmax(valid.any(1)))
     one = found.isel(time=profile)
     heights = np.flatnonzero(valid[profile])
-    chosen = heights[:: max(1, -(-heights.size // _ROWS))]
+    step = max(1, -(-heights.size // _ROWS))
+    chosen = heights[::step]
     rows = [
         (
             f"{float(one['height'][k]):.0f}",
@@ -128,4 +129,6 @@ def _show(found: "xr.Dataset") -> None:
     number = valid.shape[0]
     profiles = f"{number} profile{'s' if number > 1 else ''}"
     note = f"{int(valid.sum())} of {valid.size} winds are valid, of {profiles}."
+    if step > 1 or number > 1:
+        note += f" Shown: {shown_part(heights.size, step, 'height')} of this one."
     print_table(Table(f"wind, {time} UTC", rows, heads, note))

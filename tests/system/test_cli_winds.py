@@ -27,7 +27,7 @@ def test_winds_of_a_scan(scan, tmp_path):
     assert done.returncode == 0, done.stderr
     words = words_of(done.stdout)
     assert "remark: vad.hpl: the header promises 9 rays, the file has 6" in words
-    assert "17 of 17 winds are valid, of 1 profile" in words
+    assert "17 of 17 winds are valid, of 1 profile. Shown: every 2nd of 17 heights" in words
     with xr.open_dataset(tmp_path / "winds.nc") as found:
         expected = lm.fit_winds_to_lines(lm.read_lines_of_sight(scan), noise=0.02)
         for name, known in zip("uvw", made.WIND, strict=True):
@@ -60,7 +60,7 @@ def test_no_figure_without_a_valid_wind(tmp_path):
         (("vad.hpl", "-o", "winds.txt"), "winds.txt: .txt is not allowed; expected .nc or .csv"),
         (
             ("vad.hpl", "--min-cnr", "90"),
-            "three valid lines that are not in one plane (scan: ppi; 0",
+            "vad.hpl: no height has three valid lines that are not in one plane (scan: ppi; 0",
         ),
         (
             ("stare.hpl",),
