@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity, vortex_pair
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
 SPACING, DT = 0.5, 0.1

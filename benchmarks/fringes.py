@@ -10,8 +10,8 @@ are not subtracted.
 import mitsuba as mi
 import numpy as np
 
-from lidar_mi.atmosphere.line import Line, backscatter_line
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.scattering.line import Line, backscatter_line
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.rendering.fringes import scene_dict

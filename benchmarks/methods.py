@@ -10,7 +10,7 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.retrieval.wind.methods import METHODS
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 

@@ -11,18 +11,18 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.atmosphere.wake_path import WakeAlongPath
-from lidar_mi.encounter.combination import Completion
-from lidar_mi.encounter.computer import Cores
-from lidar_mi.encounter.doppler import DopplerScans, LineFrames, Midway, doppler_scans
-from lidar_mi.encounter.estimator import Estimator
-from lidar_mi.encounter.line_speeds import LineSpeeds
-from lidar_mi.encounter.slab_winds import without_old_garbage
-from lidar_mi.encounter.slabs import gates_of
-from lidar_mi.experiment.schema.reading import load_experiment
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
+from lidar_mi.encounter.lidar.combination import Completion
+from lidar_mi.encounter.lidar.computer import Cores
+from lidar_mi.encounter.lidar.doppler import DopplerScans, LineFrames, Midway, doppler_scans
+from lidar_mi.encounter.lidar.estimator import Estimator
+from lidar_mi.encounter.lidar.line_speeds import LineSpeeds
+from lidar_mi.encounter.lidar.slab_winds import without_old_garbage
+from lidar_mi.encounter.lidar.slabs import gates_of
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.schema.reading import load_experiment
 
 from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, Pair, drifting_pair_images
 from .report import Comparison, Row, row

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.error_budget import CAUSES
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.experiment.graph import call
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.truth.extinction import Truth
@@ -23,6 +22,7 @@ from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.wind.methods import METHODS
+from lidar_mi.schema.experiment import Experiment
 
 from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, SPACING, Pair, vortex_pair_images
 from .report import Comparison, row

@@ -7,13 +7,13 @@ from pathlib import Path
 import mitsuba as mi
 import xarray as xr
 
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import load
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import load
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import jsbsim
 
-from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
+from lidar_mi.aircraft.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema import encounter
 from lidar_mi.io.jsbsim_files import shipped_aircraft
+from lidar_mi.schema import encounter
 
 PAGE = Path(__file__).parent / "guide" / "jsbsim.md"
 BEGIN, END = "<!-- aircraft: begin -->", "<!-- aircraft: end -->"

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from pydantic import BaseModel
 
-from lidar_mi.experiment.schema import keys
+from lidar_mi.schema import keys
 
 NOTE = (
     "<!-- Written by docs/make_key_reference.py from the descriptions of the keys; edit those. -->"

@@ -18,8 +18,8 @@ import control as ct
 import numpy as np
 import scipy
 
-from lidar_mi.encounter.jump_linear import jump_covariance
-from lidar_mi.encounter.sensor_samples import SensorSamples, flights_in, samples_of
+from lidar_mi.encounter.control_block.jump_linear import jump_covariance
+from lidar_mi.encounter.control_block.sensor_samples import SensorSamples, flights_in, samples_of
 
 INERTIA, AILERON_MOMENT = 8.0e5, 1.052e6  # kg m^2 and N m/rad, of the default aircraft
 MASS, GRAVITY = 48500.0, 9.80665

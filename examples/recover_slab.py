@@ -17,13 +17,13 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, scene_dict
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
+from lidar_mi.schema import reading as config
 
 LIDAR = BackscatterLidar(divergence_full="3 mrad")  # 0.38 m rms at 500 m, on nodes of 0.5 m
 ENVIRONMENT = 1e-4

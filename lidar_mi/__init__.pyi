@@ -1,19 +1,16 @@
 """The public names: what ``import lidar_mi as lm`` offers, and where each is made."""
 
+from .aircraft.pose import AircraftPose
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
-from .encounter.export_control import export_control
+from .encounter.control_block.export import export_control
 from .encounter.fly import Flights, fly
-from .encounter.pose import AircraftPose
-from .encounter.virtual_lidar import VirtualLidar
+from .encounter.lidar.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
 from .experiment.results import Run
 from .experiment.run import run
-from .experiment.schema.experiment import Experiment
-from .experiment.schema.reading import load_experiment
-from .experiment.shipped import campaigns, experiments, scene_file
 from .experiment.truth.extinction import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
@@ -22,10 +19,10 @@ from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .rendering.labelled import to_xarray
 from .rendering.variant import use_variant
+from .retrieval.ground_vortices.vortices import fit_vortices_to_lines
+from .retrieval.ground_winds.winds import fit_winds_to_lines
 from .retrieval.images.common_grid import on_one_grid
 from .retrieval.images.quality import Flag
-from .retrieval.line_vortices.vortices import fit_vortices_to_lines
-from .retrieval.lines_of_sight.winds import fit_winds_to_lines
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
 from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines
@@ -37,6 +34,9 @@ from .retrieval.wind.pair import retrieve_wind
 from .retrieval.wind.series import retrieve_winds
 from .retrieval.wind.standard_errors import standard_errors
 from .retrieval.wind.volume import retrieve_wind_volume
+from .schema.experiment import Experiment
+from .schema.reading import load_experiment
+from .schema.shipped import campaigns, experiments, scene_file
 from .system.doctor import doctor
 
 __version__: str

@@ -6,6 +6,7 @@ outside io, a module that only forwards, a test that imports another.
 
 import ast
 import importlib
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -19,20 +20,30 @@ PACKAGE = ROOT / "lidar_mi"
 ARROWS = {
     "system": set(),
     "atmosphere": set(),
-    "instrument": {"atmosphere.line"},
-    "retrieval": {"atmosphere.vortex", "instrument.coherent.weighting"},
+    "instrument": {"atmosphere.scattering.line"},
+    "retrieval": {"atmosphere.vortices.vortex", "instrument.coherent.weighting"},
     "io": {
-        "atmosphere.aerosols",
-        "atmosphere.particle_scattering",
+        "atmosphere.scattering.aerosols",
+        "atmosphere.scattering.particle_scattering",
         "atmosphere.regrid",
-        "atmosphere.scattering",
+        "atmosphere.scattering.tables",
         "retrieval.vortices.model",
         "retrieval.vortices.pair",
     },
     "rendering": {"atmosphere", "instrument", "io", "system", "plugins"},
     "inversion": {"instrument", "rendering", "retrieval"},
-    "assessment": {"atmosphere", "instrument", "retrieval", "io"},
-    "experiment": {"atmosphere", "instrument", "rendering", "retrieval", "assessment", "io"},
+    "schema": {"atmosphere", "instrument", "io", "rendering.settings", "retrieval.method_names"},
+    "assessment": {"atmosphere", "instrument", "retrieval", "io", "schema"},
+    "aircraft": {"atmosphere", "instrument", "io", "schema"},
+    "experiment": {
+        "atmosphere",
+        "instrument",
+        "rendering",
+        "retrieval",
+        "assessment",
+        "io",
+        "schema",
+    },
     "cli": {
         "atmosphere",
         "instrument",
@@ -40,12 +51,13 @@ ARROWS = {
         "retrieval",
         "assessment",
         "io",
+        "schema",
         "experiment",
         "campaign",
         "encounter",
         "system",
     },
-    "campaign": {"assessment", "io", "experiment", "encounter", "system"},
+    "campaign": {"assessment", "io", "schema", "experiment", "encounter", "system"},
     "encounter": {
         "atmosphere",
         "instrument",
@@ -53,6 +65,8 @@ ARROWS = {
         "retrieval",
         "assessment",
         "io",
+        "schema",
+        "aircraft",
         "experiment",
         "system",
     },
@@ -63,14 +77,16 @@ gate; `io` builds those
 that its files hold; only `experiment` and what lies above it see all."""
 
 FLOORS = {
+    "atmosphere": (("scattering",), ("vortices",), ("air",)),
+    "encounter": (("lidar",), ("ahead",), ("control_block",)),
     "assessment": (("metrics",), ("figures",), ("report",)),
-    "experiment": (("schema",), ("truth",), ("stages",), ("folder",), ("preflight",)),
+    "experiment": (("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (
         ("extinction", "images", "rings"),
-        ("correlation", "channels", "lines", "lines_of_sight"),
+        ("correlation", "channels", "combined", "ground_winds"),
         ("flow", "defects"),
         ("along_path", "vortices"),
-        ("wind", "line_vortices"),
+        ("wind", "ground_vortices"),
     ),
 }
 """Folders of a room, the lowest floor first: each imports those of lower floors alone."""
@@ -327,15 +343,20 @@ RULES = (
 )
 
 
+@cache
+def found_by(rule):
+    return list(rule())
+
+
 @pytest.mark.parametrize("rule", RULES)
 def test_rule_is_kept(rule):
-    assert [one for one in rule() if one not in NOT_YET] == []
+    assert [one for one in found_by(rule) if one not in NOT_YET] == []
 
 
 def test_every_room_has_its_rule():
     found = {room(name) for name in MODULES if "." in name}
     assert found == set(ARROWS)
-    assert len(found) <= 12
+    assert len(found) <= 14
 
 
 def test_every_folder_of_a_room_with_floors_has_one():
@@ -345,7 +366,7 @@ def test_every_folder_of_a_room_with_floors_has_one():
 
 
 def test_fixed_exceptions_leave_the_list():
-    assert NOT_YET <= {one for rule in RULES for one in rule()}
+    assert NOT_YET <= {one for rule in RULES for one in found_by(rule)}
 
 
 def test_every_module_imports():

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+from lidar_mi.aircraft.roll_model import RollModel
+from lidar_mi.aircraft.state import Commands, loads_in_wind
+from lidar_mi.aircraft.strips import Loads
 from lidar_mi.atmosphere.air.gust import Gust
 from lidar_mi.atmosphere.air.microburst import Microburst
 from lidar_mi.atmosphere.air.standards import (
@@ -10,10 +13,7 @@ from lidar_mi.atmosphere.air.standards import (
     mil_f_8785c,
 )
 from lidar_mi.atmosphere.air.turbulence import turbulence
-from lidar_mi.encounter.aircraft import Commands, loads_in_wind
-from lidar_mi.encounter.roll_model import RollModel
-from lidar_mi.encounter.strips import Loads
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 from tests.support.turbulence import (
     correlations,
     finer_variance,

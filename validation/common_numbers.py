@@ -6,8 +6,8 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.experiment.run import finish, prepare
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import check, merged
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import check, merged
 
 from .report import Check, Comparison, Row
 from .scenes import VARIANT, Effort

@@ -11,7 +11,7 @@ import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.flows import flows_of, mean_flow
 from lidar_mi.retrieval.wind.options import WindowSizes

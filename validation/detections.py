@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.atmosphere.air.turbulence import turbulence
 from lidar_mi.atmosphere.texture import gaussian_field
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.retrieval.vortices.detection import RATIO_NODES, likelihoods
 from lidar_mi.retrieval.vortices.image_builder import Acquisition, builder_of
 from tests.support.flows import axes, data_array, origin

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from lidar_mi.atmosphere.aircraft_wake import TYPES, wake_of
-from lidar_mi.atmosphere.crow import crow_filaments
-from lidar_mi.atmosphere.filament_table import FilamentTable
-from lidar_mi.atmosphere.vortex import tangential_speed, velocity, vortex_pair
-from lidar_mi.atmosphere.wake_decay import sarpkaya_decay_time
+from lidar_mi.atmosphere.vortices.aircraft_wake import TYPES, wake_of
+from lidar_mi.atmosphere.vortices.crow import crow_filaments
+from lidar_mi.atmosphere.vortices.filament_table import FilamentTable
+from lidar_mi.atmosphere.vortices.vortex import tangential_speed, velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.wake_decay import sarpkaya_decay_time
 from tests.support.filaments import CUTOFFS, crow_growth, ring
 
 from .report import Check, Row

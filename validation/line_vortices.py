@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_mi.retrieval.line_vortices.detection import detect
-from lidar_mi.retrieval.line_vortices.fit import Assumptions
-from lidar_mi.retrieval.line_vortices.radial_velocities import by_radial_velocities
-from lidar_mi.retrieval.line_vortices.scan_plane import plane_scans
-from lidar_mi.retrieval.line_vortices.vortices import fit_vortices_to_lines, lidar_of
+from lidar_mi.retrieval.ground_vortices.detection import detect
+from lidar_mi.retrieval.ground_vortices.fit import Assumptions
+from lidar_mi.retrieval.ground_vortices.radial_velocities import by_radial_velocities
+from lidar_mi.retrieval.ground_vortices.scan_plane import plane_scans
+from lidar_mi.retrieval.ground_vortices.vortices import fit_vortices_to_lines, lidar_of
 from tests.support.line_wakes import START, Drawn, Family, drawn, drawn_from, slices
 
 from .report import Check, Comparison, Row

@@ -3,10 +3,10 @@
 import numpy as np
 from scipy.constants import g
 
-from lidar_mi.encounter.aircraft import Commands, loads_in_wind
-from lidar_mi.encounter.heave import derivatives_of, wing_place
-from lidar_mi.encounter.heave_model import HeaveModel
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.aircraft.heave import derivatives_of, wing_place
+from lidar_mi.aircraft.heave_model import HeaveModel
+from lidar_mi.aircraft.state import Commands, loads_in_wind
+from lidar_mi.schema.encounter import Aircraft, Path
 
 from .report import Check, Row
 

@@ -2,12 +2,12 @@
 
 import math
 
-from lidar_mi.atmosphere import molecules
+from lidar_mi.atmosphere.scattering import molecules
 
 from .report import Check, Row
 
 TITLE = "Molecules"
-INTRODUCTION = "Dry air of `lidar_mi.atmosphere.molecules`."
+INTRODUCTION = "Dry air of `lidar_mi.atmosphere.scattering.molecules`."
 
 
 def cross_sections(effort):

@@ -10,9 +10,9 @@ import numpy as np
 import rustmatrix
 import scatrs
 
-from lidar_mi.atmosphere.aerosols import AEROSOLS, Aerosol, LogNormal
-from lidar_mi.atmosphere.particle_scattering import make_table
-from lidar_mi.atmosphere.scattering import ELEMENTS
+from lidar_mi.atmosphere.scattering.aerosols import AEROSOLS, Aerosol, LogNormal
+from lidar_mi.atmosphere.scattering.particle_scattering import make_table
+from lidar_mi.atmosphere.scattering.tables import ELEMENTS
 from lidar_mi.io.scattering_table import read_table
 
 from . import figures

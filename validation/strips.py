@@ -3,15 +3,15 @@
 import numpy as np
 from scipy.special import ive
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.encounter.strips import roll_damping, wake_loads, wing_strips
+from lidar_mi.aircraft.strips import roll_damping, wake_loads, wing_strips
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 
 from .report import Check, Row
 
 TITLE = "Wake encounters"
 INTRODUCTION = (
     "Lift and rolling moment of a wing with elliptic chord in the wind of a vortex, from the "
-    "default strips of `lidar_mi.encounter.strips`. The wing is that of a Boeing 737 in air of "
+    "default strips of `lidar_mi.aircraft.strips`. The wing is that of a Boeing 737 in air of "
     "1.2 kg/m3 at 75 m/s, its sections have the slope 5.3."
 )
 

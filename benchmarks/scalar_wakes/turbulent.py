@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 
 SPACING = 0.5
 OUTER = 20.0

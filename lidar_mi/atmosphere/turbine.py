@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lidar_mi.atmosphere.texture import gaussian_field
-from lidar_mi.atmosphere.vortex import LAMB_OSEEN_CONSTANT
+from lidar_mi.atmosphere.vortices.vortex import LAMB_OSEEN_CONSTANT
 from lidar_mi.errors import InputError
 
 

@@ -9,9 +9,9 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.experiment import NAME
-from lidar_mi.experiment.schema.faults import first_fault
 from lidar_mi.io.yaml import parse_yaml, read_yaml
+from lidar_mi.schema.experiment import NAME
+from lidar_mi.schema.faults import first_fault
 from lidar_mi.units import Within, split_quantity
 
 KEYS = ("base", "sweep", "sample", "members")

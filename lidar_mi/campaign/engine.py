@@ -29,8 +29,8 @@ from lidar_mi.campaign.worker import Prepare, carry_out, render_shared
 from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
-from lidar_mi.experiment.shipped import campaign_file
 from lidar_mi.progress import Notice
+from lidar_mi.schema.shipped import campaign_file
 
 MOST_UNASKED = 100_000
 """Points of a campaign that runs without a confirmation."""

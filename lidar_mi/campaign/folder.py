@@ -19,14 +19,14 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.folder.records import METRICS
 from lidar_mi.experiment.folder.run_folder import made_by, new_record, refuse_strangers
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
-from lidar_mi.experiment.schema import reading
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import read_json, to_json
 from lidar_mi.io.text import read_text, write_text
 from lidar_mi.io.yaml import read_yaml, to_yaml
 from lidar_mi.progress import Notice
+from lidar_mi.schema import reading
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.shipped import experiment_file
 
 RECORD, INDEX, OUTCOME = "campaign.yaml", "points.txt", "outcome.json"
 DATA, REPORT = "campaign.nc", "report.html"

@@ -12,8 +12,8 @@ from scipy.stats import qmc
 
 from lidar_mi.campaign.description import Campaign, Range
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema import reading
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.schema import reading
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import registry, split_quantity
 
 MEMBER, SAMPLE = "member", "sample"

@@ -38,11 +38,11 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.run import complete, finish, prepare
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.json import to_json
 from lidar_mi.io.text import append_line, read_text, write_text
 from lidar_mi.io.yaml import to_yaml
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.system.threads import use_threads
 
 MOST_ATTEMPTS = 3

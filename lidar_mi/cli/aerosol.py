@@ -84,9 +84,9 @@ def aerosol(
     few seconds. In an experiment: `scattering: {phase: table,
     table: smoke.txt}`. Needs the library scatrs: `pip install 'lidar-mi[particles]'`.
     """
-    from lidar_mi.atmosphere.aerosols import changed
-    from lidar_mi.atmosphere.particle_scattering import make_table
-    from lidar_mi.atmosphere.scattering import describe
+    from lidar_mi.atmosphere.scattering.aerosols import changed
+    from lidar_mi.atmosphere.scattering.particle_scattering import make_table
+    from lidar_mi.atmosphere.scattering.tables import describe
     from lidar_mi.io.scattering_table import write_table
     from lidar_mi.io.target import check_target
 

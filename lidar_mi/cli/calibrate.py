@@ -67,12 +67,12 @@ def calibrate(
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.calibration import draw_calibration
     from lidar_mi.experiment.own_frames import calibrate_etalon, doppler_of, read_electrons
-    from lidar_mi.experiment.schema.reading import load
-    from lidar_mi.experiment.shipped import experiment_file
     from lidar_mi.io.netcdf import write_netcdf
     from lidar_mi.io.png import write_png
     from lidar_mi.io.target import check_target
     from lidar_mi.retrieval.checks import identical
+    from lidar_mi.schema.reading import load
+    from lidar_mi.schema.shipped import experiment_file
 
     figure = out.with_suffix(".png")
     lamps = _lines(line or [])

@@ -7,12 +7,12 @@ import typer
 
 from lidar_mi.cli.options import Changes, ExperimentName
 from lidar_mi.cli.terminal import output, print_rows
-from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import Notice, progress
+from lidar_mi.schema.shipped import experiment_file
 
 if TYPE_CHECKING:
     from lidar_mi.experiment.describe import Section
-    from lidar_mi.experiment.schema.experiment import Experiment
+    from lidar_mi.schema.experiment import Experiment
 
 EXAMPLES = (
     "lidar-mi check wake_sensor",
@@ -37,7 +37,7 @@ def check(
 
     Reads the wake, the scattering and the requirements as run does, and writes nothing.
     """
-    from lidar_mi.experiment.schema import reading
+    from lidar_mi.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
     asked = reading.load_variants(path, changes) or {"": reading.load(path, changes)}

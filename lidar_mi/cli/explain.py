@@ -29,7 +29,7 @@ def explain(
 
     Of a section, also its keys. Of a mistyped key, the nearest one.
     """
-    from lidar_mi.experiment.schema import keys
+    from lidar_mi.schema import keys
 
     if key is None:
         top = (*keys.OF_A_FILE, *keys.sections())

@@ -50,7 +50,7 @@ def export(
     range.
     """
     if format == "control":
-        from lidar_mi.encounter.export_control import export_control
+        from lidar_mi.encounter.control_block.export import export_control
 
         paths = export_control(
             folder, out, overwrite=overwrite, remark=partial(errors.print, soft_wrap=True)

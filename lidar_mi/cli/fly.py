@@ -10,8 +10,8 @@ import typer
 from lidar_mi.cli.options import Changes, Device, OptionalFlightName
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
+from lidar_mi.schema.shipped import experiment_file
 
 EXAMPLES = (
     "lidar-mi fly encounter",
@@ -79,7 +79,7 @@ def fly(
     video and a report.
     """
     from lidar_mi.experiment.folder.records import RECORD
-    from lidar_mi.experiment.schema import reading
+    from lidar_mi.schema import reading
 
     changes = list(set_ or [])
     if device:

@@ -7,7 +7,7 @@ EXAMPLES = ("lidar-mi list",)
 
 def list_shipped() -> None:
     """List the experiments and campaigns of the package: their questions, and what they need."""
-    from lidar_mi.experiment.shipped import campaigns, described, experiments, flights
+    from lidar_mi.schema.shipped import campaigns, described, experiments, flights
 
     flown = flights()
     groups = {

@@ -43,11 +43,11 @@ def new(
 
     With --like it is that of a published instrument. A file that is there is not replaced.
     """
-    from lidar_mi.experiment.schema.experiment import NAME
-    from lidar_mi.experiment.schema.faults import A_NAME
-    from lidar_mi.experiment.schema.new_file import new_file
-    from lidar_mi.experiment.shipped import experiments, flights, instrument_file, shipped_file
     from lidar_mi.io.text import read_text, write_text
+    from lidar_mi.schema.experiment import NAME
+    from lidar_mi.schema.faults import A_NAME
+    from lidar_mi.schema.new_file import new_file
+    from lidar_mi.schema.shipped import experiments, flights, instrument_file, shipped_file
 
     path = Path(name if name.endswith(".yaml") else f"{name}.yaml")
     own = path.stem

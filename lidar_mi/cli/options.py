@@ -21,41 +21,41 @@ def starting(incomplete: str, names: Iterable[str], *patterns: str) -> list[str]
 
 def complete_run(incomplete: str) -> list[str]:
     """Experiments of the package that are no flights, and experiment files here."""
-    from lidar_mi.experiment.shipped import experiments, flights
+    from lidar_mi.schema.shipped import experiments, flights
 
     return starting(incomplete, sorted(set(experiments()) - set(flights())), "*.yaml")
 
 
 def complete_flight(incomplete: str) -> list[str]:
     """Flights of the package, and experiment files here."""
-    from lidar_mi.experiment.shipped import flights
+    from lidar_mi.schema.shipped import flights
 
     return starting(incomplete, flights(), "*.yaml")
 
 
 def _complete_experiment(incomplete: str) -> list[str]:
-    from lidar_mi.experiment.shipped import experiments
+    from lidar_mi.schema.shipped import experiments
 
     return starting(incomplete, experiments(), "*.yaml")
 
 
 def complete_campaign(incomplete: str) -> list[str]:
     """Campaigns of the package, and files here."""
-    from lidar_mi.experiment.shipped import campaigns
+    from lidar_mi.schema.shipped import campaigns
 
     return starting(incomplete, campaigns(), "*.yaml")
 
 
 def complete_scene(incomplete: str) -> list[str]:
     """Mitsuba scenes of the package, and scenes here."""
-    from lidar_mi.experiment.shipped import scenes
+    from lidar_mi.schema.shipped import scenes
 
     return starting(incomplete, scenes(), "*.xml")
 
 
 def complete_contents(incomplete: str) -> list[str]:
     """Files and folders that can be shown, and the names of scatterers."""
-    from lidar_mi.atmosphere.aerosols import AEROSOLS
+    from lidar_mi.atmosphere.scattering.aerosols import AEROSOLS
 
     return starting(incomplete, ("molecules", *AEROSOLS), "*.exr", "*.nc", "*.hpl", "*.txt")
 
@@ -69,28 +69,28 @@ def complete_method(incomplete: str) -> list[str]:
 
 def complete_shipped(incomplete: str) -> list[str]:
     """Experiments of the package."""
-    from lidar_mi.experiment.shipped import experiments
+    from lidar_mi.schema.shipped import experiments
 
     return starting(incomplete, experiments())
 
 
 def complete_instrument(incomplete: str) -> list[str]:
     """Published instruments."""
-    from lidar_mi.experiment.shipped import instruments
+    from lidar_mi.schema.shipped import instruments
 
     return starting(incomplete, instruments())
 
 
 def complete_key(incomplete: str) -> list[str]:
     """Keys and sections of an experiment file."""
-    from lidar_mi.experiment.schema.keys import OF_A_FILE, names
+    from lidar_mi.schema.keys import OF_A_FILE, names
 
     return starting(incomplete, [*names(), *OF_A_FILE])
 
 
 def complete_change(incomplete: str) -> list[str]:
     """``KEY=`` of every key of an experiment file; after it, the words that the key may be."""
-    from lidar_mi.experiment.schema.keys import explain, settable
+    from lidar_mi.schema.keys import explain, settable
 
     keys = settable()
     key, equals, _ = incomplete.partition("=")

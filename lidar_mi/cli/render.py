@@ -50,12 +50,12 @@ def render(
     and beside it a PNG of its brightness to look at, linear from black to white; which values these
     are is said.
     """
-    from lidar_mi.experiment.shipped import scene_file
     from lidar_mi.instrument.products import untrusted_pixels
     from lidar_mi.io.images import read_pixels
     from lidar_mi.io.png import write_preview
     from lidar_mi.io.target import check_target
     from lidar_mi.rendering.scene import files_of, render_file
+    from lidar_mi.schema.shipped import scene_file
 
     source, definitions = scene_file(scene), _definitions(define or [])
     near = source if Path(scene).is_file() else Path(source.name)

@@ -8,11 +8,11 @@ import typer
 
 from lidar_mi.cli.options import Changes, Device, RunName, Variant
 from lidar_mi.cli.terminal import output, print_answer, print_table
-from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
+from lidar_mi.schema.shipped import experiment_file
 
 if TYPE_CHECKING:
-    from lidar_mi.experiment.schema.experiment import Experiment
+    from lidar_mi.schema.experiment import Experiment
 
 EXAMPLES = (
     "lidar-mi run wake_backscatter",
@@ -41,7 +41,7 @@ def run(
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped is resumed with the images it has.
     """
-    from lidar_mi.experiment.schema import reading
+    from lidar_mi.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
     if device:

@@ -54,12 +54,12 @@ def v_los(
 ) -> None:
     """Retrieve the speed along the line of sight from every frame of an etalon's rings."""
     from lidar_mi.experiment.own_frames import doppler_of, read_electrons, retrieve_v_los
-    from lidar_mi.experiment.schema.reading import load
-    from lidar_mi.experiment.shipped import experiment_file
     from lidar_mi.io.netcdf import read_netcdf, write_netcdf
     from lidar_mi.io.target import check_target
     from lidar_mi.retrieval.checks import identical
     from lidar_mi.retrieval.rings.calibration import calibration_of
+    from lidar_mi.schema.reading import load
+    from lidar_mi.schema.shipped import experiment_file
     from lidar_mi.tables import Table, with_error
 
     frames = [*(frames or []), *(signal or [])]

@@ -100,7 +100,7 @@ def vortices(
     from lidar_mi.io.png import write_png
     from lidar_mi.io.target import check_target
     from lidar_mi.progress import progress
-    from lidar_mi.retrieval.line_vortices.vortices import fit_vortices_to_lines
+    from lidar_mi.retrieval.ground_vortices.vortices import fit_vortices_to_lines
 
     figure = plot or out.with_suffix(".png")
     check_target(out, files, overwrite=overwrite, suffixes=(".nc", ".csv"))

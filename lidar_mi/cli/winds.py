@@ -69,7 +69,7 @@ def winds(
     from lidar_mi.io.netcdf import write_netcdf
     from lidar_mi.io.png import write_png
     from lidar_mi.io.target import check_target
-    from lidar_mi.retrieval.lines_of_sight.winds import fit_winds_to_lines
+    from lidar_mi.retrieval.ground_winds.winds import fit_winds_to_lines
 
     figure = plot or out.with_suffix(".png")
     check_target(out, files, overwrite=overwrite, suffixes=(".nc", ".csv"))

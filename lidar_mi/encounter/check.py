@@ -5,20 +5,25 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_mi.encounter.air import air_along_path, described
-from lidar_mi.encounter.aircraft import AircraftModel, RisingAircraft, loads_in_wind
-from lidar_mi.encounter.doppler import at_the_slabs
-from lidar_mi.encounter.flight import aircraft_of, duration
-from lidar_mi.encounter.slabs import Gates, gates_of
-from lidar_mi.encounter.wake import described_wake, encounter_of, vortices_in_plane
+from lidar_mi.aircraft.models import aircraft_of
+from lidar_mi.aircraft.state import AircraftModel, RisingAircraft, loads_in_wind
+from lidar_mi.encounter.flight import duration
+from lidar_mi.encounter.lidar.doppler import at_the_slabs
+from lidar_mi.encounter.lidar.slabs import Gates, gates_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.preflight import check as preflight
 from lidar_mi.experiment.run import prepare
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.truth.clear_air import site_altitude
+from lidar_mi.experiment.truth.flight_air import air_along_path, described
+from lidar_mi.experiment.truth.wake_along_path import (
+    described_wake,
+    encounter_of,
+    vortices_in_plane,
+)
 from lidar_mi.progress import Notice
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import shown
 
 # A path misses the wake where no rolling moment reaches this fraction of the ailerons'.

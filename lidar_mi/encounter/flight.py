@@ -14,18 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
-from lidar_mi.atmosphere.air.along_path import AirAlongPath
-from lidar_mi.atmosphere.wake_path import WakeAlongPath
-from lidar_mi.encounter.air import air_along_path
-from lidar_mi.encounter.aircraft import (
-    AircraftModel,
-    AircraftState,
-    ailerons_deflected,
-    deflected,
-    loads_in_wind,
-)
-from lidar_mi.encounter.control import (
+from lidar_mi.aircraft.control import (
     Controller,
     Preview,
     bumpless_transfer,
@@ -33,20 +22,30 @@ from lidar_mi.encounter.control import (
     no_loads,
     wings_level,
 )
-from lidar_mi.encounter.heave_model import HeaveModel
+from lidar_mi.aircraft.jsbsim_aircraft import JSBSimAircraft
+from lidar_mi.aircraft.models import aircraft_of
+from lidar_mi.aircraft.state import (
+    AircraftModel,
+    AircraftState,
+    ailerons_deflected,
+    deflected,
+    loads_in_wind,
+)
+from lidar_mi.aircraft.strip_loads import StripLoads
+from lidar_mi.aircraft.user_controller import name_of, user_controller
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
+from lidar_mi.atmosphere.air.along_path import AirAlongPath
+from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
 from lidar_mi.encounter.integrity import Integrity
-from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
-from lidar_mi.encounter.roll_model import RollModel
-from lidar_mi.encounter.scan_store import ScanStore
-from lidar_mi.encounter.strip_loads import StripLoads
-from lidar_mi.encounter.user_controller import name_of, user_controller
-from lidar_mi.encounter.wake import encounter_of
-from lidar_mi.experiment.schema.encounter import Encounter
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.encounter.lidar.scan_store import ScanStore
+from lidar_mi.experiment.truth.flight_air import air_along_path
+from lidar_mi.experiment.truth.wake_along_path import encounter_of
 from lidar_mi.progress import Notice
+from lidar_mi.schema.encounter import Encounter
+from lidar_mi.schema.experiment import Experiment
 
 if TYPE_CHECKING:
-    from lidar_mi.encounter.preview import Lidar
+    from lidar_mi.encounter.ahead.preview import Lidar
 
 
 OFF, AUTOPILOT, FEEDFORWARD, PERFECT = "off", "autopilot", "feedforward", "perfect"
@@ -83,15 +82,6 @@ class FlightData:
     slabs: xr.Dataset | None
 
 
-def aircraft_of(encounter: Encounter) -> AircraftModel:
-    """The aircraft of an encounter at its start."""
-    if encounter.aircraft.model == "roll":
-        return RollModel(encounter.aircraft, encounter.path)
-    if encounter.aircraft.model == "heave":
-        return HeaveModel(encounter.aircraft, encounter.path)
-    return JSBSimAircraft(encounter.aircraft, encounter.path)
-
-
 def simulate_flights(
     experiment: Experiment,
     notice: Notice,
@@ -119,11 +109,11 @@ def simulate_flights(
     processes, scans
         As `VirtualLidar` takes them.
     """
-    from lidar_mi.encounter.arrivals import arrivals_dataset
-    from lidar_mi.encounter.preview import WakeTracker, preview_in
+    from lidar_mi.encounter.ahead.arrivals import arrivals_dataset
+    from lidar_mi.encounter.ahead.preview import WakeTracker, preview_in
+    from lidar_mi.encounter.ahead.wind_ahead import WindAhead
     from lidar_mi.encounter.series import flights_dataset, track_dataset
     from lidar_mi.encounter.slab_recorder import SlabRecorder
-    from lidar_mi.encounter.wind_ahead import WindAhead
 
     encounter = encounter_of(experiment)
     wake = air_along_path(experiment)
@@ -263,6 +253,6 @@ def _titled(notice: Notice, title: str) -> Notice:
 
 def _virtual_lidar(experiment: Experiment, processes: int, scans: ScanStore | None) -> "Lidar":
     # Mitsuba takes seconds to load: flights without this lidar do not pay for it
-    from lidar_mi.encounter.virtual_lidar import VirtualLidar
+    from lidar_mi.encounter.lidar.virtual_lidar import VirtualLidar
 
     return VirtualLidar(experiment, processes=processes, scans=scans)

@@ -13,21 +13,21 @@ from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, encounter_metrics
 from lidar_mi.assessment.report.encounter import encounter_summary
+from lidar_mi.encounter.ahead.preview import Lidar
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import FlightData, OwnAircraft, OwnController, simulate_flights
 from lidar_mi.encounter.folder import EncounterFolder
-from lidar_mi.encounter.preview import Lidar
 from lidar_mi.encounter.replay import recorded_flight, recorded_lidar, with_recorded
 from lidar_mi.encounter.report import answer, write_report
-from lidar_mi.encounter.wake import described_wake, encounter_of
 from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.device import devices_in_words, on_its_device
 from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import load_experiment
+from lidar_mi.experiment.truth.wake_along_path import described_wake, encounter_of
 from lidar_mi.plots import plot_flights
 from lidar_mi.progress import Notice, progress
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import load_experiment
 from lidar_mi.tables import Table, Tabular
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def fly(
         experiment.
     controller : callable, optional
         Gives, for an aircraft, a function of the preview and the state that returns `Commands`;
-        default: `lidar_mi.encounter.control.feedforward`. It steers all flights with a preview.
+        default: `lidar_mi.aircraft.control.feedforward`. It steers all flights with a preview.
     replay : path, optional
         Folder of a flight with the lidar, whose estimates are delivered again: nothing is rendered.
         The experiment may differ in `encounter.aircraft` and `encounter.control`.

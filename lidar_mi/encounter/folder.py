@@ -8,8 +8,7 @@ from pathlib import Path
 import xarray as xr
 
 from lidar_mi.encounter.flight import FlightData
-from lidar_mi.encounter.scan_store import ScanStore
-from lidar_mi.encounter.wake import encounter_of
+from lidar_mi.encounter.lidar.scan_store import ScanStore
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.export_flight import FLIGHT_FILES as FILES
 from lidar_mi.experiment.folder.image_store import MADE_BY
@@ -23,11 +22,12 @@ from lidar_mi.experiment.folder.records import (
     read_record,
 )
 from lidar_mi.experiment.folder.run_folder import FIGURES, held, made_by, new_record, write_verdict
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.truth.wake_along_path import encounter_of
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.io.text import encoded
 from lidar_mi.io.yaml import to_yaml
+from lidar_mi.schema.experiment import Experiment
 
 ANIMATION, VIDEO, SCANS = "approach.gif", "approach.mp4", "scans"
 

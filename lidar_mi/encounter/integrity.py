@@ -14,8 +14,8 @@ better off without the preview.
 import math
 from dataclasses import dataclass, field
 
-from lidar_mi.encounter.aircraft import AircraftModel, AircraftState
-from lidar_mi.encounter.control import Preview, no_loads
+from lidar_mi.aircraft.control import Preview, no_loads
+from lidar_mi.aircraft.state import AircraftModel, AircraftState
 
 FALSE_ALARMS = 1e-4
 """Of a right prediction, in each independent sample at most: the mean number of samples between

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.encounter.estimate import Estimate
+from lidar_mi.aircraft.pose import AircraftPose
 from lidar_mi.encounter.flight import FEEDFORWARD, FlightData
-from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.encounter.lidar.estimate import Estimate
+from lidar_mi.encounter.lidar.vector_record import wind_of
 from lidar_mi.encounter.series import ESTIMATED, MEASURED
-from lidar_mi.encounter.vector_record import wind_of
-from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import value_at
 from lidar_mi.experiment.export_flight import FLIGHT_FILES
 from lidar_mi.experiment.folder.records import read_record
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import in_si, settings
+from lidar_mi.experiment.truth.wake_along_path import encounter_of
 from lidar_mi.io.netcdf import read_netcdf
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import in_si, settings
 
 NOT_RECORDED = "the recorded flight has no estimate of this scan"
 
@@ -35,7 +35,7 @@ _FREE = ("name", "encounter.aircraft", "encounter.control")
 
 @dataclass(frozen=True, eq=False)
 class RecordedLidar:
-    """Delivers the estimates of a recorded flight; a `lidar_mi.encounter.preview.Lidar`.
+    """Delivers the estimates of a recorded flight; a `lidar_mi.encounter.ahead.preview.Lidar`.
 
     Attributes
     ----------

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from lidar_mi.aircraft.models import aircraft_of
 from lidar_mi.assessment.figures.encounter import draw_all
 from lidar_mi.assessment.figures.encounter_film import RATE, film, frame_times
 from lidar_mi.assessment.metrics.encounter import (
@@ -16,16 +17,16 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 from lidar_mi.assessment.report.answer import verdict
 from lidar_mi.assessment.report.encounter import encounter_answer, encounter_chapter
 from lidar_mi.assessment.report.page import Film, page
-from lidar_mi.encounter.doppler import at_the_slabs
-from lidar_mi.encounter.flight import FlightData, aircraft_of
+from lidar_mi.encounter.flight import FlightData
 from lidar_mi.encounter.folder import ANIMATION, VIDEO, EncounterFolder
-from lidar_mi.encounter.slabs import gates_of
-from lidar_mi.encounter.wake import encounter_of
+from lidar_mi.encounter.lidar.doppler import at_the_slabs
+from lidar_mi.encounter.lidar.slabs import gates_of
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import dump
+from lidar_mi.experiment.truth.wake_along_path import encounter_of
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.film import VIDEO_EXTRA, as_mp4, frame_as_webp, write_gif
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import dump
 
 # Frames of a report without a video.
 _SLIDER_FRAMES = 40

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.wake_path import WakeAlongPath
-from lidar_mi.encounter.aircraft import AircraftState, Commands
-from lidar_mi.encounter.estimate import SKIPPED
-from lidar_mi.encounter.preview import Slab
-from lidar_mi.encounter.strips import Loads
-from lidar_mi.encounter.vector_record import recorded_vectors
-from lidar_mi.encounter.wake import vortices_in_plane
+from lidar_mi.aircraft.state import AircraftState, Commands
+from lidar_mi.aircraft.strips import Loads
+from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
+from lidar_mi.encounter.ahead.preview import Slab
+from lidar_mi.encounter.lidar.estimate import SKIPPED
+from lidar_mi.encounter.lidar.vector_record import recorded_vectors
+from lidar_mi.experiment.truth.wake_along_path import vortices_in_plane
 from lidar_mi.retrieval.vortices.model import PARAMETERS
 from lidar_mi.retrieval.vortices.pair import MEANING, VortexPairFit
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import xarray as xr
 
-from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.preview import Lidar
+from lidar_mi.encounter.ahead.preview import Lidar
+from lidar_mi.encounter.lidar.estimate import Estimate
 
 # Vectors along y that a figure has room for.
 _VECTORS = 24

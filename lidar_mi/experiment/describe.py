@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from lidar_mi.atmosphere.aerosols import AEROSOLS
-from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering
-from lidar_mi.atmosphere.particle_scattering import Notice
-from lidar_mi.atmosphere.scattering import ScatteringTable, describe
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.scattering.aerosols import AEROSOLS
+from lidar_mi.atmosphere.scattering.molecules import BANDS, molecular_scattering
+from lidar_mi.atmosphere.scattering.particle_scattering import Notice
+from lidar_mi.atmosphere.scattering.tables import ScatteringTable, describe
 from lidar_mi.errors import InputError
 from lidar_mi.io.scattering_table import aerosol_table, read_table
 from lidar_mi.io.size import fits

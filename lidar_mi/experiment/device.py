@@ -6,9 +6,9 @@ Rendering and retrieval are of two libraries, each of which may or may not compu
 from typing import TypeVar
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.rendering.variant import has_cuda
+from lidar_mi.schema.experiment import Experiment
 
 Settings = TypeVar("Settings", RenderSettings, FringeSettings)
 

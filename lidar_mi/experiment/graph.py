@@ -23,8 +23,8 @@ from typing import Annotated, Any, NamedTuple, Protocol, TypeVar, Union, get_arg
 from pydantic import BaseModel
 
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.section import sections_in
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.section import sections_in
 
 PROVIDED = ("log", "search_path", "missing", "store")
 

@@ -35,8 +35,8 @@ from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
 from lidar_mi.assessment.metrics.winds import cross_flow_metrics, sweep_metrics, true_wind_metrics
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.pipeline import Results
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.light_budget import backscatter_fractions
+from lidar_mi.schema.experiment import Experiment
 
 _NO_SKILL = "{} has no skill: its error equals the spread of the wind"
 

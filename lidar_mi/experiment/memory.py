@@ -2,12 +2,8 @@
 
 from dataclasses import dataclass
 
-from lidar_mi.atmosphere.wake import MOST_NODES
+from lidar_mi.atmosphere.vortices.wake import MOST_NODES
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan
@@ -21,6 +17,10 @@ from lidar_mi.rendering.memory import (
     image_bytes,
 )
 from lidar_mi.rendering.settings import RenderSettings
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 PER_NODE = 160
 """Bytes of a node of the wake: twenty fields in double precision."""

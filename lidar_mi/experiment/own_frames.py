@@ -15,9 +15,6 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages.ring_images import ring_models
 from lidar_mi.experiment.stages.ring_instrument import laser_rings, pixel_noise
 from lidar_mi.instrument.ccd import CCD
@@ -28,6 +25,9 @@ from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
 from lidar_mi.retrieval.rings.calibration_lines import combined
 from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
 from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import load_experiment
 
 
 def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") -> Doppler:

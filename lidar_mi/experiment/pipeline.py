@@ -5,15 +5,14 @@ from typing import TYPE_CHECKING, TypedDict
 
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.pointing import ScanPointing
 from lidar_mi.assessment.metrics.requirements import RequirementTable
 from lidar_mi.assessment.metrics.rings import RingBudget
 from lidar_mi.assessment.metrics.safety import ScanSafety
-from lidar_mi.atmosphere.line import Line
+from lidar_mi.atmosphere.scattering.line import Line
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.experiment.graph import Graph, Stage
 from lidar_mi.experiment.memory import Footprint
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.coherent_lines import check_scan, coherent_lines, passing_air
 from lidar_mi.experiment.stages.error_budget import error_budgets
 from lidar_mi.experiment.stages.eye_safety import scan_safety
@@ -80,6 +79,7 @@ from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.experiment import Experiment
 
 if TYPE_CHECKING:
     from lidar_mi.assessment.metrics.sensor import LidarCost

@@ -14,8 +14,8 @@ import numpy as np
 import scipy
 import torch
 
-from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.scattering.line import Line, backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.stages.ring_instrument import TEMPERATURE_NODES, pixel_noise
 from lidar_mi.instrument import double_edge, michelson

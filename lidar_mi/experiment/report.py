@@ -29,8 +29,8 @@ from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import judged
 from lidar_mi.experiment.pipeline import Results
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import rendered_pairs
+from lidar_mi.schema.experiment import Experiment
 
 Metrics = Mapping[str, float]
 

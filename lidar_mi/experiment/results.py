@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import xarray as xr
 from rich.console import Console
 
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import Results
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.truth.extinction import Truth
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.tables import Table, Tabular
 
 if TYPE_CHECKING:

@@ -21,9 +21,9 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.magnitudes import unusual
 from lidar_mi.experiment.pipeline import Results, stages_of
 from lidar_mi.experiment.results import Run
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import dump
 from lidar_mi.progress import Notice, progress
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import dump
 
 RESUMED = "start it again to resume the run"
 

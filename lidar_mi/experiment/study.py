@@ -9,17 +9,17 @@ from pathlib import Path
 
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.experiment.folder.records import LOG, METRICS, REPORT, STUDY
 from lidar_mi.experiment.folder.run_folder import FIGURES, refuse_strangers
 from lidar_mi.experiment.log import Log, silent
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.reading import settings as settings_of
 from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import write_json
 from lidar_mi.io.text import write_text
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.progress import Notice
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.reading import settings as settings_of
 
 
 def run(
@@ -37,7 +37,7 @@ def run(
     name : str
         Of the study.
     variants : mapping
-        From `lidar_mi.experiment.schema.reading.load_variants`.
+        From `lidar_mi.schema.reading.load_variants`.
     folder, beside, overwrite, notice
         As in `lidar_mi.experiment.run.run`.
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidar_mi.atmosphere.line import Line
+from lidar_mi.atmosphere.scattering.line import Line
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.detector import gate_duration, photons_per_energy
@@ -162,7 +162,7 @@ def coherence_time(etalon: Etalon, line: Line, order: float = 0.0) -> float:
 
     Parameters
     ----------
-    line : lidar_mi.atmosphere.line.Line
+    line : lidar_mi.atmosphere.scattering.line.Line
         Of air at rest, every Gaussian with a width.
     order : float
         Fractional order of the laser's light; 0 is the peak of a fringe, where the spectrum is
@@ -184,7 +184,7 @@ def filtered_coherence_time(line: Line, transmission: Callable[[np.ndarray], np.
 
     Parameters
     ----------
-    line : lidar_mi.atmosphere.line.Line
+    line : lidar_mi.atmosphere.scattering.line.Line
         Of air at rest, every Gaussian with a width.
     transmission : function
         Of the frequency less that of the laser (array, Hz).

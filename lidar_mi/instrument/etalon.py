@@ -5,7 +5,7 @@ light passes where m is an integer: the phase of reflection is tuned away with t
 77 000, so it is computed in float64 and its integer part split off; the rest fits in float32.
 
 As a series in the order the transmission is T(m) = A_0 + 2 sum A_n cos(2 pi n m). A line with the
-Fourier transform chi (`lidar_mi.atmosphere.line.Line`) replaces A_n by A_n chi(n / FSR), uneven
+Fourier transform chi (`scattering.line.Line`) replaces A_n by A_n chi(n / FSR), uneven
 plates into A_n D_n: all convolutions are products.
 
 The Mitsuba plugin `etalon` computes the same transmission ray by ray; tests compare the two.
@@ -19,7 +19,7 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from lidar_mi.atmosphere.line import Line
+from lidar_mi.atmosphere.scattering.line import Line
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.units import Length, Number, Within
@@ -207,7 +207,7 @@ def harmonics(
     ----------
     wavelength : float
         m, in vacuum, of the laser.
-    line : lidar_mi.atmosphere.line.Line, optional
+    line : lidar_mi.atmosphere.scattering.line.Line, optional
         Default: monochromatic light.
     count : int, optional
         Highest harmonic; default: beyond it all others together are below 1e-12 of A_0.
@@ -261,7 +261,7 @@ def transmission(
         m, in vacuum, of the laser.
     cosine, offset : array
         Of the angle inside the gap; frequency less that of the laser, Hz.
-    line : lidar_mi.atmosphere.line.Line, optional
+    line : lidar_mi.atmosphere.scattering.line.Line, optional
         Average over this line, shifted by ``offset``; default: monochromatic light.
     """
     order = fractional_order(etalon, wavelength, cosine, offset)

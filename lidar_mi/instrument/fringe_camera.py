@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from lidar_mi.atmosphere.line import Line
+from lidar_mi.atmosphere.scattering.line import Line
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
@@ -192,7 +192,7 @@ def fringe_values(
 
     Parameters
     ----------
-    line : lidar_mi.atmosphere.line.Line
+    line : lidar_mi.atmosphere.scattering.line.Line
         Of air at rest; it is shifted here.
     v_los : float or array (N,)
         Speed along the line of sight, m/s; positive when the air approaches.

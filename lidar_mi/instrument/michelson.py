@@ -7,7 +7,7 @@ fringes, equally spaced. Glass in one of the arms lets D depend on the angle of 
 order only (field widening), so that a telescope of large field loses no contrast.
 
 A fringe is a cosine, so that a line with the Fourier transform chi
-(`lidar_mi.atmosphere.line.Line`) leaves the contrast V |chi(D / c)| and the phase arg chi(D / c).
+(`scattering.line.Line`) leaves the contrast V |chi(D / c)| and the phase arg chi(D / c).
 """
 
 import math

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lidar_mi import __version__
-from lidar_mi.atmosphere.aerosols import aerosol
-from lidar_mi.atmosphere.particle_scattering import Notice, make_table
-from lidar_mi.atmosphere.scattering import ScatteringTable
+from lidar_mi.atmosphere.scattering.aerosols import aerosol
+from lidar_mi.atmosphere.scattering.particle_scattering import Notice, make_table
+from lidar_mi.atmosphere.scattering.tables import ScatteringTable
 from lidar_mi.errors import InputError
 from lidar_mi.io.text import read_text, write_text
 

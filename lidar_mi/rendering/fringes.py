@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi import __version__
-from lidar_mi.atmosphere.line import Line
+from lidar_mi.atmosphere.scattering.line import Line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
@@ -44,7 +44,7 @@ def render_fringes(
 
     Parameters
     ----------
-    line : lidar_mi.atmosphere.line.Line
+    line : lidar_mi.atmosphere.scattering.line.Line
         Of air at rest.
     v_los : sequence of float
         m/s; positive when the air approaches.

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from lidar_mi.atmosphere.molecules import molecular_scattering, molecular_table
-from lidar_mi.atmosphere.particle_scattering import Notice
-from lidar_mi.atmosphere.scattering import ScatteringTable, mix, rayleigh_table
+from lidar_mi.atmosphere.scattering.molecules import molecular_scattering, molecular_table
+from lidar_mi.atmosphere.scattering.particle_scattering import Notice
+from lidar_mi.atmosphere.scattering.tables import ScatteringTable, mix, rayleigh_table
 from lidar_mi.errors import InputError
 from lidar_mi.io.scattering_table import aerosol_table, is_complete, read_table
 
@@ -63,7 +63,7 @@ def scatterer(
 
     Parameters
     ----------
-    scattering : lidar_mi.experiment.schema.scattering.Scattering
+    scattering : lidar_mi.schema.scattering.Scattering
         Its own albedo, if given, replaces that of the scatterers.
     folder : path
         Of the tables.

@@ -21,8 +21,8 @@ from lidar_mi.assessment.report.page import Film, page
 from lidar_mi.experiment import study
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.io.film import frame_as_webp
+from lidar_mi.schema import reading as config
 from tests.support import figure_rules, page_rules
 from tests.support.campaign_results import campaign, sweep
 from tests.support.encounter_results import made_up_flights
@@ -83,7 +83,16 @@ EXPERIMENTS = {
 }
 
 
-@pytest.fixture(scope="module", params=list(EXPERIMENTS))
+LONG = ("both lidars", "lines in one direction")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(name, marks=[pytest.mark.slow] * (name in LONG), id=name)
+        for name in EXPERIMENTS
+    ],
+)
 def ran(request, tmp_path_factory):
     """Faults of the figures and text of the report of a small run."""
     folder = tmp_path_factory.mktemp("run") / "run"
@@ -205,6 +214,7 @@ def test_limits_are_drawn_in_maps():
     assert "flight control, landing" in block.split("</svg>")[0]
 
 
+@pytest.mark.slow
 def test_the_comparison_of_variants(tmp_path):
     described = {
         "name": "two",

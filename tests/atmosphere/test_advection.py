@@ -9,8 +9,8 @@ import xarray as xr
 
 from lidar_mi.atmosphere.advection import advect, advect_to, carrier
 from lidar_mi.atmosphere.texture import corrsin_obukhov
-from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
-from lidar_mi.atmosphere.wake import resample
+from lidar_mi.atmosphere.vortices.vortex import pair_wake, vortex_pair
+from lidar_mi.atmosphere.vortices.wake import resample
 from lidar_mi.errors import InputError
 from lidar_mi.io.wake_file import read_wake
 

@@ -47,7 +47,7 @@ from benchmarks import (
     transient,
     velocimetry,
 )
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 
 
 def lines(comparison):
@@ -228,6 +228,7 @@ def test_memory_of_a_fresh_process_is_its_own():
 # --- the comparisons
 
 
+@pytest.mark.slow
 def test_fraction_of_contributing_analog_samples_is_the_optical_depth_of_the_gate(variant):
     columns, rows, samples = 15, 9, 4096
     found = lines(estimators.compare(2, samples, columns, rows))

@@ -12,7 +12,7 @@ from lidar_mi.campaign.engine import prepare_campaign
 from lidar_mi.campaign.slurm import slurm_cluster
 from lidar_mi.cli.app import main
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.shipped import campaigns
+from lidar_mi.schema.shipped import campaigns
 from tests.support.campaigns import described
 
 
@@ -40,6 +40,7 @@ def test_shipped_campaigns_can_be_run(tmp_path, name):
     assert len(coarse.points) < len(whole.points) / 3
 
 
+@pytest.mark.slow
 def test_points_of_a_job_array_are_collected(tmp_path, command, capsys):
     path = described(tmp_path, sweep={"retrieval.template": [6, 8]})
     out = tmp_path / "out"

@@ -14,7 +14,7 @@ import yaml
 from lidar_mi.campaign.description import Campaign, read_campaign
 from lidar_mi.campaign.engine import prepare_campaign
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.shipped import campaign_file
+from lidar_mi.schema.shipped import campaign_file
 
 SWEEP = {"scan.range": ["300 m", "500 m"]}
 

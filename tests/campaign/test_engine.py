@@ -74,6 +74,7 @@ def client():
         yield found
 
 
+@pytest.mark.slow
 def test_a_sweep_of_retrievals_renders_two_images(tmp_path, client):
     path = described(tmp_path, sweep={"retrieval.template": list(range(6, 10))})
     states = []

@@ -21,7 +21,9 @@ from tests.support.campaigns import described
 from tests.support.experiments import leave_out_figures
 
 
-@pytest.mark.parametrize("keep", ["metrics", "estimates", "everything"])
+@pytest.mark.parametrize(
+    "keep", ["metrics", pytest.param("estimates", marks=pytest.mark.slow), "everything"]
+)
 def test_what_stays_of_a_point(tmp_path, monkeypatch, keep):
     leave_out_figures(monkeypatch)
     path = described(tmp_path, sweep={"retrieval.template": [6, 8]}, keep=keep)

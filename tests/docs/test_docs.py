@@ -25,15 +25,14 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
-from lidar_mi.experiment import shipped
 from lidar_mi.experiment.run import prepare
-from lidar_mi.experiment.schema import air, coherent, keys, reading, rings, scattering, wake
-from lidar_mi.experiment.schema import experiment as schema
 from lidar_mi.experiment.truth import extinction as truth
 from lidar_mi.instrument import motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.rendering.phase import scatterer
+from lidar_mi.schema import air, coherent, keys, reading, rings, scattering, shipped, wake
+from lidar_mi.schema import experiment as schema
 from tests.support.experiments import sketched_figures, without_figures
 
 ROOT = Path(__file__).parents[2]

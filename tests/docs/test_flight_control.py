@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Commands
-from lidar_mi.encounter.control import HORIZON
-from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.strips import Loads, wake_loads, wing_strips
+from lidar_mi.aircraft.control import HORIZON
+from lidar_mi.aircraft.state import AircraftModel, AircraftState, Commands
+from lidar_mi.aircraft.strips import Loads, wake_loads, wing_strips
+from lidar_mi.encounter.lidar.estimate import Estimate
 
 PAGE = Path(__file__).parents[2] / "docs" / "flight_control.md"
 

@@ -8,13 +8,14 @@ sees the vortices, scans of slabs that nobody meets, an upset that is an error.
 import numpy as np
 import pytest
 
+from lidar_mi.aircraft.models import aircraft_of
+from lidar_mi.aircraft.state import Commands
 from lidar_mi.assessment.metrics.encounter import MET, encounter_metrics
 from lidar_mi.assessment.report.encounter import encounter_answer
-from lidar_mi.encounter.aircraft import Commands
-from lidar_mi.encounter.flight import aircraft_of, simulate_flights
-from lidar_mi.encounter.wake import wake_along_path
+from lidar_mi.encounter.flight import simulate_flights
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
 
@@ -78,6 +79,7 @@ def test_commands_keep_the_limits(flights, experiment):
     assert np.allclose(flights.series["control_roll_moment"], power * deflection)
 
 
+@pytest.mark.slow
 def test_what_was_seen_is_not_forgotten(experiment):
     """A lidar that goes blind after the tenth slab: those slabs are still ahead, and steered by."""
     blind = SyntheticLidar(wake_along_path(experiment), blind=lambda number: number > 10)

@@ -14,13 +14,13 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.cli.fly import fly as command
 from lidar_mi.encounter.check import geometry
-from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
 from lidar_mi.instrument.scan import Scan
-from tests.support.command_line import shell
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.reading import check
+from tests.support.command_line import in_process
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
 
@@ -158,7 +158,7 @@ def flown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flown") / "out"
     changes = ("start=60 m", "beyond=10 m", "crossing_angle=20 deg")
     sets = [part for one in changes for part in ("--set", f"encounter.path.{one}")]
-    return shell("fly", "encounter", "--mode", "off", *sets, "-o", folder), folder
+    return in_process("fly", "encounter", "--mode", "off", *sets, "-o", folder), folder
 
 
 def test_the_command_flies(flown):
@@ -170,7 +170,7 @@ def test_the_command_flies(flown):
 
 def test_info_shows_a_flight(flown):
     """Its settings in usual units, without those that have no effect, and its numbers."""
-    done = shell("info", flown[1])
+    done = in_process("info", flown[1])
     assert done.returncode == 0, done.stderr
     for words in ("encounter.path.crossing_angle", "20 deg", "532 nm", "largest roll angle"):
         assert words in done.stdout

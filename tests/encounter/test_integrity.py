@@ -11,15 +11,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from lidar_mi.encounter.aircraft import AircraftState
-from lidar_mi.encounter.control import feedforward, no_loads
-from lidar_mi.encounter.flight import aircraft_of, simulate_flight
+from lidar_mi.aircraft.control import feedforward, no_loads
+from lidar_mi.aircraft.models import aircraft_of
+from lidar_mi.aircraft.state import AircraftState
+from lidar_mi.aircraft.strips import Loads
+from lidar_mi.encounter.ahead.preview import preview_in
+from lidar_mi.encounter.flight import simulate_flight
 from lidar_mi.encounter.integrity import FALSE_ALARMS, PREDICTION_ERROR, Integrity
-from lidar_mi.encounter.preview import preview_in
-from lidar_mi.encounter.strips import Loads
-from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import encounter_keys
 
 

@@ -10,14 +10,14 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
-from lidar_mi.encounter.aircraft import Commands
-from lidar_mi.encounter.preview import WakeTracker
+from lidar_mi.aircraft.state import Commands
+from lidar_mi.encounter.ahead.preview import WakeTracker
 from lidar_mi.encounter.replay import NOT_RECORDED, recorded_flight, recorded_lidar
-from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
-from tests.support.command_line import shell
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
+from lidar_mi.schema.reading import check
+from tests.support.command_line import in_process
 from tests.support.synthetic_lidar import STDERR, SyntheticLidar, encounter_keys
 
 
@@ -77,6 +77,7 @@ def test_another_controller_has_the_same_estimates(flown):
     )
 
 
+@pytest.mark.slow
 def test_aircraft_and_latency_may_change(flown):
     _, folder = flown
     one = experiment(aircraft={"aileron_rate": "5 deg/s"}, control={"latency": "0.3 s"})
@@ -120,14 +121,15 @@ def test_what_is_no_flight(flown, tmp_path):
         lm.fly(experiment(path=short), replay=tmp_path / "off", notice=silent)
 
 
+@pytest.mark.slow
 def test_the_command(flown, tmp_path):
     _, folder = flown
     sets = ("--set", "encounter.control.latency=0.2 s")
-    done = shell("fly", "--replay", folder, *sets, "-o", tmp_path / "again")
+    done = in_process("fly", "--replay", folder, *sets, "-o", tmp_path / "again")
     assert done.returncode == 0, done.stderr
     assert (
         "Beyond the autopilot, the lidar removes" in done.stdout
         and (tmp_path / "again" / "track.nc").is_file()
     )
-    done = shell("fly")
+    done = in_process("fly")
     assert done.returncode == 2 and "EXPERIMENT: missing; expected an experiment" in done.stderr

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.encounter.aircraft import AircraftState, Commands
-from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.preview import Slab, WakeTracker
+from lidar_mi.aircraft.state import AircraftState, Commands
+from lidar_mi.aircraft.strips import Loads
+from lidar_mi.encounter.ahead.preview import Slab, WakeTracker
+from lidar_mi.encounter.lidar.estimate import Estimate
 from lidar_mi.encounter.series import QUANTITIES, FlightRecorder, flights_dataset, track_dataset
-from lidar_mi.encounter.strips import Loads
-from lidar_mi.encounter.wake import wake_along_path
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import STDERR, SyntheticLidar, encounter_keys
 
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import xarray as xr
 
-from lidar_mi.encounter.estimate import Estimate
+from lidar_mi.encounter.lidar.estimate import Estimate
 from lidar_mi.encounter.slab_recorder import SlabRecorder
 
 

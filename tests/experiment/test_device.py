@@ -9,13 +9,13 @@ import pytest
 import torch
 
 import lidar_mi as lm
-from lidar_mi.encounter.virtual_lidar import VirtualLidar
+from lidar_mi.encounter.lidar.virtual_lidar import VirtualLidar
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import device, run
 from lidar_mi.experiment.device import devices_in_words, on_its_device
-from lidar_mi.experiment.schema.reading import settings
 from lidar_mi.rendering.settings import VARIANTS
 from lidar_mi.rendering.variant import has_cuda
+from lidar_mi.schema.reading import settings
 from tests.support.encounters import small_encounter
 from tests.support.experiments import check, small
 
@@ -106,11 +106,12 @@ def computed(monkeypatch):
         return torch.device("cpu")
 
     monkeypatch.setattr("lidar_mi.retrieval.checks.device_of", device_of)
-    for module in ("lidar_mi.experiment.run", "lidar_mi.encounter.virtual_lidar"):
+    for module in ("lidar_mi.experiment.run", "lidar_mi.encounter.lidar.virtual_lidar"):
         monkeypatch.setattr(f"{module}.on_its_device", lambda experiment: experiment)
     return names
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_all_winds_and_vortices_of_a_run_are_retrieved_there(computed):
     """Bound, winds, texture sweep, budget, noise of the simulation, vortices."""

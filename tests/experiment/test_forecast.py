@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi import load_experiment
-from lidar_mi.atmosphere.wake import resample
+from lidar_mi.atmosphere.vortices.wake import resample
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.memory import PER_ADVECTED, Footprint
@@ -199,6 +199,7 @@ def test_check_refuses_from_the_forecast_before_the_truth(changes, says, tmp_pat
         list(sections(check(data), tmp_path))
 
 
+@pytest.mark.slow
 def test_memory_of_a_volume_that_is_advected(monkeypatch):
     """As much as is used, to a factor of two, and no beam for each of its nodes."""
     asked = load_experiment("wake_changing", wake={"spacing": "1 m"})

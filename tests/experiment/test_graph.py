@@ -22,10 +22,10 @@ from lidar_mi.experiment.graph import But, Graph, Guard, Only, Stage, parameters
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import STAGES, Results, stages_of
 from lidar_mi.experiment.run import complete, prepare, run
-from lidar_mi.experiment.schema import reading as config
-from lidar_mi.experiment.schema.wake import Wake
-from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.schema import reading as config
+from lidar_mi.schema.shipped import experiment_file
+from lidar_mi.schema.wake import Wake
 from tests.support.experiments import check, small
 
 
@@ -235,6 +235,7 @@ def counted(monkeypatch):
     gc.collect()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_a_run_in_memory_writes_nothing_and_computes_each_stage_once(
     tmp_path, monkeypatch, counted

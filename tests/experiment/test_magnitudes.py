@@ -8,9 +8,9 @@ import pytest
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.magnitudes import USUAL, unusual
-from lidar_mi.experiment.schema.keys import explain
-from lidar_mi.experiment.schema.reading import load, load_variants
-from lidar_mi.experiment.shipped import experiments
+from lidar_mi.schema.keys import explain
+from lidar_mi.schema.reading import load, load_variants
+from lidar_mi.schema.shipped import experiments
 
 SCENES = Path(__file__).parents[2] / "scenes"
 

@@ -11,8 +11,8 @@ import pytest
 from scipy import constants
 from scipy.optimize import minimize_scalar
 
-from lidar_mi.atmosphere.line import backscatter_line
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.scattering.line import backscatter_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import receivers
 from lidar_mi.experiment.stages.ring_instrument import air_rings

@@ -11,7 +11,7 @@ from rich.console import Console
 
 import lidar_mi as lm
 from lidar_mi.experiment import results
-from lidar_mi.experiment.schema.reading import dump
+from lidar_mi.schema.reading import dump
 from tests.support.experiments import check, small, write_wake
 
 WORDS = "name: windy\nwake: {file: mine.nc}\nrender: {samples_per_beam: 4, max_order: 1}\n"

@@ -12,8 +12,8 @@ import pytest
 from lidar_mi.experiment.folder.run_folder import made_by, new_record
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.run import prepare
-from lidar_mi.experiment.schema import reading
-from lidar_mi.experiment.schema.reading import load_experiment
+from lidar_mi.schema import reading
+from lidar_mi.schema.reading import load_experiment
 from tests.support.experiments import small
 
 DOPPLER = {

@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 from scipy import integrate
 
-from lidar_mi.atmosphere.line import Line, backscatter_line
+from lidar_mi.atmosphere.scattering.line import Line, backscatter_line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import (

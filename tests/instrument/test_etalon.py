@@ -14,7 +14,7 @@ import tmm
 from pydantic import ValidationError
 from scipy import constants, integrate
 
-from lidar_mi.atmosphere.line import backscatter_line, laser_line
+from lidar_mi.atmosphere.scattering.line import backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import (
     Etalon,

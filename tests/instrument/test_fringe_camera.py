@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from scipy import constants, stats
 from scipy.spatial.transform import Rotation
 
-from lidar_mi.atmosphere.line import backscatter_line, laser_line
+from lidar_mi.atmosphere.scattering.line import backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.etalon import Etalon

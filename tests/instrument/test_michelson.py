@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 from scipy import constants, integrate
 
-from lidar_mi.atmosphere.line import backscatter_line
+from lidar_mi.atmosphere.scattering.line import backscatter_line
 from lidar_mi.instrument.michelson import Michelson, harmonics, transmission
 
 OFFSETS = np.array([-7e9, -1.3e9, 0.0, 0.4e9, 2e9, 5.6e9])

@@ -15,7 +15,7 @@ from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
 from lidar_mi.instrument.motion import Motion, true_pose
 from lidar_mi.instrument.reported import Reported, reported_pose
-from lidar_mi.retrieval.lines.vectors import line_places, wind_from_triples
+from lidar_mi.retrieval.combined.vectors import line_places, wind_from_triples
 
 LIDAR, SCAN, SPEED = DopplerLidar(range=76), DopplerScan(), 150.0
 SHAKEN = Motion(

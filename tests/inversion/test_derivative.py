@@ -36,6 +36,7 @@ PROFILE = np.array([0.5, 1.5, 2.0, 0.8, 0.5, 0.7])
 PROFILE = PROFILE / PROFILE.sum() / 20
 
 
+@pytest.mark.slow
 def test_simplified_derivative_costs_little_and_states_no_smaller_errors(variant):
     """Covariance of the estimating function's root: the sandwich, with the derivative D of all
     orders by central differences with common random numbers."""

@@ -56,7 +56,7 @@ def refused(path, *words, **asked):
     return str(caught.value)
 
 
-@pytest.mark.parametrize("first", range(0, 60, 20))
+@pytest.mark.parametrize("first", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (20, 40))])
 def test_any_features(first):
     assert not [said for seed in range(first, first + 20) if (said := check(seed))]
 

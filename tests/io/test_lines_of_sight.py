@@ -230,6 +230,7 @@ def test_names_of_other_files(known, tmp_path):
     np.testing.assert_allclose(found["radial_velocity"], known.velocity, rtol=1e-6)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.sampled_from(["arm", "windcube", "cfradial1", "cfradial2"]), st.integers(0, 2**31))
 def test_damaged_netcdf_files_give_a_line_or_what_can_be_read(tmp_path_factory, kind, seed):

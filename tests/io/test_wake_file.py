@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.wake import resample
+from lidar_mi.atmosphere.vortices.wake import resample
 from lidar_mi.errors import InputError
 from lidar_mi.io.wake_file import read_wake
 from lidar_mi.units import parse_units

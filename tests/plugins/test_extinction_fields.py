@@ -36,7 +36,7 @@ def assert_standard(found):
 
 
 def test_single_scattering():
-    assert_standard(deviations(range(40)))
+    assert_standard(deviations(range(12)))
 
 
 @pytest.mark.slow
@@ -60,6 +60,7 @@ def second_order(seeds):
     return found, np.average(ratios, weights=weights), 1 / np.sqrt(np.sum(weights))
 
 
+@pytest.mark.slow
 def test_double_scattering():
     found, ratio, error = second_order(range(4))
     assert {seed: z for seed, z in found.items() if abs(z) > 5} == {}

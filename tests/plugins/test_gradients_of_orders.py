@@ -151,6 +151,7 @@ def test_forward_is_the_transpose_of_backward(name):
         assert abs((gradient * tangent).sum() - image[gate, component]) < 1e-4 * scale
 
 
+@pytest.mark.slow
 def test_light_of_an_order_is_proportional_to_a_power_of_the_albedo():
     """Euler's relation of a uniform albedo: a dS/da = k S of the order k."""
     values = reference.extinction(1.0, True)
@@ -180,6 +181,7 @@ def test_a_table_has_no_gradient_along_itself():
     assert not gradient[:, 0].any()
 
 
+@pytest.mark.slow
 def test_air_that_does_not_scatter_has_a_gradient():
     """One-sided differences where the extinction is 0."""
     values = reference.extinction(1.0, True)

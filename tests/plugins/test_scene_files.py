@@ -219,6 +219,7 @@ def test_profile_of_500_gates():
     assert above < 0.5 * inside
 
 
+@pytest.mark.slow
 def test_puff_from_a_grid():
     """The shipped grid is the stated Gaussian; its image obeys the lidar equation along the
     axis of every beam, blurred by the beam's 0.16 m. Cells of 1 m: trilinear air lies below the

@@ -71,12 +71,14 @@ def test_of_the_depolarisation_ratio(world):
     assert np.median(alone / stated) > 2
 
 
+@pytest.mark.slow
 def test_of_analog_samples(world):
     found = images(world, "1, 0.3, 0.5, 0.7", "rayleigh_polarized", 4000, estimator="analog")
     for component in ("S0", "S1", "S2", "S3"):
         assert_stated(found[component], found[f"{component}_stderr"])
 
 
+@pytest.mark.slow
 def test_of_one_pass_and_of_many(world):
     arguments = (world, "1, 0.3, 0.5, 0.7", "rayleigh_polarized", 64, 1)
     one, many = images(*arguments), images(*arguments, samples_per_pass=50)

@@ -14,7 +14,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from lidar_mi.atmosphere.line import Line, backscatter_line
+from lidar_mi.atmosphere.scattering.line import Line, backscatter_line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, coated_transmission
 from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_image

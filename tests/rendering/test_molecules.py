@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.molecules import molecular_table
+from lidar_mi.atmosphere.scattering.molecules import molecular_table
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.reading import check
-from lidar_mi.experiment.schema.scattering import Scattering
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
@@ -19,6 +17,8 @@ from lidar_mi.io.scattering_table import aerosol_table
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import molecules, scatterer
 from lidar_mi.rendering.settings import RenderSettings
+from lidar_mi.schema.reading import check
+from lidar_mi.schema.scattering import Scattering
 
 WAVELENGTH, MOLECULES, AROUND = 532e-9, 7e-5, 1e-4
 AXIS = np.arange(-4.0, 4.5, 0.5)

@@ -7,11 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from lidar_mi.atmosphere.molecules import molecular_scattering
+from lidar_mi.atmosphere.scattering.molecules import molecular_scattering
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.scattering import Scattering
 from lidar_mi.io.scattering_table import aerosol_table, is_complete, write_table
 from lidar_mi.rendering.phase import backscatter_phase_function, loadable, scatterer, table_files
+from lidar_mi.schema.scattering import Scattering
 
 pytestmark = pytest.mark.usefixtures("variant")
 

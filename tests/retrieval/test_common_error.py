@@ -13,10 +13,11 @@ import xarray as xr
 from scipy.stats import norm
 
 from lidar_mi.atmosphere.texture import gaussian_field
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
+from lidar_mi.retrieval.combined.combine import combine
 from lidar_mi.retrieval.common_error import (
     common_rotation,
     common_stderr,
@@ -24,7 +25,6 @@ from lidar_mi.retrieval.common_error import (
     with_common_error,
 )
 from lidar_mi.retrieval.images.gridding import on_nodes
-from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.vortices.acceptance import no_fit
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.memory import most_samples
 from lidar_mi.experiment.preflight import check
-from lidar_mi.experiment.schema import reading
+from lidar_mi.schema import reading
 from tests.support.cases import Case
 from tests.support.hostile_experiments import as_yaml, settings
 

@@ -3,6 +3,11 @@
 import re
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from types import SimpleNamespace
+
+import pytest
 
 TINY = """\
 name: tiny
@@ -15,6 +20,7 @@ retrieval: {methods: [cc]}
 
 
 def shell(*arguments, **options):
+    """The command in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "lidar_mi.cli.app", *map(str, arguments)],
         capture_output=True,
@@ -22,6 +28,22 @@ def shell(*arguments, **options):
         timeout=120,
         check=False,
         **options,
+    )
+
+
+def in_process(*arguments, cwd=None):
+    """The command in this process, which is 3 s faster: exit code and what it printed."""
+    from lidar_mi.cli import app
+
+    printed, said = StringIO(), StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed), redirect_stderr(said):
+        patch.setattr(sys, "argv", ["lidar-mi", *map(str, arguments)])
+        if cwd:
+            patch.chdir(cwd)
+        with pytest.raises(SystemExit) as stop:
+            app.main()
+    return SimpleNamespace(
+        returncode=stop.value.code or 0, stdout=printed.getvalue(), stderr=said.getvalue()
     )
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from tests.support.flows import axes, origin, plane_waves, texture
 
 DT = 0.1

@@ -6,9 +6,9 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.encounter.flight import FlightData, simulate_flights
-from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.experiment.truth.wake_along_path import wake_along_path
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
 

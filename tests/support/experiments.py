@@ -13,8 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from lidar_mi import __version__
 from lidar_mi.experiment import pipeline
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.io import png
+from lidar_mi.schema import reading as config
 
 _PNG = png._png
 FIXED = {"axes.titley": 1.0, "legend.loc": "upper right"}

@@ -28,11 +28,11 @@ from lidar_mi.cli.exit_codes import exit_by
 from lidar_mi.experiment import measure, pipeline, report
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.graph import Stage
-from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.rendering import IMAGES, batches_of
 from lidar_mi.io.exr import QUANTITIES, label_scan
 from lidar_mi.io.png import png_bytes
 from lidar_mi.rendering import batches
+from lidar_mi.schema import reading
 
 SETTINGS = {
     "name": "faults",

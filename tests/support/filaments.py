@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidar_mi.atmosphere.filaments import Curve, Filaments, node_count
+from lidar_mi.atmosphere.vortices.filaments import Curve, Filaments, node_count
 
 
 def ring(radius, core_radius, model):

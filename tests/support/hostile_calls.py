@@ -10,7 +10,7 @@ import xarray as xr
 from hypothesis import strategies as st
 
 import lidar_mi as lm
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from tests.support.cases import Case
 from tests.support.hostile_experiments import BASE, as_yaml
 from tests.support.hostile_files import exr_file, image_file

@@ -10,7 +10,7 @@ import yaml
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import Unit, Within
 from tests.support.cases import Case
 from tests.support.hostile_values import ANYTHING, NUMBERS, damaged

@@ -10,9 +10,9 @@ import numpy as np
 import scipy
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import find_cores, ring_averages
 from lidar_mi.atmosphere.air.turbulence import turbulence
-from lidar_mi.atmosphere.vortex import Vortex, angular_velocity, velocity
+from lidar_mi.atmosphere.vortices.cores import find_cores, ring_averages
+from lidar_mi.atmosphere.vortices.vortex import Vortex, angular_velocity, velocity
 from lidar_mi.instrument.coherent.measurement import measured_lines
 from lidar_mi.instrument.coherent.scans import LineScan, rhi_scan
 from lidar_mi.instrument.coherent.weighting import CoherentLidar

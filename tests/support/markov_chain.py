@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidar_mi.encounter.jump_linear import stationary_distribution
+from lidar_mi.encounter.control_block.jump_linear import stationary_distribution
 
 
 def chain(random, transition, number, records=1):

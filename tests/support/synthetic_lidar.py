@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from lidar_mi.atmosphere.wake_path import WakeAlongPath
-from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.aircraft.pose import AircraftPose
+from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
+from lidar_mi.encounter.lidar.estimate import Estimate
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 STDERR = np.array([4.0, 0.03, 0.15, 0.15, 4.0, 0.03, 0.15, 0.15, 0.1, 0.1])

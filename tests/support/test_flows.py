@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from tests.support.flows import axes, origin, plane_waves, texture
 
 

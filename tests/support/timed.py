@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
 DT, DURATION = 0.1, 0.1

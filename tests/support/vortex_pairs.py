@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.atmosphere.vortices.vortex import Vortex
 
 
 def vector(*vortices, mean=(0.0, 0.0)):

@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.wake_path import CROW_WAVELENGTH, PairAlongPath
+from lidar_mi.atmosphere.vortices.wake_path import CROW_WAVELENGTH, PairAlongPath
 
 SEPARATION = 24.0
 

@@ -13,7 +13,7 @@ from filelock import FileLock
 
 from lidar_mi.cli import app as cli
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment.schema import reading as config
+from lidar_mi.schema import reading as config
 from tests.support.command_line import TINY
 from tests.support.experiments import sketched_figures, whole_figures, without_figures
 

@@ -150,6 +150,7 @@ def test_images_of_a_detector_come_first(here, lidar_mi):
     assert code == 2 and "1.exr: without the layer Y_noisy" in err and "--layer Y" in err
 
 
+@pytest.mark.slow
 def test_thresholds_flag_more(here, lidar_mi):
     def valid(*more):
         code, *_ = lidar_mi("retrieve", "0.exr", "1.exr", "--method", "cc", *OPTIONS, *more)

@@ -37,6 +37,7 @@ def test_run_writes_into_the_given_folder_and_prints_it(there, lidar_mi, quick):
     assert not (there / "outputs").exists()
 
 
+@pytest.mark.slow
 def test_a_device_turns_variants_and_is_in_the_log(there, lidar_mi, quick):
     """Of a file that asks for CUDA, which need not be there."""
     cuda = ("--set", "render.variant=cuda_ad_mono_polarized")

@@ -15,8 +15,8 @@ import yaml
 
 from lidar_mi.cli import app as cli
 from lidar_mi.cli.options import complete_change, complete_key, complete_shipped
-from lidar_mi.experiment.schema import keys, reading
-from lidar_mi.experiment.shipped import (
+from lidar_mi.schema import keys, reading
+from lidar_mi.schema.shipped import (
     campaigns,
     described,
     experiments,

@@ -11,7 +11,7 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.assessment.figures.line_vortices import draw_line_vortices
 from tests.support import figure_rules
-from tests.support.command_line import shell, words_of
+from tests.support.command_line import in_process, words_of
 from tests.support.line_wakes import Family, drawn, slices
 
 
@@ -37,7 +37,9 @@ def folder(tmp_path_factory):
 
 def test_vortices_of_two_scans(folder, tmp_path):
     files = [folder / f"rhi_{k}.csv" for k in (0, 1)]
-    done = shell("vortices", *files, "--gate-length", "30 m", "--noise", "0.08 m/s", cwd=tmp_path)
+    done = in_process(
+        "vortices", *files, "--gate-length", "30 m", "--noise", "0.08 m/s", cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     words = words_of(done.stdout)
     assert "2 of 2 scans show a wake, 2 have a valid fit." in words
@@ -49,7 +51,7 @@ def test_vortices_of_two_scans(folder, tmp_path):
     assert (tmp_path / "vortices.png").stat().st_size > 10_000
     figure = draw_line_vortices(lm.read_lines_of_sight(files), expected)
     assert len(figure.axes) == 4 and figure_rules.faults(figure) == []
-    table = shell("vortices", files[0], "-o", "v.csv", "--noise", "0.08 m/s", cwd=tmp_path)
+    table = in_process("vortices", files[0], "-o", "v.csv", "--noise", "0.08 m/s", cwd=tmp_path)
     assert table.returncode == 0, table.stderr
     head = (tmp_path / "v.csv").read_text().splitlines()[0]
     assert "circulation [m2 s-1]" in head and "flag in words" in head
@@ -68,7 +70,7 @@ def test_vortices_of_two_scans(folder, tmp_path):
     ],
 )
 def test_bad_input_is_one_line(folder, arguments, message):
-    done = shell("vortices", *arguments, cwd=folder)
+    done = in_process("vortices", *arguments, cwd=folder)
     assert done.returncode == 2 and message in words_of(done.stderr)
     assert done.stderr.count("\n") <= 2
 
@@ -88,7 +90,7 @@ def test_a_scan_without_vortices_says_why(tmp_path, name, elevation, code, messa
             for r in range(405, 900, 30)
         ]
     (tmp_path / f"{name}.csv").write_text("\n".join(rows))
-    done = shell("vortices", f"{name}.csv", cwd=tmp_path)
+    done = in_process("vortices", f"{name}.csv", cwd=tmp_path)
     assert done.returncode == code and message in words_of(done.stderr)
     # a scan without a wake has its score and false-alarm probability in the file
     assert (tmp_path / "vortices.nc").exists() == (name == "calm")

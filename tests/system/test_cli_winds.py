@@ -12,7 +12,7 @@ import lidar_mi as lm
 from lidar_mi.assessment.figures.wind_profile import draw_wind_profiles
 from tests.support import figure_rules
 from tests.support import line_files as made
-from tests.support.command_line import shell, words_of
+from tests.support.command_line import in_process, words_of
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def scan(tmp_path):
 
 
 def test_winds_of_a_scan(scan, tmp_path):
-    done = shell("winds", scan, "--noise", "0.02 m/s", cwd=tmp_path)
+    done = in_process("winds", scan, "--noise", "0.02 m/s", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     words = words_of(done.stdout)
     assert "remark: vad.hpl: the header promises 9 rays, the file has 6" in words
@@ -34,7 +34,7 @@ def test_winds_of_a_scan(scan, tmp_path):
             np.testing.assert_allclose(found[name], expected[name], atol=1e-6)
             assert (np.abs(found[name] - known) < 5 * found[f"{name}_stderr"]).all()
     assert (tmp_path / "winds.png").stat().st_size > 10_000
-    table = shell("winds", scan, "-o", "winds.csv", "--interval", "1 min", cwd=tmp_path)
+    table = in_process("winds", scan, "-o", "winds.csv", "--interval", "1 min", cwd=tmp_path)
     assert table.returncode == 0, table.stderr
     assert (tmp_path / "winds.csv").read_text().startswith("time,height")
 
@@ -42,7 +42,7 @@ def test_winds_of_a_scan(scan, tmp_path):
 def test_no_figure_without_a_valid_wind(tmp_path):
     """Lines that are all vertical say nothing of the horizontal wind."""
     (tmp_path / "up.hpl").write_text(made.halo_text(made.lines(elevation=89.9)))
-    done = shell("winds", "up.hpl", cwd=tmp_path)
+    done = in_process("winds", "up.hpl", cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     reasons = "(flags: ill_conditioned 17, uncertain 17)"
     assert words_of(done.stderr) == f"lidar-mi: no valid wind of 17 {reasons}"
@@ -70,7 +70,7 @@ def test_no_figure_without_a_valid_wind(tmp_path):
 )
 def test_bad_input_is_one_line(scan, tmp_path, arguments, message):
     (tmp_path / "stare.hpl").write_text(made.halo_text(made.lines(elevation=90.0)))
-    done = shell("winds", *arguments, cwd=tmp_path)
+    done = in_process("winds", *arguments, cwd=tmp_path)
     assert done.returncode == 2 and message in words_of(done.stderr)
     assert done.stderr.count("\n") == 1 and not (tmp_path / "winds.nc").exists()
 

@@ -13,7 +13,6 @@ from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import attenuated_backscatter_stderr
@@ -22,6 +21,7 @@ from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.io import exr
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
+from lidar_mi.schema import reading as config
 
 pytestmark = pytest.mark.slow
 

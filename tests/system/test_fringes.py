@@ -22,11 +22,11 @@ from lidar_mi.cli.run import run as run_command
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.schema import reading as config
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.ring_images import summed
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.io.exr import read_fringes
+from lidar_mi.schema import reading as config
+from lidar_mi.schema.experiment import Experiment
 from tests.support.experiments import leave_out_figures, sketched_figures
 
 # 25 % of the default camera's pixels see the same four rings

@@ -150,6 +150,7 @@ def test_a_rendered_image_names_its_unit(folder, tmp_path):
 MERCURY, GAP = 404.7708e-9, 13.7031234e-3
 
 
+@pytest.mark.slow
 def test_the_gap_from_two_lines(folder, tmp_path):
     """Of 3 um more than the nominal one: the whole order is printed, and a wrong line refused."""
     instrument = Instrument().binned(4)

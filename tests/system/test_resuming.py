@@ -48,6 +48,7 @@ def test_the_wake_is_read_once(tmp_path, monkeypatch):
     assert len(read) == 1 and "texture_sweep.40_percent.rmse_v" in metrics
 
 
+@pytest.mark.slow
 def test_a_rerun_uses_the_images(tmp_path, quick):
     folder = tmp_path / "run"
     before = run(check(small()), folder).metrics

@@ -81,6 +81,7 @@ def test_a_study_is_refused_in_a_folder_at_work(there, lidar_mi):
     assert not list((there / "out").iterdir())
 
 
+@pytest.mark.slow
 def test_images_of_another_seed_are_not_used(tmp_path, quick):
     folder, other = tmp_path / "run", tmp_path / "other"
     run(check(small()), folder)

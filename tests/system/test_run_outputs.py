@@ -18,8 +18,8 @@ from PIL import Image
 
 import lidar_mi as lm
 from lidar_mi.experiment.folder.run_folder import IMAGES
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.io.exr import read_scan
+from lidar_mi.schema import reading as config
 from tests.support.experiments import FIGURES, SOURCES
 
 SCENES = Path(str(files("lidar_mi.scenes")))

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.requirements import (
     Requirement,
     RequirementTable,
@@ -22,13 +21,13 @@ from lidar_mi.assessment.metrics.requirements import (
 )
 from lidar_mi.assessment.metrics.sensor import limit_metrics, vector_metrics
 from lidar_mi.assessment.report import sensor as sensor_report
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import judged
 from lidar_mi.experiment.preflight import check
 from lidar_mi.experiment.run import prepare, run
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages.sensor import (
     combine_settings,
     doppler_alone,
@@ -37,6 +36,7 @@ from lidar_mi.experiment.stages.sensor import (
 )
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
+from lidar_mi.schema import reading as config
 from tests.support.experiments import (
     QUICK_DOPPLER,
     leave_out_figures,

@@ -24,7 +24,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment import study
 from lidar_mi.experiment.describe import sections
-from lidar_mi.experiment.schema import reading as config
+from lidar_mi.schema import reading as config
 from tests.support.experiments import leave_out_figures
 
 SCENES = Path(str(files("lidar_mi.scenes"))).resolve()
@@ -284,9 +284,13 @@ def test_shipped_experiments_are_documented():
 @pytest.mark.parametrize(
     ("name", "one"),
     [
-        # carrying air on in three dimensions takes 4 to 12 s
+        # carrying air on in three dimensions and reading a series of states take 4 to 30 s
         pytest.param(
-            name, one, marks=[pytest.mark.slow] * (name in ("wake_3d", "turbine")), id=name
+            name,
+            one,
+            marks=[pytest.mark.slow]
+            * (name in ("wake_3d", "turbine", "real_wakes", "wake_changing")),
+            id=name,
         )
         for name, one in shipped()
     ],

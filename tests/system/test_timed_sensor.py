@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.stats import chi2
 
 import lidar_mi as lm
-from lidar_mi.experiment.schema import reading as config
+from lidar_mi.schema import reading as config
 from tests.support.experiments import QUICK_DOPPLER, without_figures
 
 DT = 0.1

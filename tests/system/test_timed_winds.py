@@ -6,7 +6,7 @@ Detects times that are lost or used where air is frozen: 0.3 m/s of 10 m/s.
 import pytest
 
 import lidar_mi as lm
-from lidar_mi.experiment.schema import reading as config
+from lidar_mi.schema import reading as config
 from tests.support.experiments import write_wake
 from tests.support.flows import plane_waves, texture
 

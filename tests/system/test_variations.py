@@ -12,11 +12,11 @@ import xarray as xr
 
 from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.io.exr import read_scan
+from lidar_mi.schema import reading as config
 from tests.support.experiments import FIGURES, SOURCES, as_seen, check, small, without_figures
 
 SCENES = Path(str(files("lidar_mi.scenes")))

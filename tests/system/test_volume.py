@@ -17,11 +17,11 @@ from lidar_mi.assessment.figures.volume import draw_all
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.run import prepare, run
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.retrieval.images.common_grid import resample
+from lidar_mi.schema import reading as config
 from tests.support import figure_rules
 
 SCENES = Path(str(files("lidar_mi.scenes")))

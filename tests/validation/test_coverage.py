@@ -102,6 +102,7 @@ def test_rows_that_miss_are_bold():
     assert coverage._line(row(*[(np.nan, np.nan)] * 3, valid=0.0)).endswith("| all flagged |")
 
 
+@pytest.mark.slow
 def test_noise_beside_smoke_is_no_information():
     """Standard errors hold within three of their own errors, where most slopes are of noise."""
     found = coverage.measured("advected, texture 5 %, noise 1 %", "variational", [1])

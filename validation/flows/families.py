@@ -18,8 +18,8 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
-from lidar_mi.atmosphere.vortex import Model, Vortex, velocity, vortex_pair
-from lidar_mi.atmosphere.wake import centre
+from lidar_mi.atmosphere.vortices.vortex import Model, Vortex, velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.wake import centre
 from lidar_mi.io.wake_file import read_wake
 
 from .turbulence import Wind, turbulence

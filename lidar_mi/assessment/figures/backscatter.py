@@ -6,7 +6,7 @@ All of them show the slab from the pilot's view: port (+y) on the left, up (+z) 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
@@ -14,11 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.described import ObservedAir, Progress
 from lidar_mi.assessment.figures.accuracy import error_and_bound, error_by_texture, truth_vectors
 from lidar_mi.assessment.figures.plates import (
     Drawn,
     Plate,
+    Progress,
     arrow_scale,
     frame,
     image_panel,
@@ -29,10 +29,21 @@ from lidar_mi.assessment.figures.plates import (
     speed_of,
 )
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import deviations
 from lidar_mi.assessment.metrics.names import Source
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.plots import ARROWS, arrow_length
+
+
+class ObservedAir(Protocol):
+    """The true wind, on (z, y), and extinction of the observed air."""
+
+    @property
+    def wind(self) -> xr.Dataset:
+        """Components v and w, m/s."""
+
+    def image(self, which: int, smooth: bool = False) -> xr.DataArray:
+        """Extinction at one of both times, 1/m; ``smooth``: without texture."""
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.described import Progress
-from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, save_all
 from lidar_mi.assessment.metrics.coherent import PUBLISHED, vortex_errors
 
 _SHOWN = 3  # slices

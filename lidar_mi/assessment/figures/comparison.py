@@ -7,8 +7,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.described import Progress
-from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Progress, save_all
 from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.assessment.labels import BACKSCATTER
 

@@ -2,19 +2,37 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.described import DopplerDescription, Progress, RingImages
-from lidar_mi.assessment.figures.plates import Drawn, Plate, one_to_one, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, one_to_one, save_all
 from lidar_mi.assessment.metrics.names import bound_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.instrument.fringe_camera import ring_radii
 from lidar_mi.retrieval.rings.centre import circular_average
 from lidar_mi.retrieval.rings.peak_fit import peak
 from lidar_mi.retrieval.rings.peaks import PIECE, radial_cuts, savitzky_golay
+from lidar_mi.schema.doppler import Doppler
+
+
+class RingImages(Protocol):
+    """Images (height, width) of rings, photoelectrons per pixel of one pulse."""
+
+    @property
+    def emitted(self) -> np.ndarray:
+        """Of the laser."""
+
+    @property
+    def received(self) -> np.ndarray:
+        """Of air at the first speed, without noise."""
+
+    @property
+    def noisy(self) -> np.ndarray:
+        """The same by the CCD."""
+
 
 PUBLISHED = {
     "free": {"averaged": 20, "std": 2.5, "bias": 7.0},
@@ -32,7 +50,7 @@ _MARKERS = dict(zip(READERS, "oXs^Dv", strict=True))
 
 def draw_all(
     folder: Path,
-    doppler: DopplerDescription,
+    doppler: Doppler,
     exposure: RingImages,
     samples: xr.Dataset | None,
     found: xr.Dataset,
@@ -43,7 +61,7 @@ def draw_all(
 
     Parameters
     ----------
-    doppler : lidar_mi.experiment.schema.doppler.Doppler
+    doppler : lidar_mi.schema.doppler.Doppler
     exposure : lidar_mi.experiment.stages.ring_images.Exposure
         Images of the laser and of the air at the first speed, without and with noise.
     samples : xr.Dataset or None
@@ -72,7 +90,7 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
-def _rings(doppler: DopplerDescription, exposure: RingImages, samples: xr.Dataset | None) -> Plate:
+def _rings(doppler: Doppler, exposure: RingImages, samples: xr.Dataset | None) -> Plate:
     """The paper's figure 3, and the profiles of both."""
     panels = 3 if samples is not None else 2
     figure = Figure(figsize=(5.6 * panels, 4.6), layout="constrained")
@@ -116,7 +134,7 @@ def _rings(doppler: DopplerDescription, exposure: RingImages, samples: xr.Datase
     )
 
 
-def _cuts(doppler: DopplerDescription, exposure: RingImages) -> Plate:
+def _cuts(doppler: Doppler, exposure: RingImages) -> Plate:
     """The paper's figure 4."""
     figure = Figure(figsize=(12, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -152,7 +170,7 @@ def _cuts(doppler: DopplerDescription, exposure: RingImages) -> Plate:
     )
 
 
-def _errors(doppler: DopplerDescription, metrics: Mapping[str, float]) -> Plate:
+def _errors(doppler: Doppler, metrics: Mapping[str, float]) -> Plate:
     settings = doppler.retrieval
     figure = Figure(figsize=(6.2 * len(settings.centre), 8.2), layout="constrained")
     axes = figure.subplots(2, len(settings.centre), sharex=True, sharey="row", squeeze=False)
@@ -206,7 +224,7 @@ def _errors(doppler: DopplerDescription, metrics: Mapping[str, float]) -> Plate:
     )
 
 
-def _bias(doppler: DopplerDescription, exposure: RingImages, found: xr.Dataset) -> Plate:
+def _bias(doppler: Doppler, exposure: RingImages, found: xr.Dataset) -> Plate:
     figure = Figure(figsize=(16, 4.8), layout="constrained")
     *rings, last = figure.subplots(1, 3)
     camera = doppler.camera

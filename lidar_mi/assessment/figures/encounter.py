@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.encounter_loads import load_factor
-from lidar_mi.assessment.figures.plates import Drawn, Plate, arrow_scale, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, arrow_scale, save_all
 from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK

@@ -6,9 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.digits import whole_percent
-from lidar_mi.assessment.figures.plates import Drawn, Plate, save_all
+from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, save_all
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.error_budget import (
     CAUSES,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
@@ -13,11 +13,18 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.seen import TRUE_CORE, seen
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.png import write_png
+
+
+class Progress(Protocol):
+    """Takes the progress of the figures that are drawn."""
+
+    def bar(self, text: str, fraction: float | None) -> None:
+        """The text with a bar; None: of unknown length."""
+
 
 UNIFORM = 5e-3
 """Relative range of colours below which a field is called uniform."""

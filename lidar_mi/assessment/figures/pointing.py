@@ -6,10 +6,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.plates import (
     Drawn,
     Plate,
+    Progress,
     arrow_scale,
     frame,
     image_panel,

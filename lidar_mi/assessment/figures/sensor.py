@@ -8,14 +8,13 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, Plate, mark_cores, save_all
-from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.retrieval.lines.vectors import COMPONENTS, line_places
+from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, mark_cores, save_all
+from lidar_mi.atmosphere.vortices.cores import Core
+from lidar_mi.retrieval.combined.vectors import COMPONENTS, line_places
 
 _SPEED = "m s$^{-1}$"
 
@@ -28,8 +27,8 @@ def draw_all(
     Parameters
     ----------
     found : xr.Dataset or None
-        From `lidar_mi.retrieval.lines.combine.combine`, with the truth as u_true, v_true, w_true.
-        None: there is no wind.
+        From `combined.combine.combine`, with the truth as u_true, v_true, w_true. None: there is
+        no wind.
     lines : xr.Dataset
         From `lidar_mi.experiment.stages.lines.measure_lines`.
     """

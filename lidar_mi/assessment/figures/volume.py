@@ -10,14 +10,20 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from lidar_mi.assessment.described import Progress
 from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, Plate, by_factors, mark_cores, save_all
+from lidar_mi.assessment.figures.plates import (
+    Drawn,
+    Plate,
+    Progress,
+    by_factors,
+    mark_cores,
+    save_all,
+)
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 
 _SPEED = "m s$^{-1}$"
 _COMPONENTS = ("u", "v", "w")

@@ -10,11 +10,17 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lidar_mi.assessment.described import Progress
-from lidar_mi.assessment.figures.plates import Drawn, Plate, arrow_scale, save_all, speed_of
+from lidar_mi.assessment.figures.plates import (
+    Drawn,
+    Plate,
+    Progress,
+    arrow_scale,
+    save_all,
+    speed_of,
+)
 from lidar_mi.assessment.figures.seen import TRUE_CORE
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.plots import ARROWS, arrow_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 

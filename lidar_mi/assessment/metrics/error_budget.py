@@ -11,8 +11,8 @@ import scipy
 import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 from lidar_mi.retrieval.method_names import ImageMethod
 
 CAUSES = {

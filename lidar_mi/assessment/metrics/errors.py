@@ -7,7 +7,7 @@ import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 
 
 def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:

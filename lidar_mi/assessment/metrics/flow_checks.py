@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, ring_averages
+from lidar_mi.atmosphere.vortices.cores import Core, ring_averages
 
 MOST_DIVERGENCE = 0.5
 """Of a cross-section, by `relative_divergence`. Sections of a simulated wake have 0.1, those of

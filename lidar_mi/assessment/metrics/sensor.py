@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable
-from lidar_mi.retrieval.lines.combine import CombinedFlag
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
+from lidar_mi.retrieval.combined.combine import CombinedFlag
 
 COMPONENTS = ("u", "v", "w")
 
@@ -52,8 +52,7 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
     Parameters
     ----------
     found : xr.Dataset or None
-        From `lidar_mi.retrieval.lines.combine.combine`, with u_true, v_true, w_true; None: there is
-        no wind.
+        From `combined.combine.combine`, with u_true, v_true, w_true; None: there is no wind.
     """
     if found is None:
         return {"sensor.valid_fraction": 0.0, "sensor.vectors": 0}

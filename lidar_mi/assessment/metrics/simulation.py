@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.names import (
     OUTSIDE_CORES,
     RENDERED,
@@ -16,6 +15,7 @@ from lidar_mi.assessment.metrics.names import (
     far_from_cores,
     wind_key,
 )
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 
 
 def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics
 from lidar_mi.assessment.metrics.names import wind_key
 from lidar_mi.assessment.metrics.winds import true_wind_metrics
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 
 COMPONENTS = ("u", "v", "w")
 

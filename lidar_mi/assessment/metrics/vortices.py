@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores, ring_averages
 from lidar_mi.assessment.metrics.errors import error_statistics
 from lidar_mi.assessment.metrics.names import vortex_key
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores, ring_averages
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.vortices.pair import VortexPairFit

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics, wind_metrics
 from lidar_mi.assessment.metrics.names import sweep_key, wind_key
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 
 
 def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from lidar_mi.assessment.described import DopplerDescription, ExperimentDescription
 from lidar_mi.assessment.digits import percent, whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import (
@@ -25,6 +24,8 @@ from lidar_mi.assessment.metrics.requirements import (
 from lidar_mi.assessment.metrics.velocities import READERS
 from lidar_mi.assessment.report.coherent_lidar import coherent_answer
 from lidar_mi.assessment.report.simulation import simulation_sentence
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.tables import with_error
 from lidar_mi.units import shown
 
@@ -36,14 +37,12 @@ _HOLDS, _ENOUGH = (0.85, 0.89), 0.2
 _FAR_OFF = 3.0
 
 
-def answer(
-    experiment: ExperimentDescription, metrics: Mapping[str, float], judged: Judged = ()
-) -> list[str]:
+def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
     """What a run found, the same on the terminal, in the report and in `summary.txt`.
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.experiment.Experiment
+    experiment : lidar_mi.schema.experiment.Experiment
     metrics : mapping of str to float
         Of a run.
     judged : sequence of (RequirementTable, list of Finding)
@@ -87,7 +86,7 @@ def verdict(table: RequirementTable, findings: Sequence[Finding]) -> str:
     return f"{_capital(table.phase)}, {table.title}: {'; '.join(reasons)}."
 
 
-def _wind(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> Iterator[str]:
+def _wind(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
     """Errors of the wind from the most complete of the sensors that the run has."""
     if "sensor.vectors" in metrics:
         yield _sensor(experiment, metrics)
@@ -99,7 +98,7 @@ def _wind(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> It
         yield from coherent_answer(metrics)
 
 
-def _sensor(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
+def _sensor(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     head = f"Both lidars, {_place(experiment)}{_without_noise(experiment)}"
     if not metrics["sensor.vectors"]:
         return f"{head}: no valid wind vector."
@@ -115,7 +114,7 @@ def _sensor(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> 
     )
 
 
-def _images(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
+def _images(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
     components = "uvw" if "true_wind.rms_u" in metrics else "vw"
     far = far_from_cores(metrics, "true_wind.", "rms_")
@@ -137,7 +136,7 @@ def _images(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> 
     )
 
 
-def _rings(doppler: DopplerDescription, metrics: Mapping[str, float]) -> Iterator[str]:
+def _rings(doppler: Doppler, metrics: Mapping[str, float]) -> Iterator[str]:
     """The first method of analysis, for every number of images averaged."""
     settings = doppler.retrieval
     method, centre = settings.methods[0], settings.centre[0]
@@ -160,7 +159,7 @@ def _rings(doppler: DopplerDescription, metrics: Mapping[str, float]) -> Iterato
         )
 
 
-def _stated(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> Iterator[str]:
+def _stated(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
     """Standard errors that do not hold here, of the winds that the answer names."""
     if "sensor.vectors" in metrics:
         yield from _misstated("both lidars", metrics, "sensor.", "uvw")
@@ -217,7 +216,7 @@ def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:
         return
 
 
-def _without_noise(experiment: ExperimentDescription) -> str:
+def _without_noise(experiment: Experiment) -> str:
     return "" if experiment.detector else ", images without detector noise"
 
 
@@ -233,7 +232,7 @@ def _scatterers(metrics: Mapping[str, float]) -> Iterator[str]:
         yield f"Backscatter in the gate, mean over the image: {', '.join(parts)}."
 
 
-def _place(experiment: ExperimentDescription) -> str:
+def _place(experiment: Experiment) -> str:
     """Range of the slab and the time until the aircraft reaches it."""
     scan, speed = experiment.scan, experiment.platform.speed
     place = f"{scan.range:.6g} to {scan.range + scan.thickness:.6g} m ahead"

@@ -3,16 +3,16 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.names import Source, has_no_skill, wind_key
 from lidar_mi.assessment.metrics.requirements import Judged
 from lidar_mi.assessment.report.compliance import compliance
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.assessment.report.simulation import samples_of
+from lidar_mi.atmosphere.vortices.cores import Core
+from lidar_mi.schema.experiment import Experiment
 
 # rows of the table of results: key, name, unit
 _ROWS = (
@@ -33,7 +33,7 @@ _ROWS = (
 
 
 def backscatter_chapter(
-    experiment: ExperimentDescription,
+    experiment: Experiment,
     metrics: Mapping[str, float],
     cores: Sequence[Core],
     drawn: Sequence[Drawn],
@@ -44,7 +44,7 @@ def backscatter_chapter(
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.experiment.Experiment
+    experiment : lidar_mi.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     judged : sequence of (RequirementTable, list of Finding)
@@ -90,9 +90,7 @@ def backscatter_chapter(
     )
 
 
-def _tables(
-    experiment: ExperimentDescription, metrics: Mapping[str, float]
-) -> Iterator[NumberTable]:
+def _tables(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[NumberTable]:
     sources = [
         *([Source.NOISY] if experiment.detector else []),
         Source.BACKSCATTER,
@@ -116,7 +114,7 @@ def _tables(
         yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
 
 
-def _noise(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
+def _noise(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     """The components of the images' noise, in one line."""
     line = (
         "Noise of the first image, relative to a pixel's signal (medians): simulation "

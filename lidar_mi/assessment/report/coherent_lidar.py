@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator, Mapping
 
-from lidar_mi.assessment.described import CoherentDescription, Wake
 from lidar_mi.assessment.digits import fixed, percent, whole_percent
 from lidar_mi.assessment.metrics.coherent import PREFIX, PUBLISHED
+from lidar_mi.schema.coherent import CoherentDoppler
+from lidar_mi.schema.wake import Wake
 from lidar_mi.units import shown
 
 _SCANS = {
@@ -54,7 +55,7 @@ def coherent_answer(metrics: Mapping[str, float]) -> Iterator[str]:
         )
 
 
-def coherent_described(lidar: CoherentDescription, wake: Wake | None) -> list[tuple[str, str]]:
+def coherent_described(lidar: CoherentDoppler, wake: Wake | None) -> list[tuple[str, str]]:
     """What was simulated, as (name, text)."""
     laser, scan = lidar.laser, lidar.scan
     rows = []

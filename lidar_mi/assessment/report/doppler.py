@@ -2,22 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 
-from lidar_mi.assessment.described import DopplerDescription, RingMethods
 from lidar_mi.assessment.digits import fixed, three, with_error
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.names import REFERENCE_ERRORS, bound_key, reference_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
+from lidar_mi.schema.doppler import Doppler, RingRetrieval
 
 
 def doppler_chapter(
-    doppler: DopplerDescription, metrics: Mapping[str, float], drawn: Sequence[Drawn]
+    doppler: Doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn]
 ) -> Chapter:
     """Rings and line-of-sight winds of the Doppler lidar.
 
     Parameters
     ----------
-    doppler : lidar_mi.experiment.schema.doppler.Doppler
+    doppler : lidar_mi.schema.doppler.Doppler
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     """
@@ -71,7 +71,9 @@ def _abbreviations(methods: Sequence[str]) -> str:
     return "; ".join([*used, "peaks are those of the innermost ring, emitted and received"]) + ". "
 
 
-def _doppler_table(settings: RingMethods, centre: str, metrics: Mapping[str, float]) -> NumberTable:
+def _doppler_table(
+    settings: RingRetrieval, centre: str, metrics: Mapping[str, float]
+) -> NumberTable:
     rows = []
     for method in settings.methods:
         for quantity, label in (("std", "standard deviation"), ("bias", "bias")):

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from lidar_mi.assessment.described import Encounter, ExperimentDescription, Platform
 from lidar_mi.assessment.digits import percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
@@ -18,6 +17,9 @@ from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.assessment.report.coherent_lidar import coherent_described
 from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
+from lidar_mi.schema.encounter import Encounter
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.platform import Platform
 from lidar_mi.units import shown
 
 # Models of an aircraft that are not JSBSim's, as the report calls them.
@@ -100,7 +102,7 @@ class Chapter(NamedTuple):
 
 
 def page(
-    experiment: ExperimentDescription,
+    experiment: Experiment,
     resolved: str,
     versions: Mapping[str, str],
     metrics: Mapping[str, float],
@@ -113,7 +115,7 @@ def page(
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.experiment.Experiment
+    experiment : lidar_mi.schema.experiment.Experiment
     resolved : str
         The experiment with all defaults, as YAML.
     versions : mapping
@@ -196,7 +198,7 @@ def script(name: str) -> Markup:
 
 
 def simulated(
-    experiment: ExperimentDescription, versions: Mapping[str, str], metrics: Mapping[str, float]
+    experiment: Experiment, versions: Mapping[str, str], metrics: Mapping[str, float]
 ) -> list[tuple[str, str]]:
     """What was simulated, as (name, text): wake, instruments, seed, versions."""
     rows = []

@@ -3,18 +3,18 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.requirements import Judged, look_ahead
 from lidar_mi.assessment.report.compliance import compliance
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.instrument.doppler_scan import PlatformErrors
-from lidar_mi.retrieval.lines.vectors import COMPONENTS
+from lidar_mi.retrieval.combined.vectors import COMPONENTS
+from lidar_mi.schema.experiment import Experiment
 
 
 def sensor_chapter(
-    experiment: ExperimentDescription,
+    experiment: Experiment,
     metrics: Mapping[str, float],
     judged: Judged,
     drawn: Sequence[Drawn],
@@ -24,7 +24,7 @@ def sensor_chapter(
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.experiment.Experiment
+    experiment : lidar_mi.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     judged : sequence of (RequirementTable, list of Finding)

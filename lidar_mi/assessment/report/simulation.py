@@ -5,12 +5,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.campaign import metrics_of
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.assessment.metrics.simulation import largest_parts, simulation_parts
+from lidar_mi.schema.experiment import Experiment
 
 _FRACTION = f"{Source.NOISY}.monte_carlo_fraction"
 _SAMPLES = f"{Source.BACKSCATTER}.samples_per_beam"
@@ -20,7 +20,7 @@ _NEARLY_ALL = 0.9
 _LEAST_PART = 0.1
 
 
-def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
+def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     """Which part of the wind's error is the simulation's; empty where it is as small as asked for.
 
     Which part of the images' noise it is, of volumes, whose winds are not retrieved once more, and
@@ -28,7 +28,7 @@ def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str,
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.experiment.Experiment
+    experiment : lidar_mi.schema.experiment.Experiment
     metrics : mapping of str to float
         Of a run.
     """
@@ -68,7 +68,7 @@ def simulation_sentence(experiment: ExperimentDescription, metrics: Mapping[str,
     )
 
 
-def simulation_remark(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
+def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     """The same as a warning, with what to set; empty where the answer has no such sentence."""
     sentence = simulation_sentence(experiment, metrics)
     if not sentence:
@@ -90,7 +90,7 @@ def simulation_remark(experiment: ExperimentDescription, metrics: Mapping[str, f
     return f"render.samples_per_beam: {text}; expected {expected}{automatic}"
 
 
-def samples_of(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> str:
+def samples_of(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     """The number of samples of a run's images, and whether it was chosen."""
     asked = experiment.render.samples_per_beam
     number = f"{metrics.get(_SAMPLES, asked):.4g}" if _SAMPLES in metrics else str(asked)
@@ -127,7 +127,7 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
     )
 
 
-def _texture_visible(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> float:
+def _texture_visible(experiment: Experiment, metrics: Mapping[str, float]) -> float:
     """Samples per beam at which the noise is as small a part of the texture; 0: no texture."""
     texture = experiment.wake.texture.rms if experiment.wake else 0.0
     if not texture:
@@ -136,7 +136,7 @@ def _texture_visible(experiment: ExperimentDescription, metrics: Mapping[str, fl
     return metrics[_SAMPLES] * ratio**2 / experiment.render.monte_carlo_fraction
 
 
-def _needed(experiment: ExperimentDescription, metrics: Mapping[str, float]) -> float:
+def _needed(experiment: Experiment, metrics: Mapping[str, float]) -> float:
     """Samples per beam that are enough; 0: not known, as hardly any error is of something else."""
     samples, allowed = metrics[_SAMPLES], experiment.render.monte_carlo_fraction
     if _FRACTION in metrics:

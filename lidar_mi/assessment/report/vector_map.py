@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.atmosphere.vortices.cores import Core
 
 # A map about as dense as vectors can be selected on a screen.
 _COLUMNS = 55

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from lidar_mi.assessment.described import ExperimentDescription
 from lidar_mi.assessment.digits import fixed, in_row, percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
@@ -10,16 +9,17 @@ from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.volume import COMPONENTS
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 from lidar_mi.assessment.report.simulation import samples_of
+from lidar_mi.schema.experiment import Experiment
 
 
 def volume_chapter(
-    experiment: ExperimentDescription, metrics: Mapping[str, float], drawn: Sequence[Drawn]
+    experiment: Experiment, metrics: Mapping[str, float], drawn: Sequence[Drawn]
 ) -> Chapter:
     """Volumes of the backscatter lidar and the winds retrieved from them.
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.experiment.Experiment
+    experiment : lidar_mi.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     """
@@ -44,9 +44,7 @@ def volume_chapter(
     return Chapter("Wind in three dimensions", [purpose, noise], drawn, numbers)
 
 
-def _tables(
-    experiment: ExperimentDescription, metrics: Mapping[str, float]
-) -> Iterator[NumberTable]:
+def _tables(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[NumberTable]:
     sources = [Source.BACKSCATTER, *([Source.NOISY] if experiment.detector else [])]
     for source in sources:
         for method in experiment.volume.methods if experiment.volume else ():

@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_mi.atmosphere.vortex import Vortex
-from lidar_mi.atmosphere.wake_path import Components, WakeAlongPath
+from lidar_mi.atmosphere.vortices.vortex import Vortex
+from lidar_mi.atmosphere.vortices.wake_path import Components, WakeAlongPath
 from lidar_mi.errors import InputError
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_mi.atmosphere.wake_path import Components
+from lidar_mi.atmosphere.vortices.wake_path import Components
 from lidar_mi.errors import InputError
 
 Direction = Literal["up", "down", "left", "right"]

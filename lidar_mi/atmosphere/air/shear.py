@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_mi.atmosphere.wake_path import Components
+from lidar_mi.atmosphere.vortices.wake_path import Components
 from lidar_mi.errors import InputError
 
 

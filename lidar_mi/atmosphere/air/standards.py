@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.constants import foot, knot
 
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
 from lidar_mi.errors import InputError
 
 Level = Literal["light", "moderate", "severe"]

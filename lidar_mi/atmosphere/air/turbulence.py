@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_mi.atmosphere.wake_path import Components
+from lidar_mi.atmosphere.vortices.wake_path import Components
 from lidar_mi.errors import InputError
 
 Spectrum = Literal["von_karman", "kolmogorov"]

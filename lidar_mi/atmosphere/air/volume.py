@@ -8,7 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates, spline_filter
 
-from lidar_mi.atmosphere.wake_path import Components
+from lidar_mi.atmosphere.vortices.wake_path import Components
 from lidar_mi.errors import InputError
 
 LARGEST_DIVERGENCE = 0.2

@@ -8,10 +8,10 @@ from typing import Any
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import log
-from lidar_mi.experiment.schema.experiment import NAME
 from lidar_mi.io.json import read_json
 from lidar_mi.io.text import read_text
 from lidar_mi.io.yaml import read_yaml
+from lidar_mi.schema.experiment import NAME
 
 RECORD, LOG, METRICS, REPORT = "experiment.yaml", "log.txt", "metrics.json", "report.html"
 SUMMARY = "summary.txt"

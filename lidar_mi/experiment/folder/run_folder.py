@@ -26,9 +26,6 @@ from lidar_mi.experiment.folder.records import (
     read_record,
 )
 from lidar_mi.experiment.graph import Keys, Store
-from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema import reading
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.stages.timed_beams import timing_files
 from lidar_mi.io import exr
@@ -40,6 +37,9 @@ from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.text import encoded, write_text
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.rendering.phase import table_files
+from lidar_mi.schema import reading
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.input_files import find_file
 
 FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)

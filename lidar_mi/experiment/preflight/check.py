@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.digits import three
-from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
 from lidar_mi.assessment.metrics.requirements import RequirementTable, look_ahead
+from lidar_mi.atmosphere.vortices.cores import find_cores
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.graph import call
@@ -19,10 +19,6 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.preflight.coherent import coherent_rows, passage_rows
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.sensor import Sensor
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.eye_safety import scan_safety
 from lidar_mi.experiment.stages.image_remarks import window_reach
 from lidar_mi.experiment.stages.light_budget import (
@@ -43,6 +39,10 @@ from lidar_mi.progress import Notice, without_warnings
 from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.samples import Samples
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.sensor import Sensor
+from lidar_mi.schema.wake import Wake
 from lidar_mi.units import shown
 
 LEAST_SHOWN = 0.5

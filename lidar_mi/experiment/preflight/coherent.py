@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from lidar_mi.experiment.schema.coherent import CoherentDoppler
 from lidar_mi.experiment.stages.coherent_lines import (
     coherent_lidar,
     line_scan,
@@ -13,6 +12,7 @@ from lidar_mi.experiment.stages.coherent_lines import (
 )
 from lidar_mi.experiment.truth.passing_wake import PassingWake
 from lidar_mi.instrument.coherent.velocity_noise import cramer_rao, random_velocity
+from lidar_mi.schema.coherent import CoherentDoppler
 from lidar_mi.units import shown
 
 Rows = list[tuple[str, str]]

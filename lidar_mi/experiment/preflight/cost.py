@@ -14,11 +14,11 @@ import xarray as xr
 
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.pipeline import Results, has_error_budget, has_vortices
-from lidar_mi.experiment.schema.coherent import CoherentDoppler
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.coherent_lines import line_scan
 from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images
 from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
+from lidar_mi.schema.coherent import CoherentDoppler
+from lidar_mi.schema.experiment import Experiment
 
 PROBE_SECONDS = 0.115
 """Processor time of `probe` when all costs below were measured."""

@@ -6,12 +6,12 @@ import numpy as np
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.memory import most_samples
-from lidar_mi.experiment.schema.wake import ExtinctionMapping
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.settings import RenderSettings
+from lidar_mi.schema.wake import ExtinctionMapping
 from lidar_mi.units import shown
 
 SINGLE = 1e-17

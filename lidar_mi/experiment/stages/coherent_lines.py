@@ -7,16 +7,16 @@ import numpy as np
 import xarray as xr
 from scipy.constants import c as SPEED_OF_LIGHT
 
-from lidar_mi.atmosphere.vortex import Model, Vortex, angular_velocity
-from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
+from lidar_mi.atmosphere.vortices.vortex import Model, Vortex, angular_velocity
+from lidar_mi.atmosphere.vortices.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.coherent import CoherentDoppler, CoherentScan
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.passing_wake import PassingWake, echo, passing_wake
 from lidar_mi.instrument.coherent.measurement import measured_lines
 from lidar_mi.instrument.coherent.scans import LineScan, dbs_scan, ppi_scan, rhi_scan, stare_scan
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
+from lidar_mi.schema.coherent import CoherentDoppler, CoherentScan
+from lidar_mi.schema.wake import Wake
 
 _RINGS = np.arange(5.0, 15.125, 0.25)  # m, as of `ring_averages`
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.assessment.metrics.error_budget import (
     error_budget,
     image_scale,
@@ -16,13 +15,9 @@ from lidar_mi.assessment.metrics.error_budget import (
 )
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.advection import advect, advect_to
+from lidar_mi.atmosphere.vortices.cores import Core, find_cores
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.stages.image_pair import noise_without
 from lidar_mi.experiment.stages.rendering import scan_plans
@@ -42,6 +37,11 @@ from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from lidar_mi.assessment.metrics.safety import ScanSafety
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.timed_beams import pulse_train
 from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.sensor import Sensor
 
 EXPOSURE = 10.0
 """Time of exposure to the beams, s, unless given by the sensor."""

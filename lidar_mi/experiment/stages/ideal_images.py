@@ -6,9 +6,6 @@ import numpy as np
 import scipy
 import xarray as xr
 
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows
@@ -16,6 +13,9 @@ from lidar_mi.experiment.truth.in_time import air_in_time
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 
 def slab_images(

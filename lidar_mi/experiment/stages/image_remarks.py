@@ -6,16 +6,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
+from lidar_mi.atmosphere.vortices.cores import find_cores
 from lidar_mi.description import Description
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.scattering import Scattering
-from lidar_mi.experiment.schema.site import Site
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.experiment.stages.brightness import overlap
 from lidar_mi.experiment.stages.light_budget import (
     LEAST_OVERLAP,
@@ -29,6 +22,13 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.scattering import Scattering
+from lidar_mi.schema.site import Site
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.units import shown
 
 MOST_WIND = 150.0

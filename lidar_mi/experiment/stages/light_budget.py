@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_mi.experiment.schema.scattering import Scattering
-from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.experiment.stages.brightness import overlap
 from lidar_mi.experiment.truth.clear_air import ClearAir, are_particles
 from lidar_mi.experiment.truth.extinction import Truth
@@ -15,6 +13,8 @@ from lidar_mi.instrument.detector_noise import expected_counts, noise_variance
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.phase import Scatterer, backscatter_phase_function
+from lidar_mi.schema.scattering import Scattering
+from lidar_mi.schema.wake import ExtinctionMapping, Wake
 
 LEAST_OVERLAP = 0.9
 """Of the field of view and the beam; with less, a warning states the light that is lost."""

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidar_mi.atmosphere.line import laser_line
-from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.atmosphere.scattering.line import laser_line
 from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, reference_photons
 from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.fringe_camera import fringe_image
+from lidar_mi.schema.doppler import Doppler
 
 if TYPE_CHECKING:
     import torch

@@ -6,16 +6,16 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from lidar_mi.atmosphere.vortex import Model
+from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.coherent import CoherentDoppler
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.coherent_lines import coherent_lidar, ring_fraction, true_vortices
 from lidar_mi.experiment.truth.passing_wake import PassingWake
 from lidar_mi.instrument.coherent.measurement import START
 from lidar_mi.instrument.coherent.scans import directions
+from lidar_mi.schema.coherent import CoherentDoppler
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.wake import Wake
 
 _UNEVEN_ECHO = 1 << 8
 _UNEVEN, _PART = 1.5, 0.99
@@ -49,7 +49,7 @@ def line_winds(
     InputError
         Scans without any wind.
     """
-    from lidar_mi.retrieval.lines_of_sight.winds import fit_winds_to_lines
+    from lidar_mi.retrieval.ground_winds.winds import fit_winds_to_lines
 
     log.bar("fitting winds to lines of sight", None)
     found = fit_winds_to_lines(coherent_lines, interval=doppler_interval)
@@ -90,7 +90,7 @@ def line_vortices(
         ``separation`` (m) of the wake. Of the method of radial velocities, its peer, `y_rv`, ...
         and the truth at its own times, `y_rv_true`, ...
     """
-    from lidar_mi.retrieval.line_vortices.vortices import fit_vortices_to_lines
+    from lidar_mi.retrieval.ground_vortices.vortices import fit_vortices_to_lines
 
     log.bar("fitting vortices to lines of sight", None)
     ground = -doppler.position[2] if doppler.passage.ground and wake.vortex_pair else None
@@ -158,10 +158,10 @@ def _by_peer(
     It searches around the true places, at which it has no way to be wrong by a whole vortex. NaN:
     it finds nothing.
     """
-    from lidar_mi.retrieval.line_vortices.echo import at_the_echo
-    from lidar_mi.retrieval.line_vortices.fit import Assumptions
-    from lidar_mi.retrieval.line_vortices.radial_velocities import by_radial_velocities
-    from lidar_mi.retrieval.line_vortices.scan_plane import plane_scans
+    from lidar_mi.retrieval.ground_vortices.echo import at_the_echo
+    from lidar_mi.retrieval.ground_vortices.fit import Assumptions
+    from lidar_mi.retrieval.ground_vortices.radial_velocities import by_radial_velocities
+    from lidar_mi.retrieval.ground_vortices.scan_plane import plane_scans
 
     given, lidar = Assumptions(profile), coherent_lidar(doppler)
     part = float(ring_fraction(np.array(given.core_radius), profile))

@@ -9,12 +9,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requirements
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.sensor import Sensor
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings
 from lidar_mi.experiment.stages.ring_instrument import pixel_noise
@@ -32,8 +27,13 @@ from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_lines
 from lidar_mi.instrument.scan import Scan
-from lidar_mi.retrieval.lines.vectors import COMPONENTS
+from lidar_mi.retrieval.combined.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.sensor import Sensor
+from lidar_mi.schema.wake import Wake
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.rings.model import PixelNoise

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from lidar_mi.assessment.metrics.pointing import ScanPointing, scan_pointing
-from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.schema.platform import Platform
 
 
 def beam_pointing(platform: Platform, plans: Sequence[ScanPlan]) -> ScanPointing | None:

@@ -7,15 +7,11 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core, find_cores
+from lidar_mi.atmosphere.vortices.cores import Core, find_cores
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import But, Only, Store
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.memory import Footprint
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.scattering import Scattering
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.brightness import check_brightness, least_samples
 from lidar_mi.experiment.stages.timed_beams import timed_plans
 from lidar_mi.experiment.truth.extinction import Truth
@@ -34,6 +30,10 @@ from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import check_variant, use_variant
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.scattering import Scattering
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""

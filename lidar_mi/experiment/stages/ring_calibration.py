@@ -3,11 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidar_mi.atmosphere.line import laser_line
+from lidar_mi.atmosphere.scattering.line import laser_line
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.stages.ring_images import (
     Rings,
     exposed_frames,
@@ -18,6 +16,8 @@ from lidar_mi.experiment.stages.ring_instrument import pixel_noise
 from lidar_mi.experiment.stages.ring_reference import calibration_drift
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.io.netcdf import read_netcdf
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.input_files import find_file
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.rings.calibration import Calibration

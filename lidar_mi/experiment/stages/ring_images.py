@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.scattering.line import Line, backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Only, Store
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.rings import Assumed
 from lidar_mi.experiment.stages.rendering import batches_of
 from lidar_mi.experiment.stages.ring_instrument import air_rings, laser_rings, pixel_noise
 from lidar_mi.experiment.stages.ring_reference import reference_frames
@@ -28,6 +26,8 @@ from lidar_mi.rendering.fringes import lens_surfaces, render_fringes
 from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory, host_bytes
 from lidar_mi.rendering.settings import FringeSettings
 from lidar_mi.rendering.variant import check_variant, use_variant
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.rings import Assumed
 
 if TYPE_CHECKING:
     import torch

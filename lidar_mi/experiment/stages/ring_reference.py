@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.schema.doppler import Doppler
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.rings.reference_error import ReferenceUncertainty

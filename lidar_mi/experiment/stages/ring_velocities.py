@@ -12,7 +12,6 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.rings import RingBudget
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.stages.ring_images import (
     RingImages,
     Rings,
@@ -31,6 +30,7 @@ from lidar_mi.experiment.stages.ring_reference import (
 )
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
+from lidar_mi.schema.doppler import Doppler
 
 if TYPE_CHECKING:
     import torch

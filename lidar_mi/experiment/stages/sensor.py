@@ -11,22 +11,22 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi import __version__
-from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import commonest_flag
 from lidar_mi.assessment.metrics.names import Source
+from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.sensor import Sensor
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS
+from lidar_mi.schema.doppler import Doppler
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.sensor import Sensor
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 # Lines of sight per least-squares vector of the Doppler lidar alone: one and those around it.
 _AROUND = 9
@@ -80,7 +80,7 @@ def doppler_alone(lines: xr.Dataset, log: Log) -> dict[str, xr.Dataset]:
 
     Empty where the valid lines do not give any, which is logged as a warning.
     """
-    from lidar_mi.retrieval.lines.vectors import wind_from_neighbours, wind_from_triples
+    from lidar_mi.retrieval.combined.vectors import wind_from_neighbours, wind_from_triples
 
     try:
         triples = wind_from_triples(lines)
@@ -119,7 +119,7 @@ def with_systematic(found: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
         systematic error of v_LOS. It is one error, common to all lines and vectors; the differences
         of the vectors are what it makes of u, v and w.
     """
-    from lidar_mi.retrieval.lines.vectors import COMPONENTS
+    from lidar_mi.retrieval.combined.vectors import COMPONENTS
 
     for name in COMPONENTS:
         found[f"{name}_systematic"] = abs(shifted[name] - found[name]).assign_attrs(
@@ -149,7 +149,7 @@ def _oblique_view(
 
 def _in_time(platform: Platform, sensor: Sensor, crossflow: xr.Dataset) -> dict[str, Any]:
     """Settings of `combine` for the time of the wind, half way between both images."""
-    from lidar_mi.retrieval.lines.common_time import estimated_drift
+    from lidar_mi.retrieval.combined.common_time import estimated_drift
 
     settings: dict[str, Any] = {"time": platform.dt / 2}
     if sensor.drift == "estimated":
@@ -181,8 +181,8 @@ def with_truth(
     settings: Mapping[str, Any],
 ) -> xr.Dataset:
     """The wind of `combine` from lines and cross-flow wind, with the truth at its nodes."""
-    from lidar_mi.retrieval.lines.combine import combine
-    from lidar_mi.retrieval.lines.vectors import COMPONENTS
+    from lidar_mi.retrieval.combined.combine import combine
+    from lidar_mi.retrieval.combined.vectors import COMPONENTS
 
     found, shifted = combine(crossflow, lines, **settings), _shifted(lines)
     if shifted is not None:
@@ -280,8 +280,8 @@ def mean_squares_without(
         By cause; with all of them as "". Valid vectors, beyond two core radii where there are
         cores. Empty without any.
     """
-    from lidar_mi.retrieval.lines.combine import combine
-    from lidar_mi.retrieval.lines.vectors import COMPONENTS
+    from lidar_mi.retrieval.combined.combine import combine
+    from lidar_mi.retrieval.combined.vectors import COMPONENTS
 
     at = {axis: crossflow[axis] for axis in ("z", "y")}
     true = {name: truth[name].interp(at).transpose("z", "y").values for name in COMPONENTS}

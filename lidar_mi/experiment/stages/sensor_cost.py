@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, pulse_train
 from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.eye_safety import assess_pulses
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.pulse_budget import pulse_budget, pulses_for_error
 from lidar_mi.instrument.scan import Scan, plan_scans
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.sensor import Sensor
 
 if TYPE_CHECKING:
     from lidar_mi.assessment.metrics.sensor import LidarCost

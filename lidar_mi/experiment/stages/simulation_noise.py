@@ -6,9 +6,6 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.rendering import gridded_scans
 from lidar_mi.experiment.stages.winds import (
     attenuated_backscatter_stderr,
@@ -21,6 +18,9 @@ from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.settings import RenderSettings
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.wake import Wake
 
 
 def simulation_noise(

@@ -5,16 +5,16 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import error_statistics, truth_at_vectors
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.experiment.truth.clear_air import ClearAir
 from lidar_mi.experiment.truth.extinction import true_air
 from lidar_mi.experiment.truth.flows import Flows, advection_by
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Relative rms of the texture."""

@@ -7,10 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.instrument.beams import Beams, steered_beams
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.motion import ANGLES, PLACES, Motion, Pose, trajectory, true_pose
@@ -18,6 +14,10 @@ from lidar_mi.instrument.reported import Reported, reported_pose
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.instrument.scan_timing import Directions, ScanTiming, Schedule
 from lidar_mi.io.timed_table import read_timed_table
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.sensor import Sensor
 
 
 def is_steady(platform: Platform) -> bool:

@@ -15,9 +15,6 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_pair import Pair, both, combined_noise
 from lidar_mi.experiment.stages.rendering import environment_extinction
 from lidar_mi.experiment.stages.winds import retrieval_device
@@ -29,6 +26,9 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.pair_error import pair_stderr
 from lidar_mi.retrieval.images.window_sizes import check_window_sizes
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 
 @dataclass(frozen=True)

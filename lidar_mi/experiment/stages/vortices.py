@@ -12,10 +12,6 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.sensor import Sensor
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.winds import (
     common_error,
     pixel_times,
@@ -25,6 +21,10 @@ from lidar_mi.experiment.stages.winds import (
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.sensor import Sensor
+from lidar_mi.schema.wake import Wake
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -51,7 +51,7 @@ class VortexFits:
 
 def combined_vectors(wind3d: xr.Dataset | None) -> xr.Dataset | None:
     """Cross-flow wind of both lidars, with the flags of v and w; None: there is none."""
-    from lidar_mi.retrieval.lines.combine import CombinedFlag
+    from lidar_mi.retrieval.combined.combine import CombinedFlag
 
     if wind3d is None:
         return None

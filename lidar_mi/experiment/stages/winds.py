@@ -10,9 +10,6 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.errors import commonest_flag, truth_at_vectors
 from lidar_mi.assessment.metrics.names import EXACT, RENDERED, Source
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.retrieval import Retrieval
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.image_pair import Noise, Pair, both, combined_noise
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
@@ -22,6 +19,9 @@ from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.pair_error import pair_stderr
 from lidar_mi.retrieval.images.window_sizes import check_window_sizes
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.retrieval import Retrieval
+from lidar_mi.schema.wake import Wake
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.wind.options import WindowSizes

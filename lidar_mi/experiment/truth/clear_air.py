@@ -5,17 +5,17 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from lidar_mi.atmosphere.molecules import molecular_scattering
-from lidar_mi.atmosphere.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
+from lidar_mi.atmosphere.scattering.molecules import molecular_scattering
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Only
-from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema.encounter import Encounter
-from lidar_mi.experiment.schema.scattering import Scattering
-from lidar_mi.experiment.schema.site import Site
-from lidar_mi.experiment.schema.wake import ExtinctionMapping
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.io.sounding import read_sounding
+from lidar_mi.schema.encounter import Encounter
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.scattering import Scattering
+from lidar_mi.schema.site import Site
+from lidar_mi.schema.wake import ExtinctionMapping
 
 SHORTEST_WAVELENGTH, LONGEST_WAVELENGTH = 0.2e-6, 2e-6
 """m, of the refractive index of air; beyond, molecules scatter less than 7e-8 m^-1."""

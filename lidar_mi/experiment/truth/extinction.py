@@ -14,14 +14,14 @@ from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_fro
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.experiment.truth.clear_air import ClearAir, clear_air
 from lidar_mi.experiment.truth.flows import Advection, Flows, advection_by, flows_of, mean_flow
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.scan import Scan
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import ExtinctionMapping, Wake
 
 
 class Later(Sequence[xr.DataArray]):

@@ -11,20 +11,20 @@ import xarray as xr
 
 from lidar_mi.atmosphere.advection import carrier
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
-from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
-from lidar_mi.atmosphere.wake import centre, check_nodes, resample
+from lidar_mi.atmosphere.vortices.vortex import pair_wake, vortex_pair
+from lidar_mi.atmosphere.vortices.wake import centre, check_nodes, resample
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Guard, call
-from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.memory import Footprint
-from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Turbine, Wake
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.io.wake_file import read_wake
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Turbine, Wake
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
 Advection = Callable[[xr.DataArray], xr.DataArray]

@@ -8,12 +8,12 @@ import xarray as xr
 
 from lidar_mi.atmosphere.advection import advect_to
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.platform import Platform
-from lidar_mi.experiment.schema.volume import Volume
-from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows, mean_flow, moves_along
 from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.schema.platform import Platform
+from lidar_mi.schema.volume import Volume
+from lidar_mi.schema.wake import Wake
 
 LARGEST_STEP = 0.25
 """Node spacings by which air moves from one state to the next, at most.

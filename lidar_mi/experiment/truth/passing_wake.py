@@ -9,28 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 from scipy.integrate import cumulative_trapezoid
 
-from lidar_mi.assessment.metrics.cores import find_cores, ring_averages
 from lidar_mi.atmosphere.air.shear import LogarithmicShear
 from lidar_mi.atmosphere.air.turbulence import Turbulence
-from lidar_mi.atmosphere.ground_effect import PairAboveGround
-from lidar_mi.atmosphere.vortex import Vortex
-from lidar_mi.atmosphere.wake_decay import sarpkaya_decay_time
-from lidar_mi.atmosphere.wake_path import Components
-from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
+from lidar_mi.atmosphere.vortices.ground_effect import PairAboveGround
+from lidar_mi.atmosphere.vortices.vortex import Vortex
+from lidar_mi.atmosphere.vortices.wake_decay import sarpkaya_decay_time
+from lidar_mi.atmosphere.vortices.wake_path import Components
+from lidar_mi.atmosphere.vortices.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.schema.coherent import AirAtTheGround, CoherentDoppler, Passage
-from lidar_mi.experiment.schema.wake import ExtinctionMapping, VortexPair, Wake
-from lidar_mi.experiment.truth.extinction import extinction_of
-from lidar_mi.experiment.truth.flows import tracers_of
+from lidar_mi.experiment.truth.file_wake import pairs_in, read_planes, refuse_ages, with_extinction
 from lidar_mi.experiment.truth.turbulent_air import turbulent_air
 from lidar_mi.instrument.coherent.weighting import Signal
-from lidar_mi.io.wake_file import read_wake
-
-_OUTER = (15.0, 12.0, 10.0, 8.0)  # m, of the rings over which circulation is averaged
+from lidar_mi.schema.coherent import AirAtTheGround, CoherentDoppler, Passage
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.wake import ExtinctionMapping, VortexPair, Wake
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,62 +201,28 @@ def _plane(wake: Wake, passage: Passage, mean: MeanWind, search_path: Path) -> V
     Beyond the file's edges the wind is that of two vortices at the places and with the circulation
     of those of the plane.
     """
-    for key, given in (
-        ("age", passage.age),
-        ("decay_time", passage.decay_time),
-        ("dissipation_rate", passage.dissipation_rate),
-    ):
-        if given:
-            raise InputError(
-                f"doppler.passage.{key}: {given:g} is not allowed with wake.file; expected "
-                "wake.vortex_pair"
-            )
+    refuse_ages(
+        "doppler.passage",
+        {
+            "age": passage.age,
+            "decay_time": passage.decay_time,
+            "dissipation_rate": passage.dissipation_rate,
+        },
+    )
     assert wake.file is not None  # of the kinds of wake that a coherent lidar observes
     path = find_file(wake.file, search_path, "wake.file")
-    needed, names = tracers_of(wake)
-    flow = read_wake(path, wake.time, names, wake.x, require=needed)
-    if flow.sizes["x"] > 1:
-        planes = flow["x"].values
-        raise InputError(
-            f"wake.x: missing; {path.name} has {planes.size} planes, expected one of "
-            f"{planes[0]:g} to {planes[-1]:g} m"
-        )
-    field = extinction_of(flow, wake.extinction, flow, None)
-    flow = flow[[n for n in "uvw" if n in flow]].assign(extinction=field)
-    section = flow.isel(x=0)
-    sides, drifts = _vortices(section, path.name)
-    y = float(np.mean([one.y for one in sides]))
-    z = float(np.mean([one.z for one in sides]))
-    own_y, own_z = wake.centre or (y, z)
-    v, w = np.mean(drifts, axis=0)
+    flow = with_extinction(read_planes(path, wake), wake)
+    (port, starboard), (v, w) = pairs_in(flow, path.name)
+    own_y, own_z = wake.centre or (
+        float(np.mean([one.y for one in (*port, *starboard)])),
+        float(np.mean([one.z for one in (*port, *starboard)])),
+    )
     return VolumeAlongPath(
         flow,
-        (sides[0],),
-        (sides[1],),
+        port,
+        starboard,
         background=wake.extinction.background,
-        drift=(float(v) + float(mean.to_the_left(np.array(passage.height))), float(w)),
+        drift=(v + float(mean.to_the_left(np.array(passage.height))), w),
         origin=(float(flow["x"][0]), own_y, own_z),
         miss=(0.0, passage.height),
     )
-
-
-def _vortices(section: xr.Dataset, name: str) -> tuple[list[Vortex], list[tuple[float, float]]]:
-    """Port and starboard vortex of a plane, and the winds that carry them."""
-    cores = find_cores(section)
-    if len(cores) != 2:
-        raise InputError(
-            f"wake.file: {name} has {len(cores)} vortices in its plane; expected two of opposite "
-            "sense"
-        )
-    vortices, drifts = [], []
-    for core, partner in zip(cores, cores[::-1], strict=True):
-        tried = (ring_averages(section, core, [partner], outer=outer) for outer in _OUTER)
-        rings = next((one for one in tried if one is not None), None)
-        if rings is None:
-            raise InputError(
-                f"wake.file: {name} has vortices too close to each other or to the plane's edge; "
-                f"expected {_OUTER[-1]:g} m of their own flow about them"
-            )
-        vortices.append(Vortex(rings.circulation, core.radius, core.y, core.z))
-        drifts.append((rings.v, rings.w))
-    return vortices, drifts

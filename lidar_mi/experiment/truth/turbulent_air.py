@@ -3,7 +3,7 @@
 from lidar_mi.atmosphere.air.standards import CS_25_LENGTH, mil_f_8785c
 from lidar_mi.atmosphere.air.turbulence import Turbulence, turbulence
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema import air as schema
+from lidar_mi.schema import air as schema
 
 
 def turbulent_air(given: schema.Turbulence, height: float, seed: int, section: str) -> Turbulence:

@@ -143,7 +143,7 @@ def fit_vortices(
     >>> import numpy as np
     >>> import xarray as xr
     >>> from scipy.ndimage import gaussian_filter, map_coordinates
-    >>> from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+    >>> from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
     >>> y, z = np.arange(-40.0, 41.0), np.arange(-25.0, 26.0)
     >>> v, w = velocity(vortex_pair(300.0, separation=30.0, core_radius=3.0), y, z[:, None])
     >>> air = 1 + gaussian_filter(np.random.default_rng(1).normal(size=(z.size, y.size)), 1.5)

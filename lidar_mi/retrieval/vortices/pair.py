@@ -9,7 +9,7 @@ import torch
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.atmosphere.vortices.vortex import Vortex
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.quantity import Quantity
 from lidar_mi.retrieval.vortices.model import (

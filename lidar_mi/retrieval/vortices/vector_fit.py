@@ -82,7 +82,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     >>> import lidar_mi as lm
     >>> import numpy as np
     >>> import xarray as xr
-    >>> from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+    >>> from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
     >>> y, z = np.arange(-40.0, 41.0, 2.0), np.arange(-24.0, 25.0, 2.0)
     >>> v, w = velocity(vortex_pair(300.0, separation=30.0, core_radius=3.0), y, z[:, None])
     >>> vectors = xr.Dataset({"v": (("z", "y"), v), "w": (("z", "y"), w)}, {"z": z, "y": y})

@@ -8,7 +8,6 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from lidar_mi.assessment.figures.error_budget import draw_all
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.error_budget import (
     CAUSES,
     chord_wind,
@@ -19,7 +18,8 @@ from lidar_mi.assessment.metrics.error_budget import (
     window_mean,
 )
 from lidar_mi.assessment.report.error_budget import budget_chapter, limit_sentence
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.cores import Core
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture

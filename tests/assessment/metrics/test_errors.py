@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import (
     commonest_flag,
     deviations,
@@ -17,6 +16,7 @@ from lidar_mi.assessment.metrics.errors import (
     truth_at_vectors,
     wind_metrics,
 )
+from lidar_mi.atmosphere.vortices.cores import Core
 
 STATISTICS = {
     f"{statistic}_{name}"

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import (
     MOST_DIVERGENCE,
     relative_divergence,
     rises,
     sense_of_rotation,
 )
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.cores import find_cores
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 
 Y, Z = np.arange(-40.0, 41.0), np.arange(-25.0, 26.0)
 

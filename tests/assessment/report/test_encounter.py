@@ -16,7 +16,7 @@ from lidar_mi.assessment.report.encounter import (
     encounter_summary,
 )
 from lidar_mi.assessment.report.page import Film, page
-from lidar_mi.experiment.schema.reading import check
+from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import encounter_keys
 
 

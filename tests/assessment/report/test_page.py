@@ -12,11 +12,11 @@ import pytest
 import xarray as xr
 
 from lidar_mi.assessment.figures.plates import Drawn
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.report.page import Chapter, Tables, page
 from lidar_mi.assessment.report.vector_map import map_data
-from lidar_mi.experiment.schema import reading as config
+from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.io.images import panel_cuts
+from lidar_mi.schema import reading as config
 
 EVIL = "</script><script>alert(1)</script>&\"'"
 

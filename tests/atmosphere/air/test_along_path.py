@@ -15,7 +15,7 @@ from lidar_mi.atmosphere.air.gust import Gust
 from lidar_mi.atmosphere.air.microburst import Microburst
 from lidar_mi.atmosphere.air.shear import LinearShear
 from lidar_mi.atmosphere.air.turbulence import turbulence
-from lidar_mi.atmosphere.wake_path import PairAlongPath
+from lidar_mi.atmosphere.vortices.wake_path import PairAlongPath
 from lidar_mi.errors import InputError
 
 CLIMB = math.radians(-3)

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
+from lidar_mi.aircraft.roll_model import RollModel
+from lidar_mi.aircraft.state import Commands, loads_in_wind
+from lidar_mi.aircraft.strips import Loads
 from lidar_mi.atmosphere.air.turbulence import Turbulence, energy_spectrum, turbulence
-from lidar_mi.encounter.aircraft import Commands, loads_in_wind
-from lidar_mi.encounter.roll_model import RollModel
-from lidar_mi.encounter.strips import Loads
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.encounter import Aircraft, Path
+from lidar_mi.schema.encounter import Aircraft, Path
 from tests.support.turbulence import (
     correlations,
     finer_variance,

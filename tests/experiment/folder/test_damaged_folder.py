@@ -11,7 +11,7 @@ from lidar_mi.experiment.folder import records
 from lidar_mi.experiment.folder import run_folder as resumable_folder
 from lidar_mi.experiment.folder.records import read_metrics, read_study
 from lidar_mi.experiment.log import Log, failure
-from lidar_mi.experiment.schema import reading
+from lidar_mi.schema import reading
 
 
 @pytest.mark.parametrize(

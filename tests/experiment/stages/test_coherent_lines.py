@@ -136,6 +136,7 @@ def test_the_echo_falls_as_the_lidar_equation():
     assert ratio[30] == pytest.approx(expected[30], rel=5e-3)
 
 
+@pytest.mark.slow
 def test_vortices_come_back_from_the_lines():
     """A pair in calm air, to 20 cm and 2 %, on its true side; there is hardly any noise."""
     given = experiment(SMALL)
@@ -221,6 +222,7 @@ def test_what_cannot_be_measured_is_refused(doppler, wake, message):
     assert str(error.value).startswith(message)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("exhaust", "flagged"), [("tracer", True), (None, False)])
 def test_slices_of_an_uneven_echo_are_flagged(exhaust, flagged, tmp_path):
     """Exhaust in the cores hides the air around them from gates of 30 m: no error bar says so."""

@@ -9,13 +9,13 @@ import pytest
 import xarray as xr
 
 from lidar_mi.experiment.graph import call
-from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.error_budget import budgets, platforms_without
 from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.instrument.motion import Motion
+from lidar_mi.schema import reading
 
 RATE = 2e-3  # rad/s
 

@@ -14,9 +14,9 @@ from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.preflight.check import sections
 from lidar_mi.experiment.run import finish, prepare
-from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.light_budget import light_budget
-from tests.support.command_line import shell, words_of
+from lidar_mi.schema import reading
+from tests.support.command_line import in_process, words_of
 
 WAKE = {
     "name": "warned",
@@ -116,7 +116,7 @@ def test_the_terminal_shows_a_warning_once(command, tmp_path):
         folder = tmp_path / str(number)
         folder.mkdir()
         (folder / "a.yaml").write_text(yaml.safe_dump(one))
-        done = shell(command, "a.yaml", cwd=folder)
+        done = in_process(command, "a.yaml", cwd=folder)
         assert done.returncode == 0, done.stderr
         lines = [line for line in (done.stdout + done.stderr).splitlines() if "warning: " in line]
         assert len(lines) == len(set(lines))

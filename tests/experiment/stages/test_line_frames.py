@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.stages.line_frames import line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import ring_instrument
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.fringe_camera import fringe_image
+from lidar_mi.schema.doppler import Doppler
 
 SPEEDS, RANGES = np.array([20.0, 63.0, 95.0]), np.array([56.0, 60.0, 56.0])
 

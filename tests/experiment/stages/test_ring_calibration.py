@@ -9,11 +9,10 @@ import math
 import numpy as np
 import pytest
 
-from lidar_mi.atmosphere.line import laser_line
+from lidar_mi.atmosphere.scattering.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.reading import check
 from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
 from lidar_mi.experiment.stages.ring_images import exposed_frames, ring_instrument
 from lidar_mi.experiment.stages.ring_instrument import pixel_noise
@@ -22,6 +21,7 @@ from lidar_mi.experiment.stages.ring_velocities import speeds_to_laser
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
+from lidar_mi.schema.reading import check
 
 # 4 x 4 of the default camera's pixels in one
 CAMERA = {"width": 240, "height": 195, "pixel": "29.6 um"}
@@ -78,6 +78,7 @@ def test_calibrated_instrument():
     assert abs(float((normal**2).sum()) / (PULSES - 1) - 1) < 4 * math.sqrt(2 / (PULSES - 1))
 
 
+@pytest.mark.slow
 def test_camera_that_is_tilted_out_of_focus_and_distorts():
     """Defects of the true camera; each alone is in the table of defects."""
     camera = CAMERA | {"tilt": ["0.5 deg", "0 deg"], "distortion": 0.002, "defocus": "50 um"}
@@ -110,6 +111,7 @@ def test_hot_and_dead_pixels_are_masked():
     assert 47 + 10 <= left_out <= 2 * 47 + 5
 
 
+@pytest.mark.slow
 def test_frames_of_the_calibration_drift():
     """Random walks of laser and etalon: found as drift, with its size in the systematic error."""
     quiet, drifting = (

@@ -11,7 +11,6 @@ import pytest
 from scipy.constants import speed_of_light
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.stages.ring_reference import (
     drifts,
     plate_error,
@@ -22,6 +21,7 @@ from lidar_mi.experiment.stages.ring_reference import (
     shared_covariance,
     step_speed,
 )
+from lidar_mi.schema.doppler import Doppler
 
 KEY = "averaged"
 HALF_FILLED = {"etalon": {"bow": "12.286 nm"}, "reference": {"laser_pupil": 0.5}}

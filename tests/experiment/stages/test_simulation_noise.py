@@ -16,8 +16,6 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.preflight.cost import with_number
 from lidar_mi.experiment.run import finish, prepare
-from lidar_mi.experiment.schema import reading
-from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.stages.rendering import (
     IMAGES,
@@ -29,6 +27,8 @@ from lidar_mi.experiment.stages.rendering import (
 from lidar_mi.experiment.stages.simulation_noise import simulation_noise
 from lidar_mi.experiment.stages.winds import cross_flow_winds
 from lidar_mi.rendering.samples import noise_ratio
+from lidar_mi.schema import reading
+from lidar_mi.schema.reading import load_experiment
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -85,6 +85,7 @@ def number(prepared):
     return call(chosen_samples, prepared.experiment, **needed(prepared)).number
 
 
+@pytest.mark.slow
 def test_the_stated_fraction_is_that_of_other_random_numbers(prepared, number):
     """Variance of 12 renderings of the same air, of every beam, over the detector's."""
     asked = with_number(prepared.experiment, number)
@@ -123,6 +124,7 @@ def test_an_image_of_chosen_samples_is_that_of_the_number_alone(prepared, number
     assert few < number and all(abs(pilot - seed) >= 1 << 29 for seed, _ in others)
 
 
+@pytest.mark.slow
 def test_the_mean_of_chosen_images_is_unbiased(prepared):
     """Twenty-four images, each with a number of its own, against one of as many samples in all."""
     asked = newcomer(render={"monte_carlo_fraction": 2})
@@ -166,6 +168,7 @@ def test_the_winds_of_a_newcomer_are_those_of_many_samples(prepared, number):
     assert rms[8] > rms[number]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", ["independent", "common"])
 def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared, numbers):
     """Winds of eight renderings of the same air without a detector, about their mean."""

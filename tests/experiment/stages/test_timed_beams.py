@@ -15,13 +15,13 @@ from lidar_mi.experiment.folder.run_folder import made_by, new_record
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.preflight.check import sections
-from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.lines import slab_wind, states_of_wind
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.timed_beams import line_beams
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.instrument.doppler_scan import scan_wind
+from lidar_mi.schema import reading
 from tests.support.experiments import small
 
 STILL = {"speed": "150 m/s", "dt": "0.1 s"}

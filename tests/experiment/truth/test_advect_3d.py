@@ -62,7 +62,7 @@ def uniform(x, y, z):
     return {"u": 8.0, "v": -5.0, "w": 7.0}
 
 
-@pytest.mark.parametrize("depth", ["plane", "volume"])
+@pytest.mark.parametrize("depth", ["plane", pytest.param("volume", marks=pytest.mark.slow)])
 def test_uniform_wind_displaces_the_volume(tmp_path, depth):
     """The image at t2 is that at t1 of a file whose air is displaced."""
 
@@ -87,6 +87,7 @@ def blobs_displaced_in_the_plane(folder, depth):
     return images(folder, written(folder, displaced, uniform), depth=depth)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", ["plane", "volume"])
 def test_solid_rotation_about_an_axis_in_the_plane(tmp_path, depth):
     """Air moves from z to x and from x to -z, by 0.2 rad about the y axis."""

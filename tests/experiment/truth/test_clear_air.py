@@ -142,7 +142,7 @@ def test_a_file_that_says_nothing_is_told_of_its_molecules():
     silent["wake"].pop("extinction")
     silent["name"] = "old"
     del silent["encounter"]
-    from lidar_mi.experiment.schema.reading import check
+    from lidar_mi.schema.reading import check
 
     said = [text for text in prepare(check(silent, "")).warnings if "molecules" in text]
     assert len(said) == 1
@@ -199,7 +199,7 @@ def test_a_site_that_a_doppler_lidar_cannot_use():
 
 def test_the_air_of_the_site_survives_a_record(tmp_path):
     found = lm.load_experiment("fringes", **{"site.altitude": 1000})
-    from lidar_mi.experiment.schema.reading import dump
+    from lidar_mi.schema.reading import dump
 
     file = tmp_path / "again.yaml"
     file.write_text(dump(found))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy
 
-from lidar_mi.atmosphere.vortex import angular_velocity
+from lidar_mi.atmosphere.vortices.vortex import angular_velocity
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.scans import dbs_scan, directions, ppi_scan, rhi_scan, stare_scan
 from lidar_mi.instrument.coherent.weighting import (

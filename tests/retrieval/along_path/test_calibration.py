@@ -54,10 +54,10 @@ def judged(flights):
     ("sigma", "length", "noise", "resolution", "options"),
     [
         (1.5, 300.0, 0.3, 0.0, {}),
-        (1.5, 300.0, 0.1, 8.0, {}),
+        pytest.param(1.5, 300.0, 0.1, 8.0, {}, marks=pytest.mark.slow),
         (1.0, 100.0, 0.3, 8.0, {"spectrum": "kolmogorov"}),
-        (0.5, 60.0, 0.2, 0.0, {}),
-        (2.3, 500.0, 0.3, 6.0, {"evolution": "sweeping"}),
+        pytest.param(0.5, 60.0, 0.2, 0.0, {}, marks=pytest.mark.slow),
+        pytest.param(2.3, 500.0, 0.3, 6.0, {"evolution": "sweeping"}, marks=pytest.mark.slow),
         (1.5, 200.0, 0.3, 0.0, {"evolution": "sweeping"}),
     ],
 )

@@ -10,9 +10,9 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.along_path.vectors import counting, slab_vectors
+from lidar_mi.retrieval.combined.combine import CombinedFlag
+from lidar_mi.retrieval.combined.vectors import flag_attributes
 from lidar_mi.retrieval.common_error import with_common_error
-from lidar_mi.retrieval.lines.combine import CombinedFlag
-from lidar_mi.retrieval.lines.vectors import flag_attributes
 
 
 def wind(spacing=4.0, **attributes):

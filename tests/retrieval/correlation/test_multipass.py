@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from benchmarks.cases import DT, vortex_pair_images
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.correlation.multipass import multipass, travelled
 from lidar_mi.retrieval.images.quality import Flag

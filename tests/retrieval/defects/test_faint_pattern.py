@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag

@@ -67,6 +67,7 @@ def test_false_alarms_are_as_rare_as_asked_for():
     assert alarms <= 400 * 0.1 + 3 * np.sqrt(400 * 0.1 * 0.9)
 
 
+@pytest.mark.slow
 def test_winds_are_as_if_lit_evenly():
     """Stated standard errors were twice as large."""
     (image1, image2), _ = pair(91, 2.0, 0.01)

@@ -18,7 +18,9 @@ def rms(values):
 
 
 @pytest.mark.parametrize("kind", ["texture", "particles"])
-@pytest.mark.parametrize("template", [8, 16, pytest.param(32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "template", [16, *(pytest.param(px, marks=pytest.mark.slow) for px in (8, 32))]
+)
 @pytest.mark.parametrize("method", ["cc", "multipass", "variational"])
 def test_masked_pixels_change_vectors_by_less_than_their_errors(
     method, template, kind, monkeypatch

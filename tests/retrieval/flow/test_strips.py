@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.retrieval.flow import direct, strips
 from lidar_mi.retrieval.flow.flow_spline import Mesh
 from lidar_mi.retrieval.flow.settings import StripSettings, VariationalSettings

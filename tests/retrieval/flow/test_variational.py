@@ -13,7 +13,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.cases import DT, SPACING, vortex_pair_images
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.bound import displacement_bound
@@ -62,6 +62,7 @@ def check_coverage(found):
         assert np.mean(inside) == pytest.approx(expected, abs=0.05 + 3 * error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "everywhere", "beyond"), [KNOWN[2]])
 def test_errors_are_below_the_prototypes(noise, everywhere, beyond):
     check_errors(noise, everywhere, beyond, [1])
@@ -305,6 +306,7 @@ def blurred_errors(seed, noise, sigma, undone=(False, True), length=2.0, shape=(
     return np.reshape(errors, (-1, 2, 2))
 
 
+@pytest.mark.slow
 def test_blurred_images_with_less_noise_have_no_larger_errors():
     """Beyond the cores they were seven times larger with half of the noise: a filter that whitens
     a hardly coloured misfit makes images differ where the air is strained."""

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from lidar_mi.experiment.graph import call
-from lidar_mi.experiment.schema.reading import load
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.retrieval.wind.pair import retrieve_wind
+from lidar_mi.schema.reading import load
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 SIMULATION = Path(__file__).parents[4] / "shared" / "data" / "wake_les_40s.nc"

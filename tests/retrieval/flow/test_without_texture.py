@@ -62,7 +62,7 @@ def smoke(seed, through):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003])
-@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_smooth_smoke_tells_no_wind(seed, noise):
     """Taken for texture, errors of 1 px were stated as 0.2 px."""
     random = np.random.default_rng(seed)

@@ -59,6 +59,7 @@ def test_noisy_backscatter_off_centre():
     assert np.mean(fractions) == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fractions", [(0.75,), (0.59, 0.89), (0.2, 0.45, 0.7)])
 def test_lines_and_orders_are_distinguished(fractions):
     image = split_rings((500, 640), (300.3, 262.8), 20000.0, fractions)

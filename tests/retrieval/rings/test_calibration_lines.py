@@ -94,6 +94,7 @@ def test_an_ambiguous_order_is_told(lines):
     assert "ambiguous" in text and "nominal gap" in text
 
 
+@pytest.mark.slow
 def test_second_and_third_harmonic_are_always_ambiguous():
     """Wavelengths of 3 to 2: orders that differ by 3 and 2 have the same fractions."""
     found = both((line(LASER, 2), line(1.5 * LASER, 2)), tolerance=1e-6)
@@ -128,6 +129,7 @@ def refused(message, lines, **options):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_unknown_lines(lines):
     """Of another wavelength: seen by the width of its rings (0.1 %), or by its fraction (1e-6)."""
     refused(r"line of 405.1756 nm: .* true wavelength", (lines[0], line(MERCURY, 1, 405.1756e-9)))

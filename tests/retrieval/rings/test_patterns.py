@@ -76,6 +76,7 @@ def test_the_shorter_spacing_wins():
     assert distance(known.fraction, fraction).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_a_series_has_one_spacing():
     """A frame between its neighbours takes their spacing; noise is refused."""
     frames = [zeeman("two", splitting)[0] for splitting in (0.46, 0.5, 0.54)]

@@ -36,6 +36,7 @@ def allowed(number: int) -> float:
     return math.sqrt(5 / 3 + 4 * math.sqrt(22.2 / number))
 
 
+@pytest.mark.slow
 def test_errors_of_uneven_plates():
     """Three frames of two lines; three of the six errors of a frame are independent, about."""
     frame = Frame(**SMALL, **LINES, plates=0.005, patch=25.0)

@@ -108,8 +108,8 @@ def test_any_light_any_mask_any_defect():
     ("background", "hiding", "defect"),
     [
         ("steep", "nothing", "none"),
-        ("bright corner", "half", "none"),
-        ("even", "bar", "hidden centre"),
+        pytest.param("bright corner", "half", "none", marks=pytest.mark.slow),
+        pytest.param("even", "bar", "hidden centre", marks=pytest.mark.slow),
         ("vignetting", "aperture", "hot pixels"),
     ],
 )
@@ -118,6 +118,7 @@ def test_the_step_is_not_doubled(background, hiding, defect):
     assert verdict(image, step, fraction) == "right"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 300.0, 600.0])
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_gradient_or_half_of_the_rings(slope, hidden):
@@ -134,6 +135,7 @@ def test_a_gradient_or_half_of_the_rings(slope, hidden):
     assert abs(found.fraction[0] - 0.59) < 4 * found.fraction_std[0] < 4e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [0.1, 0.13, -0.13, 0.2])
 def test_a_faint_line_beside_another(distance):
     """10 % as high, from 1.2 widths on: without it the other's fraction is off by 0.003."""

@@ -75,6 +75,7 @@ def reliable(probability, there):
     return abs(number) < 3 * more and abs(spread) < 3 * more
 
 
+@pytest.mark.slow
 def test_probabilities_hold_on_other_draws():
     """120 draws; the test sees probabilities that are all 0.15 higher, and odds squared."""
     ratio, there = log_ratios(range(120))

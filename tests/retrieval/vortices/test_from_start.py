@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks.cases import DT, drifting_pair_images
-from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.atmosphere.vortices.vortex import Vortex
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices, started_fit
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder

@@ -14,16 +14,16 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from benchmarks.cases import vortex_pair_images
-from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.atmosphere.wake_path import PairAlongPath
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.wake_path import PairAlongPath
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.retrieval.images.spline import band_limited
 from lidar_mi.retrieval.vortices import model
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.model import PROFILES, advected, path_sensitivity, wind
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
+from lidar_mi.schema import reading as config
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 from tests.support.vortex_pairs import uneven, vector
 

@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.stats import multivariate_normal
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.retrieval.vortices.matched_filter import _explained, matched_filter
 from lidar_mi.retrieval.vortices.model import PROFILES
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity, vortex_pair
 from lidar_mi.retrieval.vortices.model import (
     PARAMETERS,
     PROFILES,
@@ -30,7 +30,7 @@ def grid(columns=41, rows=31, spacing=1.0):
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_wind_is_the_vortices_own(profile):
-    """Against the closed forms of `lidar_mi.atmosphere.vortex`, written apart from these."""
+    """Against the closed forms of `atmosphere.vortices.vortex`, written apart from these."""
     pair = uneven(profile)
     y, z = grid()
     ours = wind(torch.as_tensor(vector(*pair, mean=(1.5, -0.5))), y, z, profile)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.atmosphere.vortex import vortex_pair
+from lidar_mi.atmosphere.vortices.vortex import vortex_pair
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices.model import wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit, circulation_5_15

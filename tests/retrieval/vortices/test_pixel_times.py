@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder
 from lidar_mi.retrieval.vortices.model import PARAMETERS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.retrieval.vortices.model import PROFILES
 from lidar_mi.retrieval.vortices.search import Observations, condensed, starting_points
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 import xarray as xr
 
-from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices import vector_fit
 from lidar_mi.retrieval.vortices.model import wind

@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.optimize import least_squares
 
 from benchmarks.cases import CORE_RADIUS, DT, vortex_pair_images
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.wind.bound import wind_bound

@@ -83,7 +83,9 @@ def test_smooth_flows_are_not_drawn_to_whole_voxels(moved):
         assert abs(np.mean(off[name])) < 0.01, (name, np.mean(off[name]))
 
 
-@pytest.mark.parametrize("method", ["correlation", "variational"])
+@pytest.mark.parametrize(
+    "method", ["correlation", pytest.param("variational", marks=pytest.mark.slow)]
+)
 def test_rigid_shift(method):
     """Nothing bends: errors are those of the noise, 1 % of the mean, 10 % of the texture."""
     level, normalised = [], []
@@ -341,6 +343,7 @@ def test_more_volumes_tell_more():
     assert level[1] < 0.6 * level[0] and level[1] < 0.06, level
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["correlation", "variational"])
 def test_one_volume_given_twice_has_no_valid_wind(method):
     """It was 0 m/s, and valid all over."""

@@ -1,0 +1,1 @@
+"""What scatters: molecules, aerosols, their tables, and the line that they scatter."""

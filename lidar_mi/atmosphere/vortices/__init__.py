@@ -1,0 +1,1 @@
+"""Vortices: models, filaments, decay, cores, and wakes as they are simulated and met."""

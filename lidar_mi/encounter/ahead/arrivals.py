@@ -1,0 +1,67 @@
+"""The wind expected on the wing as it reaches the slabs, and the wind that it meets."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
+
+# Places on the wing, in half spans.
+_PLACES = np.linspace(-0.9, 0.9, 7)
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """The wind expected on the wing in the plane of a slab.
+
+    Attributes
+    ----------
+    x, time : float
+        m and s.
+    y : ndarray, shape (places,)
+        On the wing, m, path frame.
+    z : float
+        m.
+    wind, stderr : ndarray, shape (2, places)
+        v and w as expected then, and their standard errors, m/s.
+    """
+
+    x: float
+    time: float
+    y: np.ndarray
+    z: float
+    wind: np.ndarray
+    stderr: np.ndarray
+
+
+def wing_places(span: float) -> np.ndarray:
+    """Places along a wing, from its middle, m."""
+    return span / 2 * _PLACES
+
+
+def arrivals_dataset(arrivals: Sequence[Arrival], air: WakeAlongPath) -> xr.Dataset:
+    """The wind on the wing as it was expected and as it is, dims (arrival, place)."""
+    if not arrivals:
+        return xr.Dataset()
+    y, x, z, time = np.broadcast_arrays(
+        np.array([one.y for one in arrivals]),
+        *(np.array([getattr(one, n) for one in arrivals])[:, None] for n in ("x", "z", "time")),
+    )
+    _, *truth = air.wind(x, y, z, time)
+    each, both = "arrival", ("arrival", "place")
+    found = {
+        "arrival_x": (each, x[:, 0], {"units": "m", "long_name": "plane of the slab"}),
+        "arrival_time": (each, time[:, 0], {"units": "s", "long_name": "time of arrival"}),
+        "arrival_y": (both, y, {"units": "m", "long_name": "place on the wing"}),
+    }
+    for k, name in enumerate("vw"):
+        for suffix, text, values in (
+            ("", "expected at arrival", [one.wind[k] for one in arrivals]),
+            ("_stderr", "standard error of that", [one.stderr[k] for one in arrivals]),
+            ("_true", "as it is", truth[k]),
+        ):
+            about = {"units": "m s-1", "long_name": f"{name} on the wing, {text}"}
+            found[f"arrival_{name}{suffix}"] = (both, np.asarray(values), about)
+    return xr.Dataset(found)

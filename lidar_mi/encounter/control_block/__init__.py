@@ -1,0 +1,1 @@
+"""The lidar of a flight as a block for control design."""

@@ -1,0 +1,200 @@
+"""The air of an encounter: what flies, what is seen and what is advected is in all of it."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from lidar_mi.atmosphere.air.along_path import AirAlongPath, LevelFrame, MovingAir
+from lidar_mi.atmosphere.air.gust import Gust
+from lidar_mi.atmosphere.air.microburst import Microburst
+from lidar_mi.atmosphere.air.shear import LinearShear, LogarithmicShear
+from lidar_mi.atmosphere.air.standards import design_gust_speed, flight_profile_alleviation
+from lidar_mi.atmosphere.air.volume import AirVolume
+from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
+from lidar_mi.atmosphere.vortices.wake_volume import VolumeAlongPath
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.truth.turbulent_air import turbulence_scales, turbulent_air
+from lidar_mi.experiment.truth.wake_along_path import (
+    encounter_of,
+    vortices_in_plane,
+    wake_along_path,
+)
+from lidar_mi.io.wake_file import read_wake
+from lidar_mi.schema import air as schema
+from lidar_mi.schema import encounter as flight
+from lidar_mi.schema.experiment import Experiment
+from lidar_mi.schema.input_files import find_file
+from lidar_mi.schema.section import Section
+from lidar_mi.units import AS_GIVEN
+
+# Planes across the path, in separations from the middle, over which a wake's drift is averaged.
+_AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
+
+
+def air_along_path(experiment: Experiment) -> WakeAlongPath:
+    """The wind of the wake and of all other air along the flight path.
+
+    Raises
+    ------
+    InputError
+        No encounter, a wake that is not known along its axis, air out of range.
+    """
+    encounter, wake = encounter_of(experiment), wake_along_path(experiment)
+    air, path = encounter.air, encounter.path
+    if air is None:
+        return wake
+    parts = moving_air(air, path, experiment.seed)
+    frame = LevelFrame(path.altitude, path.climb_angle)
+    if air.volume is not None:
+        volume = _volume(air.volume, experiment)
+        _check_covered(volume, air.volume.file, experiment, wake, frame)
+        parts = (volume, *parts)
+    if not air.wake:
+        return AirAlongPath(None, parts, frame)
+    met = path.start / path.speed
+    # a gust is shorter than the wake: it does not move all of it
+    wide = [part for part in parts if not isinstance(part, Gust)]
+    return AirAlongPath(wake, parts, frame, _drift(wake, wide, frame, path.start, met), met)
+
+
+def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir, ...]:
+    """The parts of the air that are neither the wake nor read from a file.
+
+    Parameters
+    ----------
+    air : lidar_mi.schema.air.Air
+    path : lidar_mi.schema.encounter.Path
+        Heights are above its ground; turbulence and gusts are those at its start.
+    seed : int
+        Of the experiment.
+    """
+    parts: list[MovingAir] = []
+    if air.turbulence is not None:
+        parts.append(turbulent_air(air.turbulence, path.altitude, seed, "encounter.air"))
+    for gust in air.gusts:
+        speed = _largest_speed(gust, path.altitude)
+        parts.append(Gust(gust.direction, gust.gradient, gust.start, speed))
+    if air.linear_shear is not None:
+        shear = air.linear_shear
+        parts.append(LinearShear(shear.du_dz, shear.dv_dz, path.altitude))
+    if air.logarithmic_shear is not None:
+        layer = air.logarithmic_shear
+        parts.append(
+            LogarithmicShear(
+                layer.speed, layer.reference, layer.roughness, layer.towards, path.altitude
+            )
+        )
+    if air.microburst is not None:
+        burst = air.microburst
+        parts.append(
+            Microburst(burst.outflow, burst.radius, burst.outflow_height, burst.x, burst.y)
+        )
+    return tuple(parts)
+
+
+def described(air: schema.Air, path: flight.Path) -> list[tuple[str, str]]:
+    """What the air is, for people: names of its parts, and a line for each."""
+    rows = []
+    if air.turbulence is not None:
+        sigma, length = turbulence_scales(air.turbulence, path.altitude)
+        kind = f"{air.turbulence.spectrum}, {air.turbulence.evolution}".replace("_", " ")
+        rows.append(("turbulence", f"{sigma:.3g} m/s rms, length {length:.3g} m, {kind}"))
+    if air.volume is not None:
+        rows.append(("air of a simulation", air.volume.file))
+    for gust in air.gusts:
+        speed = _largest_speed(gust, path.altitude)
+        where = f"{2 * gust.gradient:g} m long, from {gust.start:g} m on"
+        rows.append(("gust", f"{speed:.3g} m/s {gust.direction}, {where}"))
+    for name in ("linear_shear", "logarithmic_shear", "microburst"):
+        part = getattr(air, name)
+        if part is not None:
+            rows.append((name.replace("_", " "), _keys(part)))
+    return rows
+
+
+def _keys(part: Section) -> str:
+    values = part.model_dump(mode="json", context=AS_GIVEN)
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def _largest_speed(gust: schema.Gust, altitude: float) -> float:
+    """Of a gust, m/s: its own, or the design speed."""
+    if gust.speed is not None:
+        return gust.speed
+    factor = gust.alleviation or 1.0
+    if gust.maximum_altitude is not None:
+        factor = flight_profile_alleviation(
+            altitude, gust.maximum_altitude, gust.landing_weight, gust.zero_fuel_weight
+        )
+    return design_gust_speed(altitude, gust.gradient, factor)
+
+
+def _volume(given: schema.AirVolume, experiment: Experiment) -> AirVolume:
+    path = find_file(given.file, experiment.folder, "encounter.air.volume.file")
+    # its time of change: a file that is written anew is read anew
+    height = encounter_of(experiment).path.altitude
+    return _read_volume(path, path.stat().st_mtime_ns, given.model_dump_json(), height)
+
+
+# check, flight and lidar need it again: it takes seconds to read
+@lru_cache(maxsize=1)
+def _read_volume(path: Path, stamp: int, keys: str, height: float) -> AirVolume:
+    given = schema.AirVolume.model_validate_json(keys)
+    flow = read_wake(path, given.time, given.names, require=["u"])
+    start = float(flow["x"][0]) if given.start is None else given.start
+    centre = float(flow["y"].mean()) if given.centre is None else given.centre
+    return AirVolume(flow[["u", "v", "w"]], start, centre, height)
+
+
+def _check_covered(
+    volume: AirVolume, file: str, experiment: Experiment, wake: WakeAlongPath, frame: LevelFrame
+) -> None:
+    """Refuse a volume that does not hold the wing along the path and, with a lidar, its images."""
+    encounter = encounter_of(experiment)
+    across, above = encounter.aircraft.span / 2, 0.0
+    if encounter.control.mode == "feedforward":
+        width, height = _image_size(experiment, wake)
+        across, above = max(across, width / 2), height / 2
+    along = np.array([0.0, encounter.path.start + encounter.path.beyond])
+    x, z = frame.places(along[:, None], [-above, above])
+    missing = volume.missing(x, [-across, across], z)
+    for name, (first, last, low, high) in missing.items():
+        what = {"x": "start", "y": "centre", "z": "path.altitude"}[name]
+        raise InputError(
+            f"encounter.air.volume.file: {file} covers {name} = {first:g} to {last:g} m; the "
+            f"flight needs {low:.4g} to {high:.4g} m (a larger volume, a shorter path, or another "
+            f"{what})"
+        )
+
+
+def _image_size(experiment: Experiment, wake: WakeAlongPath) -> tuple[float, float]:
+    """Width and height of the lidar's images, m."""
+    if isinstance(wake, VolumeAlongPath):
+        return float(np.ptp(wake.flow["y"])), float(np.ptp(wake.flow["z"]))
+    given = experiment.wake
+    assert given is not None and given.vortex_pair is not None  # an analytic wake
+    return given.vortex_pair.width, given.vortex_pair.height
+
+
+def _drift(
+    wake: WakeAlongPath, parts: Sequence[MovingAir], frame: LevelFrame, x: float, time: float
+) -> tuple[float, float, float]:
+    """Mean wind (m/s) of the other air along both vortices, where and when the wake is met.
+
+    Of a wake that lies across the path: at the place where the aircraft is then.
+    """
+    middle = vortices_in_plane(wake, x, time)
+    places = [(x, 0.0, 0.0)]
+    if middle:
+        separation = abs(middle[0].y - middle[1].y)
+        planes = [x + part * separation for part in _AROUND]
+        places = [
+            (plane, one.y, one.z)
+            for plane in planes
+            for one in vortices_in_plane(wake, plane, time) or ()
+        ]
+    at = np.array(places).T
+    u, v, w = (float(a.mean()) for a in frame.wind(parts, *at, time))
+    return u, v, w
