@@ -146,7 +146,10 @@ def simulate_flights(
             tested = encounter.control.preview == "pair" and not isinstance(model, JSBSimAircraft)
             integrity = Integrity(model) if tested else None
             found[mode] = fly(
-                steering, preview_at=partial(tracker.preview, model), integrity=integrity
+                steering,
+                observe=tracker.update,
+                preview_at=partial(tracker.preview, model),
+                integrity=integrity,
             )
             track, slabs = track_dataset(tracker.slabs, wake), recorder.dataset()
             track = track.merge(arrivals_dataset(tracker.arrivals, wake))
@@ -178,6 +181,8 @@ def simulate_flight(
     wake: WakeAlongPath,
     encounter: Encounter,
     notice: Notice,
+    *,
+    observe: Callable[[AircraftState], None] = lambda state: None,
     preview_at: Callable[[AircraftState], Preview | None] = lambda state: None,
     integrity: Integrity | None = None,
 ) -> xr.Dataset:
@@ -194,6 +199,8 @@ def simulate_flight(
     wake : WakeAlongPath
     encounter : Encounter
     notice : callable
+    observe : callable
+        A scan, if one is due in a state, and what was delivered since the last.
     preview_at : callable
         The preview in a state; None: there is none, and the controller gets what
         `bumpless_transfer` makes of the last one.
@@ -214,6 +221,7 @@ def simulate_flight(
         state = aircraft.state
         if step % a_scan == 0:
             notice(f"{state.time:.0f} of {count * dt:.0f} s", step / count)
+        observe(state)
         preview = preview_at(state)
         loads = met(state)
         predicted = preview(state.time) if preview else None

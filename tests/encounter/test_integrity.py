@@ -65,8 +65,10 @@ def test_a_wrong_wake_costs_no_more_than_half_a_degree(predicted, case):
             wake,
             encounter,
             silent,
-            partial(preview_in, predicted.wind, aircraft) if tested else lambda _: no_loads,
-            Integrity(aircraft) if tested else None,
+            preview_at=partial(preview_in, predicted.wind, aircraft)
+            if tested
+            else lambda _: no_loads,
+            integrity=Integrity(aircraft) if tested else None,
         )
         rolls.append(math.degrees(float(np.abs(found["roll"]).max())))
     expected = np.abs(found["predicted_roll_moment"].values)

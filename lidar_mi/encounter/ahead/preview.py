@@ -157,11 +157,7 @@ class WakeTracker:
         return np.clip(1 - (x - end) / (HORIZON * self.stride / self.period), 0.0, 1.0)
 
     def preview(self, aircraft: AircraftModel, state: AircraftState) -> Preview | None:
-        """The loads expected from a state on; None while nothing is known.
-
-        Calls `update` first.
-        """
-        self.update(state)
+        """The loads expected from a state on; None while nothing is known."""
         known = self.covers(state.x) or bool(self.ahead)
         return preview_in(self.wind, aircraft, state) if known else None
 
