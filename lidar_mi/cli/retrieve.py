@@ -1,5 +1,6 @@
 """``lidar-mi retrieve``: the cross-flow wind in images of the same air."""
 
+import enum
 import re
 from collections.abc import Sequence
 from itertools import pairwise
@@ -27,6 +28,20 @@ EXAMPLES = (
 
 _SAME = 1e-3
 """Relative difference between a time step given and one from headers that is rounding."""
+
+
+class Colours(enum.StrEnum):
+    """Of a picture of a wind."""
+
+    SPEED = "speed"
+    VORTICITY = "vorticity"
+
+
+class Lines(enum.StrEnum):
+    """On a picture of a wind."""
+
+    ARROWS = "arrows"
+    STREAMLINES = "streamlines"
 
 
 def retrieve(
@@ -102,6 +117,12 @@ def retrieve(
             "--pairs)."
         ),
     ] = True,
+    colours: Annotated[
+        Colours, typer.Option(help="Of the picture: speed or vorticity (dw/dy - dv/dz).")
+    ] = Colours.SPEED,
+    lines: Annotated[
+        Lines, typer.Option(help="On the picture: arrows or streamlines.")
+    ] = Lines.ARROWS,
     noise: Annotated[
         float | None,
         typer.Option(
@@ -236,7 +257,7 @@ def retrieve(
     output.print(f"method   {method}")
     output.print(f"winds    {out}")
     if drawn is not None:
-        _draw(wind, drawn)
+        _draw(wind, drawn, colours.value, lines.value)
         output.print(f"picture  {drawn}")
     if lost:
         output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
@@ -256,14 +277,14 @@ def _in_pixels(wind: "xr.Dataset", *, per_frame: bool) -> "xr.Dataset":
     return wind.assign_attrs(dt_units="frame") if per_frame else wind
 
 
-def _draw(wind: "xr.Dataset", path: Path) -> None:
+def _draw(wind: "xr.Dataset", path: Path, colours: str, lines: str) -> None:
     from matplotlib.figure import Figure
 
     from lidar_mi.io.png import write_png
     from lidar_mi.plots import plot_wind
 
     figure = Figure(figsize=(7.5, 4.6), layout="compressed")
-    plot_wind(wind, figure.subplots())
+    plot_wind(wind, figure.subplots(), colours=colours, lines=lines)
     write_png(figure, path)
 
 

@@ -227,6 +227,9 @@ def test_a_picture_of_the_vectors(photographs, lidar_mi, tmp_path):
     with Image.open("w.png") as picture:
         # arrows and colours: a picture of one colour has nothing in it
         assert min(picture.size) > 100 and len(set(picture.convert("L").tobytes())) > 20
+    options = "--colours", "vorticity", "--lines", "streamlines"
+    assert lidar_mi(*files, "-o", "turns.nc", *options)[0] == 0
+    assert (tmp_path / "turns.png").read_bytes() != (tmp_path / "w.png").read_bytes()
     before = (tmp_path / "a.png").read_bytes()
     code, _, err = lidar_mi(*files, "-o", "a.nc")
     assert code == 2 and "a.png: is an input" in err
