@@ -94,6 +94,24 @@ def _pick_time(
         raise InputError(
             f"{path}: dimension {name!r} has no values; allowed: a coordinate variable {name!r}"
         )
+    times, rounding = _times(data, name, path)
+    if time is None:
+        if times.size != 1:
+            listed = listing(times, tolerances(times, rounding))
+            raise InputError(
+                f"{path}: has {times.size} times, and none is chosen; expected wake.time: one of "
+                f"{listed} s"
+            )
+        index = 0
+    elif not np.isfinite(time):
+        raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
+    else:
+        index = state_at(time, times, rounding, str(path))
+    return data.isel({name: index}) if name in data.dims else data, float(times[index])
+
+
+def _times(data: xr.Dataset, name: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times of a file and by how much they may be rounded, s."""
     coordinate = data[name]
     if coordinate.ndim > 1:
         raise InputError(f"{path}: {name!r} has dims {coordinate.dims}; allowed: one at most")
@@ -108,20 +126,21 @@ def _pick_time(
             f"{path}: {name!r} is not finite at {bad.size} of {stored.size} places, the first at "
             f"index {bad[0]}; allowed: finite numbers"
         )
-    times, rounding = stored * scale, _rounding(coordinate, stored) * scale
-    if time is None:
-        if times.size != 1:
-            listed = listing(times, tolerances(times, rounding))
-            raise InputError(
-                f"{path}: has {times.size} times, and none is chosen; expected wake.time: one of "
-                f"{listed} s"
-            )
-        index = 0
-    elif not np.isfinite(time):
-        raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
-    else:
-        index = state_at(time, times, rounding, str(path))
-    return data.isel({name: index}) if name in data.dims else data, float(times[index])
+    return stored * scale, _rounding(coordinate, stored) * scale
+
+
+def wake_times(path: str | Path, names: Mapping[str, str] | None = None) -> np.ndarray:
+    """Times (s) of the states of a file that `read_wake` reads; none: it has no time.
+
+    Raises
+    ------
+    InputError
+        As of `read_wake`.
+    """
+    path = Path(path)
+    name = _file_names(names, path)[0]["time"]
+    with open_netcdf(path) as data:
+        return _times(data, name, path)[0] if name in data.variables else np.zeros(0)
 
 
 def _rounding(variable: xr.DataArray, values: np.ndarray) -> np.ndarray:

@@ -159,12 +159,40 @@ class Microburst(Section):
     y: _Place = Field(0.0, description="distance of its axis to the left of the path")
 
 
-class AirVolume(Section):
-    """Air of a simulation: one instant, frozen in its mean wind."""
+_Step = Annotated[Length, Within(0.01, 1000, "from wind tunnels to models of weather")]
 
-    file: str = Field(description="NetCDF file with u, v, w on (x, y, z), z above the ground")
+
+_Nodes = Annotated[int, Within(4, 65536, "cubic splines need 4, memory ends below")]
+
+
+class MannBox(Section):
+    """What the files of a Mann box do not say."""
+
+    nodes: tuple[_Nodes, _Nodes, _Nodes] = Field(description="along x, y and z")
+    spacing: tuple[_Step, _Step, _Step] = Field(description="of the nodes along x, y and z")
+    base: Annotated[Length, Within(0, 20000, "above the ground")] = Field(
+        description="height of the lowest nodes above the ground"
+    )
+
+
+class AirVolume(Section):
+    """Air of a simulation in its mean wind: one instant, frozen, or a series of states."""
+
+    file: str = Field(
+        description="NetCDF file with u, v, w on (x, y, z), z above the ground; or a full field of "
+        "TurbSim (.bts); or u of a Mann box of HAWC2 (.bin), beside v and w"
+    )
     time: Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")] | None = Field(
-        None, description="time in the file; required if it has several"
+        None, description="time in the file as the path starts; required if it has several"
+    )
+    series: bool = Field(
+        False, description="true: the air goes on through the states after `time`; false: frozen"
+    )
+    mann: MannBox | None = Field(None, description="with a Mann box")
+    largest_divergence: Annotated[Number, Within(0, 1, "0.577 is noise")] = Field(
+        0.2,
+        description="rms of the divergence over that of the velocity gradient up to which air is "
+        "accepted; fields of TurbSim have 0.5 to 0.6",
     )
     names: dict[str, str] = Field(
         {}, description="names in the file, of variables or dimensions with other names there"

@@ -82,6 +82,7 @@ OPTIONAL = (
     air.Air,
     air.Turbulence,
     air.AirVolume,
+    air.MannBox,
     air.Gust,
     air.LinearShear,
     air.LogarithmicShear,

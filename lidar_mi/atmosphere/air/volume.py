@@ -1,4 +1,4 @@
-"""Air of a simulation: one instant of a volume, frozen in the frame of the mean wind."""
+"""Air of a simulation: a volume in the frame of its mean wind, frozen or a series of states."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,21 +40,25 @@ def divergence_fraction(flow: xr.Dataset) -> float:
 
 @dataclass(frozen=True, eq=False)
 class AirVolume:
-    """A volume of air, at rest in the frame that moves with its mean wind at a height.
+    """A volume of air in the frame that moves with its mean wind at a height: frozen, or a series.
 
-    Interpolated by cubic splines. Beyond its edges the wind is that at the edge: `missing` says
-    where places are outside.
+    Interpolated by cubic splines in space and linearly in time, between the states before and after
+    that the mean wind carries to the same instant. Beyond its edges the wind is that at the edge:
+    `missing` says where places are outside.
 
     Parameters
     ----------
     flow : xarray.Dataset
-        u, v and w (m/s) on (x, y, z), m, even, 4 nodes or more along each; z above the ground.
+        u, v and w (m/s) on (x, y, z), m, even, 4 nodes or more along each; z above the ground. With
+        the dimension time (s, ascending, 0 as the path starts) it is a series of states.
     start : float
         x in the volume of the start of the path, m.
     centre : float
         y in the volume of the path, m.
     height : float
         At which the mean wind is that of the frame, m.
+    largest_divergence : float
+        Rms of the divergence over that of the velocity gradient, at most.
 
     Raises
     ------
@@ -66,6 +70,7 @@ class AirVolume:
     start: float
     centre: float
     height: float
+    largest_divergence: float = LARGEST_DIVERGENCE
 
     def __post_init__(self) -> None:
         for name in "xyz":
@@ -74,28 +79,56 @@ class AirVolume:
                     f"encounter.air.volume.file: {self.flow.sizes[name]} nodes along {name} are "
                     "not allowed; expected 4 or more"
                 )
-        fraction = divergence_fraction(self.flow)
-        if fraction > LARGEST_DIVERGENCE:
+        fraction = divergence_fraction(self._state(0))
+        if fraction > self.largest_divergence:
             raise InputError(
                 f"encounter.air.volume.file: the rms divergence is {fraction:.2g} times that of "
                 f"the velocity gradient; expected air without divergence, at most "
-                f"{LARGEST_DIVERGENCE:g} (0.58 is noise)"
+                f"{self.largest_divergence:g} (0.58 is noise), or another "
+                "encounter.air.volume.largest_divergence"
             )
 
     @cached_property
+    def times(self) -> np.ndarray:
+        """Of the states, s; of frozen air one."""
+        return self.flow["time"].values if "time" in self.flow.dims else np.zeros(1)
+
+    def _state(self, index: int) -> xr.Dataset:
+        return self.flow.isel(time=index) if "time" in self.flow.dims else self.flow
+
+    @cached_property
     def mean_wind(self) -> tuple[float, float]:
-        """Mean u and v of the volume at the height, m/s."""
-        level = self.flow[["u", "v"]].mean(("x", "y")).interp(z=self.height)
+        """Mean u and v of the volume at the height, m/s, over all states."""
+        over = [name for name in ("time", "x", "y") if name in self.flow.dims]
+        level = self.flow[["u", "v"]].mean(over).interp(z=self.height)
         # below the lowest or above the highest nodes that of the nearest
-        nearest = self.flow[["u", "v"]].mean(("x", "y")).sel(z=self.height, method="nearest")
+        nearest = self.flow[["u", "v"]].mean(over).sel(z=self.height, method="nearest")
         found = level.where(np.isfinite(level), nearest)
         return float(found["u"]), float(found["v"])
 
+    def _moved(self, last: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """How far the mean wind has carried the air at the first and at the last state needed, m.
+
+        Frozen air is looked up where it was at the only state.
+        """
+        needed = min(int(np.searchsorted(self.times, last)), len(self.times) - 1)
+        u, v = self.mean_wind
+        ends = float(self.times[0]), float(self.times[needed])
+        return (u * ends[0], u * ends[1]), (v * ends[0], v * ends[1])
+
     def missing(
-        self, x: ArrayLike, y: ArrayLike, z: ArrayLike
+        self, x: ArrayLike, y: ArrayLike, z: ArrayLike, last: float = 0.0
     ) -> dict[str, tuple[float, float, float, float]]:
-        """Along each axis that does not hold all places: its extent, and that of the places; m."""
-        places = np.asarray(x, float) + self.start, np.asarray(y, float) + self.centre, z
+        """Along each axis that does not hold all places: its extent, and that of the places; m.
+
+        With states until the time ``last`` (s) of a series.
+        """
+        along, across = self._moved(last)
+        places = (
+            np.add.outer(np.asarray(x, float) + self.start, along),
+            np.add.outer(np.asarray(y, float) + self.centre, across),
+            z,
+        )
         found = {}
         for name, place in zip("xyz", places, strict=True):
             nodes = self.flow[name].values
@@ -106,29 +139,50 @@ class AirVolume:
         return found
 
     @cached_property
-    def _splines(self) -> list[np.ndarray]:
-        means = (*self.mean_wind, 0.0)
-        return [
-            spline_filter(
-                self.flow[n].transpose("x", "y", "z").values - mean,
-                mode="nearest",
-                output=np.float32,
-            )
-            for n, mean in zip("uvw", means, strict=True)
-        ]
+    def _splines(self) -> dict[int, list[np.ndarray]]:
+        return {}
+
+    def _spline(self, index: int) -> list[np.ndarray]:
+        if index not in self._splines:
+            means, state = (*self.mean_wind, 0.0), self._state(index)
+            self._splines[index] = [
+                spline_filter(
+                    state[n].transpose("x", "y", "z").values - mean,
+                    mode="nearest",
+                    output=np.float32,
+                )
+                for n, mean in zip("uvw", means, strict=True)
+            ]
+        return self._splines[index]
 
     def velocity(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:
         """u, v, w (m/s) at places (m) and times (s), which broadcast."""
         given = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
-        own = given[0] + self.start, given[1] + self.centre, given[2]
-        index = []
-        for name, place in zip("xyz", own, strict=True):
-            nodes = self.flow[name].values
-            step = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
-            index.append(np.clip((place - nodes[0]) / step, 0, len(nodes) - 1).ravel())
-        at, shape = np.stack(index), given[0].shape
-        u, v, w = (
-            map_coordinates(one, at, output=float, mode="nearest", prefilter=False).reshape(shape)
-            for one in self._splines
-        )
-        return u, v, w
+        shape = given[0].shape
+        at_x, at_y, at_z, when = (one.ravel() for one in given)
+        found, count = np.zeros((3, when.size)), len(self.times)
+        # 2.0: halfway between the states 1 and 2 is 1.5
+        position = np.interp(when, self.times, np.arange(count)) if count > 1 else 0.0 * when
+        u, v = self.mean_wind
+        for index in np.unique([np.floor(position), np.ceil(position)]).astype(int):
+            weight = np.clip(1 - np.abs(position - index), 0, None)
+            here = weight > 0
+            passed = self.times[index]
+            own = (
+                at_x[here] + self.start + u * passed,
+                at_y[here] + self.centre + v * passed,
+                at_z[here],
+            )
+            at = np.stack([self._index(n, place) for n, place in zip("xyz", own, strict=True)])
+            for component, one in enumerate(self._spline(index)):
+                found[component, here] += weight[here] * map_coordinates(
+                    one, at, output=float, mode="nearest", prefilter=False
+                )
+        u_found, v_found, w_found = found.reshape(3, *shape)
+        return u_found, v_found, w_found
+
+    def _index(self, name: str, place: np.ndarray) -> np.ndarray:
+        """Fractional index of places along an axis, within it."""
+        nodes = self.flow[name].values
+        step = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
+        return np.clip((place - nodes[0]) / step, 0, len(nodes) - 1)

@@ -35,6 +35,7 @@ from lidar_mi.io.images import read_pixels
 from lidar_mi.io.json import to_json
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.text import encoded, write_text
+from lidar_mi.io.wind_box import mann_files
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.rendering.phase import table_files
 from lidar_mi.schema import reading
@@ -387,4 +388,6 @@ def _inputs(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
     if air is not None and air.volume is not None:
         key = "encounter.air.volume.file"
         paths[key] = find_file(air.volume.file, search_path, key)
+        if air.volume.mann is not None:
+            _, paths[f"{key} (v)"], paths[f"{key} (w)"] = mann_files(paths[key])
     return paths | timing_files(experiment, search_path)

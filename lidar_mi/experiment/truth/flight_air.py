@@ -5,6 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from lidar_mi.atmosphere.air.along_path import AirAlongPath, LevelFrame, MovingAir
 from lidar_mi.atmosphere.air.gust import Gust
@@ -21,7 +22,8 @@ from lidar_mi.experiment.truth.wake_along_path import (
     vortices_in_plane,
     wake_along_path,
 )
-from lidar_mi.io.wake_file import read_wake
+from lidar_mi.io.wake_file import read_wake, wake_times
+from lidar_mi.io.wind_box import read_bts, read_mann
 from lidar_mi.schema import air as schema
 from lidar_mi.schema import encounter as flight
 from lidar_mi.schema.experiment import Experiment
@@ -142,10 +144,43 @@ def _volume(given: schema.AirVolume, experiment: Experiment) -> AirVolume:
 @lru_cache(maxsize=1)
 def _read_volume(path: Path, stamp: int, keys: str, height: float) -> AirVolume:
     given = schema.AirVolume.model_validate_json(keys)
-    flow = read_wake(path, given.time, given.names, require=["u"])
+    flow = _flow(path, given)
     start = float(flow["x"][0]) if given.start is None else given.start
     centre = float(flow["y"].mean()) if given.centre is None else given.centre
-    return AirVolume(flow[["u", "v", "w"]], start, centre, height)
+    return AirVolume(flow[["u", "v", "w"]], start, centre, height, given.largest_divergence)
+
+
+def _flow(path: Path, given: schema.AirVolume) -> xr.Dataset:
+    """The wind of a file on (x, y, z), or on (time, x, y, z) with 0 s as the path starts."""
+    box = {".bts": "a field of TurbSim", ".bin": "a Mann box"}.get(path.suffix.lower())
+    if box and (given.time is not None or given.series or given.names):
+        raise InputError(
+            f"encounter.air.volume: time, series and names are not allowed with {box}, which has "
+            "one state"
+        )
+    if (box == "a Mann box") != (given.mann is not None):
+        raise InputError(
+            f"encounter.air.volume.mann: expected with a Mann box (.bin) and with no other file, "
+            f"found {path.name}"
+        )
+    if given.mann is not None:
+        return read_mann(path, given.mann.nodes, given.mann.spacing, given.mann.base)
+    if box:
+        return read_bts(path)
+    if not given.series:
+        return read_wake(path, given.time, given.names, require=["u"])
+    times = np.unique(wake_times(path, given.names))
+    if given.time is None or not (times[:1] <= given.time).all() or times.size < 2:
+        listed = f"{times[0]:g} to {times[-1]:g} s" if times.size else "none"
+        raise InputError(
+            f"encounter.air.volume.series: needs a file of several times and `time`, one of them; "
+            f"{path.name} has {listed}"
+        )
+    # the state at `time` is chosen as of a single one, whatever its rounding
+    first = read_wake(path, given.time, given.names, require=["u"])
+    chosen = [float(first["time"]), *times[times > float(first["time"])]]
+    states = [first, *(read_wake(path, t, given.names, require=["u"]) for t in chosen[1:])]
+    return xr.concat(states, "time").assign_coords(time=np.array(chosen) - chosen[0])
 
 
 def _check_covered(
@@ -158,8 +193,14 @@ def _check_covered(
         width, height = _image_size(experiment, wake)
         across, above = max(across, width / 2), height / 2
     along = np.array([0.0, encounter.path.start + encounter.path.beyond])
+    last = along[1] / encounter.path.speed
+    if volume.times.size > 1 and last > volume.times[-1] + 1e-6:
+        raise InputError(
+            f"encounter.air.volume.series: {file} goes on for {volume.times[-1]:g} s; the flight "
+            f"takes {last:.4g} s"
+        )
     x, z = frame.places(along[:, None], [-above, above])
-    missing = volume.missing(x, [-across, across], z)
+    missing = volume.missing(x, [-across, across], z, last)
     for name, (first, last, low, high) in missing.items():
         what = {"x": "start", "y": "centre", "z": "path.altitude"}[name]
         raise InputError(

@@ -6,6 +6,7 @@ refused where there is none, places outside that count as inside.
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from lidar_mi.atmosphere.air.turbulence import turbulence
 from lidar_mi.atmosphere.air.volume import AirVolume, divergence_fraction
@@ -79,3 +80,48 @@ def test_order_of_dimensions_does_not_matter(flow):
     second = AirVolume(flow.transpose("z", "x", "y"), 100.0, 0.0, 60.0)
     at = (30.0, 10.0, 50.0, 0.0)
     np.testing.assert_allclose(first.velocity(*at), second.velocity(*at))
+
+
+def passing(times, wind, x=(-40.0, 400.0)):
+    """States (s) of a wave that the wind carries along x and that grows by 10 % a second."""
+    axes = {
+        "x": np.arange(*x, 5.0),
+        "y": np.arange(-30.0, 31.0, 10.0),
+        "z": np.arange(20.0, 81.0, 10.0),
+    }
+    states = []
+    for time in times:
+        along = np.meshgrid(*axes.values(), indexing="ij")[0] - wind * time
+        w = (1 + 0.1 * time) * np.sin(2 * np.pi * along / 80)
+        values = {"u": np.full_like(w, wind), "v": np.zeros_like(w), "w": w}
+        states.append(xr.Dataset({n: (("x", "y", "z"), a) for n, a in values.items()}, coords=axes))
+    return xr.concat(states, "time").assign_coords(time=np.asarray(times, float))
+
+
+@pytest.mark.parametrize("wind", [-12.0, 0.0, 10.0])
+def test_a_series_is_carried_by_its_mean_wind_and_changes(wind):
+    """In the frame of the wind the wave stands and grows, also between the states."""
+    volume = AirVolume(passing(np.arange(0.0, 6.0, 1.5), wind), 80.0, 0.0, 50.0)
+    random = np.random.default_rng(4)
+    x, time = random.uniform(20, 200, 200), random.uniform(0, 4.5, 200)
+    u, v, w = volume.velocity(x, 3.0, 47.0, time)
+    # a cubic spline of 16 nodes a wave is right to 3e-4
+    np.testing.assert_allclose(w, (1 + 0.1 * time) * np.sin(2 * np.pi * (x + 80) / 80), atol=2e-3)
+    np.testing.assert_allclose([u, v], 0, atol=1e-5)
+    frozen = AirVolume(passing([0.0], wind).isel(time=0), 80.0, 0.0, 50.0)
+    _, _, stands = frozen.velocity(x, 3.0, 47.0, time)
+    np.testing.assert_allclose(stands, np.sin(2 * np.pi * (x + 80) / 80), atol=2e-3)
+
+
+def test_a_series_must_hold_the_places_that_the_wind_carries():
+    volume = AirVolume(passing([0.0, 2.0, 4.0], 10.0), 0.0, 0.0, 50.0)
+    assert volume.missing([0.0, 350.0], [0.0], [50.0], last=2.0) == {}
+    # at 4 s the air is 40 m farther on
+    missing = volume.missing([0.0, 360.0], [0.0], [50.0], last=2.5)
+    assert missing["x"] == pytest.approx((-40.0, 395.0, 0.0, 400.0))
+
+
+def test_more_divergence_is_accepted_on_request(flow):
+    random = np.random.default_rng(2)
+    noise = flow.copy(data={n: random.normal(size=flow[n].shape) for n in "uvw"})
+    AirVolume(noise, 0.0, 0.0, 60.0, largest_divergence=0.7)

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 
 from lidar_mi.aircraft.models import aircraft_of
@@ -168,6 +169,59 @@ def test_volumes_that_are_refused(air_file, path, air, control, message):
     volume = {"file": str(air_file[0])} | air
     with pytest.raises(InputError, match=message):
         air_along_path(in_air(path, control={"mode": control}, volume=volume))
+
+
+def test_boxes_and_series(tmp_path, air_file):
+    """A Mann box of the same field, and two states of which the second is twice as strong."""
+    flow = xr.open_dataset(air_file[0])
+    for name in "uvw":
+        raw = (flow[name] - flow[name].mean()).astype("<f4").transpose("x", "y", "z")
+        (tmp_path / f"box_{name}.bin").write_bytes(raw.values.tobytes())
+    nodes = [flow.sizes[name] for name in "xyz"]
+    mann = {"nodes": nodes, "spacing": ["2 m"] * 3, "base": "270 m"}
+    box = {"file": str(tmp_path / "box_u.bin"), "mann": mann}
+    stored = {"file": str(air_file[0])}
+    x = np.linspace(10, 220, 50)
+    expected, found = (
+        np.stack(air_along_path(in_air(SHORT, wake=False, volume=one)).wind(x, 5.0, -4.0, 1.0))
+        for one in (stored, box)
+    )
+    # the mean over the volume is not that at the height
+    difference = found - expected
+    assert np.abs(difference - difference.mean(axis=1, keepdims=True)).max() < 1e-4
+    record = new_record(in_air(SHORT, volume=box), tmp_path)["files"]
+    assert sum(key.startswith("encounter.air.volume.file") for key in record) == 3
+
+    states = xr.concat([flow, 2 * flow], "time").assign_coords(
+        time=("time", [3.0, 7.0], {"units": "s"})
+    )
+    for name in "uvw":
+        states[name].attrs["units"] = "m s-1"
+    states.to_netcdf(tmp_path / "series.nc")
+    series = {"file": str(tmp_path / "series.nc"), "time": "3 s", "series": True}
+    # the air of the second state has gone on with its mean wind
+    air = air_along_path(in_air(SHORT | {"start": "90 m"}, wake=False, volume=series))
+    calm = in_air(SHORT, wake=False, volume={"file": str(air_file[0])})
+    frozen = air_along_path(calm).wind(x, 5.0, -4.0, 0.0)[2]
+    np.testing.assert_allclose(air.wind(x, 5.0, -4.0, 0.0)[2], frozen, atol=1e-4)
+    with pytest.raises(InputError, match="goes on for 4 s; the flight takes "):
+        air_along_path(in_air({"start": "90 m", "beyond": "300 m"}, wake=False, volume=series))
+
+
+@pytest.mark.parametrize(
+    ("volume", "message"),
+    [
+        ({"file": "a.bts", "series": True}, "not allowed with a field of TurbSim, which has one"),
+        ({"file": "a_u.bin"}, r"volume\.mann: expected with a Mann box"),
+        ({"series": True}, "needs a file of several times and `time`, one of them; .* has none"),
+    ],
+)
+def test_boxes_and_series_that_are_refused(tmp_path, air_file, volume, message):
+    for name in ("a.bts", "a_u.bin"):
+        (tmp_path / name).write_bytes(b"")
+    file = tmp_path / volume["file"] if "file" in volume else air_file[0]
+    with pytest.raises(InputError, match=message):
+        air_along_path(in_air(SHORT, wake=False, volume=volume | {"file": str(file)}))
 
 
 def test_the_content_of_the_file_belongs_to_the_experiment(air_file, tmp_path):
