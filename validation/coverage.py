@@ -208,7 +208,7 @@ def rendered_images(seed: int) -> xr.Dataset:
 
 
 def both_lidars(seed: int) -> xr.Dataset:
-    """Wind by both lidars 150 m ahead, of the state of the simulation that is stored 0.1 s later."""
+    """Wind by both lidars 150 m ahead, of the state that is stored 0.1 s later."""
     experiment = lm.load_experiment(
         "near_range",
         variant="at_150m",

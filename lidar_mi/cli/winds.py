@@ -1,5 +1,6 @@
 """``lidar-mi winds``: profiles of the wind from scans of a Doppler lidar."""
 
+import enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +20,13 @@ EXAMPLES = (
 )
 
 _ROWS = 12
+
+
+class Layout(enum.StrEnum):
+    """Names in a file of winds."""
+
+    CF = "cf"
+    ACTRIS = "actris"
 
 
 def winds(
@@ -56,6 +64,9 @@ def winds(
         str | None, typer.Option(help="Distance of the gates, where that of the file is wrong.")
     ] = None,
     name: LineNames = None,
+    layout: Annotated[
+        Layout, typer.Option(help="Of the file: cf (u, v, w) or actris (uwind, vwind, as doppy's).")
+    ] = Layout.CF,
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve profiles of the wind from scans of a Doppler lidar, with their errors.
@@ -64,6 +75,7 @@ def winds(
     """
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.wind_profile import draw_wind_profiles
+    from lidar_mi.io.actris_wind import in_actris_layout
     from lidar_mi.io.csv_file import write_csv
     from lidar_mi.io.lines_of_sight.read import read_lines_of_sight
     from lidar_mi.io.netcdf import write_netcdf
@@ -92,10 +104,11 @@ def winds(
     valid = int((found["flag"] == 0).sum())
     if valid:
         _show(found)
+    written = in_actris_layout(found) if layout is Layout.ACTRIS else found
     if out.suffix.lower() == ".nc":
-        write_netcdf(found.assign_attrs(software=f"lidar-mi {__version__}"), out)
+        write_netcdf(written.assign_attrs(software=f"lidar-mi {__version__}"), out)
     else:
-        write_csv(out, found)
+        write_csv(out, written)
     output.print(f"winds    {out}")
     if not valid:
         end_without_result(f"no valid wind of {found['flag'].size}", found["flag"])

@@ -98,3 +98,19 @@ def test_many_profiles_are_drawn_as_maps():
     for some, panels in ((data, 6), (data.isel(time=[0]), 3)):
         figure = draw_wind_profiles(some)
         assert len(figure.axes) == panels and figure_rules.faults(figure) == []
+
+
+def test_winds_in_the_layout_of_actris(scan, tmp_path):
+    """Under the names of doppy, flagged winds in those that are not screened alone."""
+    done = shell("winds", scan, "--layout", "actris", "-o", "w.nc", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    expected = lm.fit_winds_to_lines(lm.read_lines_of_sight(scan))
+    valid = expected["flag"] == 0
+    with xr.open_dataset(tmp_path / "w.nc", engine="h5netcdf") as found:
+        for ours, theirs in (("u", "uwind"), ("v", "vwind")):
+            np.testing.assert_allclose(found[f"{theirs}_raw"], expected[ours], atol=1e-6)
+            np.testing.assert_allclose(found[theirs], expected[ours].where(valid), atol=1e-6)
+            assert found[theirs].attrs["units"] == "m s-1"
+        from_where = np.rad2deg(np.arctan2(-found["uwind"], -found["vwind"])) % 360
+        np.testing.assert_allclose(found["wind_direction"], from_where, atol=1e-3)
+        assert found["height"].attrs["units"] == "m" and found["time"].dtype.kind == "M"
