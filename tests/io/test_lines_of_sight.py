@@ -6,6 +6,7 @@ good values or none on bad ones.
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -481,7 +482,7 @@ def test_real_arm_file():
 
 
 def test_cfradial_is_read_by_its_documented_names(tmp_path):
-    """By plain xarray, and back by the reader of others' files; two sweeps, one a vertical slice."""
+    """By plain xarray, and back by the reader of others' files; of two sweeps, one is an RHI."""
     paths = [tmp_path / "a.hpl", tmp_path / "b.hpl"]
     circle = made.lines()
     slices = replace(
@@ -514,5 +515,5 @@ def test_cfradial_is_read_by_its_documented_names(tmp_path):
     )
     for name in ("radial_velocity", "azimuth", "elevation", "range"):
         np.testing.assert_allclose(back[name], lines[name], atol=1e-5)
-    with pytest.raises(InputError, match="lines: azimuth is missing"):
+    with pytest.raises(lm.InputError, match="lines: azimuth is missing"):
         lm.write_cfradial(lines.drop_vars("azimuth"), tmp_path / "d.nc")

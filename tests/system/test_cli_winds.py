@@ -102,7 +102,7 @@ def test_many_profiles_are_drawn_as_maps():
 
 def test_winds_in_the_layout_of_actris(scan, tmp_path):
     """Under the names of doppy, flagged winds in those that are not screened alone."""
-    done = shell("winds", scan, "--layout", "actris", "-o", "w.nc", cwd=tmp_path)
+    done = in_process("winds", scan, "--layout", "actris", "-o", "w.nc", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     expected = lm.fit_winds_to_lines(lm.read_lines_of_sight(scan))
     valid = expected["flag"] == 0

@@ -69,7 +69,7 @@ def write_cfradial(lines: xr.Dataset, path: str | Path) -> None:
     if "snr" in fields:
         about = {"units": "dB", "long_name": "signal-to-noise ratio of the powers"}
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = 10 * np.log10(fields["snr"])
+            ratio = fields["snr"].copy(data=10 * np.log10(fields["snr"].values))
         fields["snr"] = ratio.where(np.isfinite(ratio)).assign_attrs(about)
     for name, standard in _STANDARD.items():
         if name in fields:
