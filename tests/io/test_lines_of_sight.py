@@ -517,3 +517,19 @@ def test_cfradial_is_read_by_its_documented_names(tmp_path):
         np.testing.assert_allclose(back[name], lines[name], atol=1e-5)
     with pytest.raises(lm.InputError, match="lines: azimuth is missing"):
         lm.write_cfradial(lines.drop_vars("azimuth"), tmp_path / "d.nc")
+
+
+def test_a_lidar_that_moves_is_remarked_on(tmp_path):
+    """A ship that sails north at 10 m/s: 1852 m are a minute of latitude."""
+    known = made.lines()
+    data = made._cfradial(known)
+    way = 10.0 * known.seconds
+    data["latitude"] = "time", 47.0 + way / 1852 / 60
+    data["longitude"] = "time", np.full(way.size, 8.0)
+    data.attrs = {"Conventions": "CF/Radial", "version": "1.4"}
+    data.to_netcdf(tmp_path / "ship.nc", engine="h5netcdf")
+    remarks = lm.read_lines_of_sight(tmp_path / "ship.nc").attrs["remarks"]
+    assert f"the lidar moves by {way[-1] - way[0]:.0f} m (10 m/s): winds are off by" in remarks
+    anchored = data.assign(latitude=data["latitude"] * 0 + 47.0)
+    anchored.to_netcdf(tmp_path / "quay.nc", engine="h5netcdf")
+    assert "moves" not in lm.read_lines_of_sight(tmp_path / "quay.nc").attrs["remarks"]

@@ -47,8 +47,8 @@ def write_cfradial(lines: xr.Dataset, path: str | Path) -> None:
     >>> with open("lines.csv", "w") as file:
     ...     _ = file.write(rows)
     >>> lm.write_cfradial(lm.read_lines_of_sight("lines.csv"), "lines.nc")
-    >>> xr.load_dataset("lines.nc")["fixed_angle"].values
-    array([60.])
+    >>> float(xr.load_dataset("lines.nc")["fixed_angle"][0])
+    60.0
     """
     for name in _NEEDED:
         if name not in lines.variables:
