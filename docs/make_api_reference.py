@@ -24,8 +24,8 @@ plugins have [pages of their own](plugins.md).
 """
 # file, title, modules whose names are there (of several that fit, the longest), use
 PAGES = (
-    ("experiments", "Experiments", ("experiment",), "[Python](../guide/python.md)"),
-    ("encounters", "Encounters", ("encounter",), "[an encounter](../guide/flights.md)"),
+    ("experiments", "Experiments", ("experiment", "schema"), "[Python](../guide/python.md)"),
+    ("encounters", "Encounters", ("encounter", "aircraft"), "[an encounter](../guide/flights.md)"),
     ("campaigns", "Campaigns", ("campaign",), "[campaigns](../campaigns.md)"),
     (
         "wind",
@@ -36,7 +36,7 @@ PAGES = (
     (
         "lines_of_sight",
         "Wind and vortices from lines of sight",
-        ("retrieval.lines_of_sight", "retrieval.line_vortices"),
+        ("retrieval.ground_winds", "retrieval.ground_vortices"),
         "[lines of sight](../guide/doppler_lines.md)",
     ),
     ("vortices", "Vortices", ("retrieval.vortices",), "[methods](../guide/methods.md)"),
@@ -49,7 +49,7 @@ PAGES = (
     (
         "files",
         "Files",
-        ("io", "experiment.export", "encounter.export_control"),
+        ("io", "experiment.export", "encounter.control_block.export"),
         "[run outputs](../guide/outputs.md)",
     ),
     ("machine", "Mitsuba and the machine", ("",), "[troubleshooting](../guide/troubleshooting.md)"),
@@ -58,6 +58,7 @@ PAGES = (
 MEMBERS = {
     "Experiment": "folder, read_from",
     "VirtualLidar": "step, wake",
+    "JSBSimInAir": "run",
     "VortexPairFit": "success, port, starboard, mean_wind, quantities, after, wind",
     "Calibration": "to_dataset",
     "Rings": "splitting, curve",
@@ -68,8 +69,8 @@ MEMBERS = {
     "InputError": None,
 }
 # what is returned, but not made by hand
-MORE = {"encounters": ("encounter.estimate.Estimate",)}
-BY_HAND = ("AircraftPose", "VectorValidation", "VirtualLidar", "WindowSizes")
+MORE = {"encounters": ("encounter.lidar.estimate.Estimate",)}
+BY_HAND = ("AircraftPose", "JSBSimInAir", "VectorValidation", "VirtualLidar", "WindowSizes")
 
 
 def pages() -> dict[str, str]:

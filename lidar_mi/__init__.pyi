@@ -5,6 +5,7 @@ from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
 from .encounter.control_block.export import export_control
 from .encounter.fly import Flights, fly
+from .encounter.jsbsim_in_air import JSBSimInAir
 from .encounter.lidar.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
@@ -50,6 +51,7 @@ __all__ = [
     "Flights",
     "Gap",
     "InputError",
+    "JSBSimInAir",
     "Rings",
     "Run",
     "VectorValidation",

@@ -84,7 +84,7 @@ class JSBSimAircraft:
         check_aeroplane(aircraft.model, path)
         self._fdm = trimmed(aircraft.model, path, FLAPS)
         self.density = self._fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
-        self.strips = _strips(self._fdm, aircraft.lift_slope)
+        self.strips = strips_of(self._fdm, aircraft.lift_slope)
         # derivatives take aircraft of their own, with the flaps of this one
         again = partial(trimmed, aircraft.model, path, [self._fdm["fcs/flap-cmd-norm"]])
         self.control_moments, self._per_command = control_moments(again)
@@ -107,7 +107,7 @@ class JSBSimAircraft:
         self._roll_relief = aircraft.heave.wing_mass * self.mass * span**2 / 16  # elliptic chord
         self._trim = self._fdm["aero/alpha-rad"], self._fdm["accelerations/Nz"]
         self.deflection = np.zeros(3)
-        self._origin = _place(self._fdm)
+        self._origin = neu_place(self._fdm)
         self.state = self._read(0.0, np.zeros(2))
 
     @property
@@ -153,42 +153,11 @@ class JSBSimAircraft:
 
     def _read(self, time: float, by_wind: np.ndarray) -> AircraftState:
         """State in the path frame, with the wind's bending moments."""
-        fdm = self._fdm
-        north, east, up = _place(fdm) - self._origin
-        northward, downward = (fdm[f"velocities/v-{to}-fps"] * foot for to in ("north", "down"))
-        along, upward = math.cos(self._climb), math.sin(self._climb)
-        # heading is clockwise seen from above, yaw is to port
-        level = attitude(
-            fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], -fdm["attitude/psi-rad"]
-        )
-        numbers = [north, east, up, *level.as_quat(), fdm["velocities/vt-fps"]]
-        if not np.isfinite(numbers).all():
+        found = state_in_path(self._fdm, self._origin, self._climb, time)
+        if found is None:
             return replace(self.state, time=time, departed=True)
-        # the path frame is inclined by the climb angle
-        in_path = attitude(0.0, self._climb, 0.0).inv() * level
-        # right-handed about y, which is to port: the nose goes down
-        yaw, nose_down, roll = in_path.as_euler("ZYX")
         port, starboard = self._bent(by_wind)
-        p, q, r = (fdm[f"velocities/{axis}-rad_sec"] for axis in "pqr")
-        # the path goes north, so that port is west; q is nose up as pitch, r to starboard
-        return AircraftState(
-            time=time,
-            x=float(north * along + up * upward),
-            y=float(-east),
-            z=float(up * along - north * upward),
-            roll=float(roll),
-            pitch=float(-nose_down),
-            yaw=float(yaw),
-            roll_rate=p,
-            pitch_rate=q,
-            yaw_rate=-r,
-            airspeed=fdm["velocities/vt-fps"] * foot,
-            departed=bool(abs(roll) > LARGEST_ROLL or fdm["position/h-agl-ft"] <= 0),
-            vertical_speed=float(-downward * along - northward * upward),
-            load_factor=fdm["accelerations/Nz"],
-            port_bending=port,
-            starboard_bending=starboard,
-        )
+        return replace(found, port_bending=port, starboard_bending=starboard)
 
     def _bent(self, by_wind: np.ndarray) -> tuple[float, float]:
         """Bending moments of port and starboard wing, changes from the trim, N m.
@@ -209,7 +178,54 @@ class JSBSimAircraft:
         return float(port), float(starboard)
 
 
-def _place(fdm: "FGFDMExec") -> np.ndarray:
+def state_in_path(
+    fdm: "FGFDMExec", origin: np.ndarray, climb: float, time: float
+) -> AircraftState | None:
+    """The state of JSBSim in a path frame, without bending moments; None: it is not finite.
+
+    Parameters
+    ----------
+    fdm : jsbsim.FGFDMExec
+    origin : ndarray, shape (3,)
+        Of the path, as `neu_place`, m; the path goes north.
+    climb : float
+        Angle of the path, rad.
+    time : float
+        s.
+    """
+    north, east, up = neu_place(fdm) - origin
+    northward, downward = (fdm[f"velocities/v-{to}-fps"] * foot for to in ("north", "down"))
+    along, upward = math.cos(climb), math.sin(climb)
+    # heading is clockwise seen from above, yaw is to port
+    level = attitude(fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], -fdm["attitude/psi-rad"])
+    numbers = [north, east, up, *level.as_quat(), fdm["velocities/vt-fps"]]
+    if not np.isfinite(numbers).all():
+        return None
+    # the path frame is inclined by the climb angle
+    in_path = attitude(0.0, climb, 0.0).inv() * level
+    # right-handed about y, which is to port: the nose goes down
+    yaw, nose_down, roll = in_path.as_euler("ZYX")
+    p, q, r = (fdm[f"velocities/{axis}-rad_sec"] for axis in "pqr")
+    # the path goes north, so that port is west; q is nose up as pitch, r to starboard
+    return AircraftState(
+        time=time,
+        x=float(north * along + up * upward),
+        y=float(-east),
+        z=float(up * along - north * upward),
+        roll=float(roll),
+        pitch=float(-nose_down),
+        yaw=float(yaw),
+        roll_rate=p,
+        pitch_rate=q,
+        yaw_rate=-r,
+        airspeed=fdm["velocities/vt-fps"] * foot,
+        departed=bool(abs(roll) > LARGEST_ROLL or fdm["position/h-agl-ft"] <= 0),
+        vertical_speed=float(-downward * along - northward * upward),
+        load_factor=fdm["accelerations/Nz"],
+    )
+
+
+def neu_place(fdm: "FGFDMExec") -> np.ndarray:
     """North, east, up, m."""
     return foot * np.array([fdm[f"position/from-start-neu-{axis}-ft"] for axis in "neu"])
 
@@ -221,7 +237,7 @@ def _wing(fdm: "FGFDMExec") -> tuple[float, float, np.ndarray]:
     return fdm["metrics/bw-ft"] * foot, fdm["metrics/Sw-sqft"] * foot**2, place
 
 
-def _strips(fdm: "FGFDMExec", lift_slope: float) -> Strips:
+def strips_of(fdm: "FGFDMExec", lift_slope: float) -> Strips:
     """Wing, and the tail surfaces that JSBSim knows."""
     span, area, place = _wing(fdm)
     surfaces = [as_wing(wing_strips(span, area, lift_slope, place=place))]

@@ -182,13 +182,22 @@ def _buoyancy(fdm: "FGFDMExec") -> float:
 
 
 def _at_the_start(name: str, path: Path) -> "FGFDMExec":
-    fdm = _loaded(name)
+    fdm = loaded(name)
     fdm["ic/h-sl-ft"] = path.altitude / foot
     fdm["ic/vt-fps"] = path.speed / foot
     return fdm
 
 
-def _loaded(name: str) -> "FGFDMExec":
+def loaded(name: str) -> "FGFDMExec":
+    """JSBSim with an aircraft on which forces and moments can act, before initial conditions.
+
+    Raises
+    ------
+    InputError
+        There is no JSBSim, or it has no such aircraft.
+    RuntimeError
+        From JSBSim, of an aircraft that it cannot load.
+    """
     try:
         import jsbsim
     except ImportError:
