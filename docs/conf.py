@@ -160,9 +160,8 @@ def with_narrow(text, narrow):
     def both(image):
         if image["name"] not in narrow:
             return image[0]
-        source = (
-            f'<source media="(max-width: 46em)" srcset="{image["folder"]}{narrow[image["name"]]}">'
-        )
+        file = image["folder"] + narrow[image["name"]]
+        source = f'<source media="(max-width: 46em)" srcset="{file}">'
         return f"<picture>{source}{image[0]}</picture>"
 
     pattern = r'<img [^>]*src="(?P<folder>[^"]*_images/)(?P<name>[^"/]+)"[^>]*>'

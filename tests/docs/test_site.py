@@ -14,7 +14,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 DOCS = Path(__file__).parents[2] / "docs"
 NEEDED = ("sphinx", "myst_parser", "furo", "latex2mathml")
@@ -162,6 +164,7 @@ def test_site_is_built_without_a_warning(tmp_path):
         assert not re.search(r'(?:src|href)="https?://[^"]+\.(?:js|css)', page.read_text())
 
 
+@with_sphinx
 def test_pictures_of_two_panels_are_stacked_on_a_small_screen(tmp_path):
     """A red and a blue panel with white between them; a picture of one panel stays."""
     conf = runpy.run_path(str(DOCS / "conf.py"))
