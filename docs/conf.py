@@ -10,10 +10,14 @@ import re
 import runpy
 import unicodedata
 from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
 
 from docutils import nodes
 from latex2mathml.converter import convert
+from PIL import Image
+
+from lidar_mi.io.images import panel_cuts
 
 project = "lidar-mi"
 author = "The lidar-mi developers"
@@ -118,9 +122,56 @@ def _write_texts(app, error):
     (Path(app.outdir) / "_static" / "pages.js").write_text(script, encoding="utf-8")
 
 
+def stacked(path):
+    """The panels of a picture one below the other; None: it has one column."""
+    cuts = panel_cuts(path)
+    if not cuts:
+        return None
+    with Image.open(path) as image:
+        whole = image.convert("RGB")
+    edges = [round(cut * whole.width) for cut in (0, *cuts, 1)]
+    panels = [whole.crop((a, 0, b, whole.height)) for a, b in pairwise(edges)]
+    column = Image.new("RGB", (max(p.width for p in panels), whole.height * len(panels)), "white")
+    for number, panel in enumerate(panels):
+        column.paste(panel, (0, number * whole.height))
+    return column
+
+
+def _stack_pictures(app, error):
+    """Pictures of several columns have their panels stacked on a small screen."""
+    if error or app.builder.format != "html":
+        return
+    out, narrow = Path(app.outdir), {}
+    for path in (out / "_images").glob("*.png"):
+        column = stacked(path)
+        if column is not None:
+            narrow[path.name] = f"{path.stem}.narrow.webp"
+            column.save(path.with_name(narrow[path.name]), lossless=True)
+    for page in out.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        found = with_narrow(text, narrow)
+        if found != text:
+            page.write_text(found, encoding="utf-8")
+
+
+def with_narrow(text, narrow):
+    """A page whose pictures have other files on a small screen, by their names."""
+
+    def both(image):
+        if image["name"] not in narrow:
+            return image[0]
+        file = image["folder"] + narrow[image["name"]]
+        source = f'<source media="(max-width: 46em)" srcset="{file}">'
+        return f"<picture>{source}{image[0]}</picture>"
+
+    pattern = r'<img [^>]*src="(?P<folder>[^"]*_images/)(?P<name>[^"/]+)"[^>]*>'
+    return re.sub(pattern, both, text)
+
+
 def setup(app):
     """Formulas of the pages in MathML, and pages that the site alone has."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     app.connect("builder-inited", _write_pages)
     app.connect("html-page-context", _finish_page)
     app.connect("build-finished", _write_texts)
+    app.connect("build-finished", _stack_pictures)

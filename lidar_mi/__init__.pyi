@@ -15,6 +15,7 @@ from .experiment.run import run
 from .experiment.truth.extinction import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
+from .io.lines_of_sight.cfradial import write_cfradial
 from .io.lines_of_sight.read import read_lines_of_sight
 from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
@@ -92,5 +93,6 @@ __all__ = [
     "standard_errors",
     "to_xarray",
     "use_variant",
+    "write_cfradial",
     "write_vortices",
 ]

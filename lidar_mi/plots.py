@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 ARROWS = 28
 """About as many arrows along the longer side."""
 
+_SHORTEST = 0.4  # arrow, in distances between arrows
+
 _COLOURS = {
     "off": "tab:red",
     "autopilot": "tab:purple",
@@ -134,12 +136,31 @@ def arrow_length(speeds: np.ndarray, limit: float) -> float:
     return float(np.clip(limit / (3 * usual), 1.8, 5.0)) if usual > 0 else 1.8
 
 
+def arrow_stretch(speeds: np.ndarray, stderr: np.ndarray | None, most: float) -> np.ndarray:
+    """Factors of the lengths of arrows by which none is too short to show its direction.
+
+    The shortest arrow is 0.4 of the distance between arrows. Those with a standard error above
+    their speed are left as they are: they have no direction. Colours tell the speed.
+
+    Parameters
+    ----------
+    speeds, stderr : arrays
+        Of the arrows, m/s; stderr None: not known, as 0.
+    most : float
+        Speed whose arrow is as long as arrows are apart, m/s.
+    """
+    least = _SHORTEST * most
+    sure = speeds > 0 if stderr is None else speeds > np.maximum(stderr, 0.0)
+    return np.where(sure, np.maximum(least / np.where(sure, speeds, np.inf), 1.0), 1.0)
+
+
 def plot_wind(
     wind: xr.Dataset, ax: "Axes | None" = None, *, colours: str = "speed", lines: str = "arrows"
 ) -> "Axes":
     """Cross-flow wind (v, w) on (z, y) as arrows or streamlines on its speed or vorticity.
 
-    Flagged vectors are grey. Where the standard error exceeds the speed, colours are pale.
+    Flagged vectors are grey. Where the standard error exceeds the speed, colours are pale. Arrows
+    elsewhere are no shorter than 0.4 of their distance, see `arrow_stretch`.
 
     Parameters
     ----------
@@ -184,14 +205,15 @@ def plot_wind(
     mesh = ax.pcolormesh(y, z, field, shading="nearest", **span)
     ax.figure.colorbar(mesh, ax=ax, label=label, extend=ends, pad=0.02)
     # after the bar, whose colours are full
-    opacity: Any = _opacity(wind, speed)
+    stderr = _stderr(wind)
+    opacity: Any = None if stderr is None else np.where(stderr > speed, 0.25, 1.0)
     mesh.set_alpha(opacity)
     on_top = "white" if colours == "speed" else "black"
     if lines == "streamlines":
         across, up = (np.where(valid, part.values, np.nan) for part in (v, w))
         ax.streamplot(y, z, across, up, color=on_top, density=1.4, linewidth=0.7, arrowsize=0.7)
         return _axes(ax, v)
-    _quiver(ax, v, w, valid, on_top, _largest(known), unit)
+    _quiver(ax, v, w, valid, on_top, _largest(known), unit, stderr)
     return ax
 
 
@@ -203,6 +225,7 @@ def _quiver(
     colour: str,
     limit: float,
     unit: str,
+    stderr: np.ndarray | None,
 ) -> None:
     """Arrows of valid vectors in a colour; others are grey and no longer than arrows are apart."""
     y, z = v["y"].values, v["z"].values
@@ -218,7 +241,8 @@ def _quiver(
         "width": 0.0025,
     }
     most = limit / length
-    shorter = np.where(valid, 1.0, most / np.maximum(speed, most))
+    stretch = arrow_stretch(speed, stderr, most)
+    shorter = np.where(valid, stretch, most / np.maximum(speed, most))
     for which, shade in ((valid, colour), (~valid, "0.6")):
         arrows = ax.quiver(
             y[::every],
@@ -241,13 +265,12 @@ def _largest(values: np.ndarray) -> float:
     return (float(np.quantile(known, 0.999)) if known.size else 0.0) or 1.0
 
 
-def _opacity(wind: xr.Dataset, speed: np.ndarray) -> np.ndarray | None:
-    """Pale where the standard error is larger than the speed; None: no errors are stated."""
+def _stderr(wind: xr.Dataset) -> np.ndarray | None:
+    """Of the vectors, m/s, (z, y); None: no errors are stated."""
     if not {"v_stderr", "w_stderr"} <= set(wind.data_vars):
         return None
     errors = [np.broadcast_to(wind[f"{name}_stderr"], wind[name].shape) for name in "vw"]
-    stderr = xr.DataArray(np.hypot(*errors), dims=wind["v"].dims).transpose("z", "y").values
-    return np.where(stderr > speed, 0.25, 1.0)
+    return xr.DataArray(np.hypot(*errors), dims=wind["v"].dims).transpose("z", "y").values
 
 
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -38,6 +38,20 @@ class Tabular:
         return as_html(self.tables(), self.thumbnail())
 
 
+def shown_part(number: int, step: int, noun: str) -> str:
+    """Which rows of a thinned table are shown: "every 3rd of 36 heights".
+
+    Examples
+    --------
+    >>> shown_part(36, 3, "height"), shown_part(40, 2, "scan"), shown_part(9, 1, "height")
+    ('every 3rd of 36 heights', 'every 2nd of 40 scans', 'all 9 heights')
+    """
+    if step == 1:
+        return f"all {number} {noun}s"
+    ending = {1: "st", 2: "nd", 3: "rd"}.get(step % 10 if step % 100 // 10 != 1 else 0, "th")
+    return f"every {step}{ending} of {number} {noun}s"
+
+
 def with_error(value: float, stderr: float, unit: str = "") -> str:
     """A number and its standard error, both to two digits of the latter: ``312.4 ± 5.1 m²/s``.
 

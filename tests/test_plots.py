@@ -19,7 +19,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.quiver import Quiver
 
 import lidar_mi as lm
-from lidar_mi.plots import arrow_length, plot_flights, vorticity
+from lidar_mi.plots import arrow_length, arrow_stretch, plot_flights, vorticity
 from tests.support import figure_rules
 
 Y, Z = np.arange(-2.0, 3.0), np.arange(4.0)
@@ -198,3 +198,11 @@ def test_noise_is_not_as_vivid_as_wind(wind):
     assert {tuple(one) for one in (wind.lm.plot().get_xlim(), wind.lidar.plot().get_xlim())} == {
         (2.0, -2.0)
     }
+
+
+def test_no_arrow_is_too_short_to_show_its_direction_but_those_without_one():
+    """Where arrows are 1 m/s apart: 0.4 of it at least; 0.1 m/s with an error of 0.2 has none."""
+    speeds = np.array([0.1, 0.1, 0.8, 3.0, 0.0])
+    factors = arrow_stretch(speeds, np.array([0.05, 0.2, 0.1, 0.1, 0.0]), 1.0)
+    np.testing.assert_allclose(factors * speeds, [0.4, 0.1, 0.8, 3.0, 0.0])
+    np.testing.assert_allclose(arrow_stretch(speeds, None, 1.0) * speeds, [0.4, 0.4, 0.8, 3.0, 0.0])

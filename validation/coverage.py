@@ -208,7 +208,7 @@ def rendered_images(seed: int) -> xr.Dataset:
 
 
 def both_lidars(seed: int) -> xr.Dataset:
-    """Wind by both lidars 150 m ahead, of the simulation's true second state."""
+    """Wind by both lidars 150 m ahead, of the state that is stored 0.1 s later."""
     experiment = lm.load_experiment(
         "near_range",
         variant="at_150m",
@@ -226,7 +226,7 @@ CASES: dict[str, Callable[[int], Pair]] = {
         for rms in (0.0, 0.02, 0.05, 0.1, 0.2)
     },
     **{
-        f"true second state, texture {100 * rms:.0f} %": partial(shipped_wake, "40.1 s", rms)
+        f"stored state at t2, texture {100 * rms:.0f} %": partial(shipped_wake, "40.1 s", rms)
         for rms in (0.0, 0.02, 0.05, 0.1, 0.2)
     },
     **{
@@ -235,13 +235,13 @@ CASES: dict[str, Callable[[int], Pair]] = {
         )
         for words, second, rms, noise in (
             ("advected", "advect", 0.0, 0.003),
-            ("true second state", "40.1 s", 0.0, 0.003),
+            ("stored state at t2", "40.1 s", 0.0, 0.003),
             ("advected", "advect", 0.05, 0.01),
             ("advected", "advect", 0.2, 0.02),
-            ("true second state", "40.1 s", 0.1, 0.01),
+            ("stored state at t2", "40.1 s", 0.1, 0.01),
         )
     },
-    "true second state, texture 10 %, noise 1 % of each pixel": partial(
+    "stored state at t2, texture 10 %, noise 1 % of each pixel": partial(
         shipped_wake, "40.1 s", 0.1, noise=0.01, bright=True
     ),
     **{
@@ -265,7 +265,7 @@ VOLUMES: dict[str, Callable[[int], Pair]] = {
 VOLUME_METHODS = ("variational", "correlation")
 
 RUNS: dict[str, tuple[Callable[[int], xr.Dataset], tuple[str, ...]]] = {
-    "true second state, texture 10 %, rendered, all orders": (rendered_images, METHODS),
+    "stored state at t2, texture 10 %, rendered, all orders": (rendered_images, METHODS),
     "the same by both lidars at 150 m": (both_lidars, ("sensor",)),
 }
 """Winds of whole experiments by seed, with the true ones, and the methods in them."""

@@ -1,5 +1,6 @@
 """``lidar-mi retrieve``: the cross-flow wind in images of the same air."""
 
+import enum
 import re
 from collections.abc import Sequence
 from itertools import pairwise
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_mi.cli.exit_codes import end_without_result
 from lidar_mi.cli.options import Overwrite, complete_method
 from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.errors import InputError
@@ -26,6 +28,20 @@ EXAMPLES = (
 
 _SAME = 1e-3
 """Relative difference between a time step given and one from headers that is rounding."""
+
+
+class Colours(enum.StrEnum):
+    """Of a picture of a wind."""
+
+    SPEED = "speed"
+    VORTICITY = "vorticity"
+
+
+class Lines(enum.StrEnum):
+    """On a picture of a wind."""
+
+    ARROWS = "arrows"
+    STREAMLINES = "streamlines"
 
 
 def retrieve(
@@ -101,6 +117,12 @@ def retrieve(
             "--pairs)."
         ),
     ] = True,
+    colours: Annotated[
+        Colours, typer.Option(help="Of the picture: speed or vorticity (dw/dy - dv/dz).")
+    ] = Colours.SPEED,
+    lines: Annotated[
+        Lines, typer.Option(help="On the picture: arrows or streamlines.")
+    ] = Lines.ARROWS,
     noise: Annotated[
         float | None,
         typer.Option(
@@ -121,7 +143,10 @@ def retrieve(
     device: Annotated[str, typer.Option(help="That computes: cpu, cuda, or auto.")] = "cpu",
     overwrite: Overwrite = False,
 ) -> None:
-    """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from many."""
+    """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from many.
+
+    Exit code 1: no vector is valid; the file says why.
+    """
     import numpy as np
     import xarray as xr
 
@@ -131,12 +156,13 @@ def retrieve(
     from lidar_mi.io.wind_file import SERIES, SUFFIXES, write_wind
     from lidar_mi.retrieval.images.common_grid import on_one_grid
     from lidar_mi.retrieval.images.gridding import on_nodes
-    from lidar_mi.retrieval.wind.methods import METHODS
     from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
     from lidar_mi.retrieval.wind.pair import retrieve_wind
+    from lidar_mi.retrieval.wind.pair_input import method_of
     from lidar_mi.retrieval.wind.series import retrieve_winds
     from lidar_mi.retrieval.wind.synchronised import synchronised
 
+    settings_of = method_of(method).options
     check_target(out, files, overwrite=overwrite, suffixes=SUFFIXES if pairs is None else SERIES)
     drawn = out.with_suffix(".png") if picture and pairs is None else None
     if drawn is not None:
@@ -150,7 +176,7 @@ def retrieve(
     paths = [path for path, frames in asked for _ in frames]
     chosen = None if pairs is None else _pairs(pairs, len(paths))
     more = len(paths) > 2 and chosen is None
-    if more and method in METHODS and "more" not in METHODS[method].options:
+    if more and "more" not in settings_of:
         raise InputError(
             f"{len(paths)} images are not allowed with --method {method}; expected two, --pairs "
             "all (a wind from each pair), or --method variational (one wind from all)"
@@ -231,10 +257,12 @@ def retrieve(
     output.print(f"method   {method}")
     output.print(f"winds    {out}")
     if drawn is not None:
-        _draw(wind, drawn)
+        _draw(wind, drawn, colours.value, lines.value)
         output.print(f"picture  {drawn}")
     if lost:
         output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
+    if not (wind["flag"] == 0).any():
+        end_without_result(f"no valid vector of {wind['flag'].size}", wind["flag"])
 
 
 def _in_pixels(wind: "xr.Dataset", *, per_frame: bool) -> "xr.Dataset":
@@ -249,14 +277,14 @@ def _in_pixels(wind: "xr.Dataset", *, per_frame: bool) -> "xr.Dataset":
     return wind.assign_attrs(dt_units="frame") if per_frame else wind
 
 
-def _draw(wind: "xr.Dataset", path: Path) -> None:
+def _draw(wind: "xr.Dataset", path: Path, colours: str, lines: str) -> None:
     from matplotlib.figure import Figure
 
     from lidar_mi.io.png import write_png
     from lidar_mi.plots import plot_wind
 
     figure = Figure(figsize=(7.5, 4.6), layout="compressed")
-    plot_wind(wind, figure.subplots())
+    plot_wind(wind, figure.subplots(), colours=colours, lines=lines)
     write_png(figure, path)
 
 

@@ -141,12 +141,13 @@ def _show(found: "xr.Dataset") -> None:
     """A table of the scans with a wake, and how many there are."""
     import numpy as np
 
-    from lidar_mi.tables import Table, with_error
+    from lidar_mi.tables import Table, shown_part, with_error
 
     valid = (found["flag"] == 0).values
     chosen = np.flatnonzero(np.isfinite(found["y"].values).all(1))
     rows = []
-    for k in chosen[:: max(1, -(-chosen.size // _ROWS))]:
+    step = max(1, -(-chosen.size // _ROWS))
+    for k in chosen[::step]:
         one = found.isel(scan=int(k))
         for v in range(found.sizes["vortex"]):
             rows.append(
@@ -162,4 +163,6 @@ def _show(found: "xr.Dataset") -> None:
     heads = ("time (UTC)", "y, m", "z, m", "circulation, m²/s", "core radius, m", "")
     wakes = int((found["flag"].values & 1 == 0).sum())
     note = f"{wakes} of {valid.size} scans show a wake, {int(valid.sum())} have a valid fit."
+    if step > 1:
+        note += f" Shown: {shown_part(chosen.size, step, 'scan')}."
     print_table(Table("vortices", rows, heads, note))

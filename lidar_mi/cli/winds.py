@@ -1,5 +1,6 @@
 """``lidar-mi winds``: profiles of the wind from scans of a Doppler lidar."""
 
+import enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +20,13 @@ EXAMPLES = (
 )
 
 _ROWS = 12
+
+
+class Layout(enum.StrEnum):
+    """Names in a file of winds."""
+
+    CF = "cf"
+    ACTRIS = "actris"
 
 
 def winds(
@@ -56,6 +64,9 @@ def winds(
         str | None, typer.Option(help="Distance of the gates, where that of the file is wrong.")
     ] = None,
     name: LineNames = None,
+    layout: Annotated[
+        Layout, typer.Option(help="Of the file: cf (u, v, w) or actris (uwind, vwind, as doppy's).")
+    ] = Layout.CF,
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve profiles of the wind from scans of a Doppler lidar, with their errors.
@@ -64,6 +75,7 @@ def winds(
     """
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.wind_profile import draw_wind_profiles
+    from lidar_mi.io.actris_wind import in_actris_layout
     from lidar_mi.io.csv_file import write_csv
     from lidar_mi.io.lines_of_sight.read import read_lines_of_sight
     from lidar_mi.io.netcdf import write_netcdf
@@ -92,10 +104,11 @@ def winds(
     valid = int((found["flag"] == 0).sum())
     if valid:
         _show(found)
+    written = in_actris_layout(found) if layout is Layout.ACTRIS else found
     if out.suffix.lower() == ".nc":
-        write_netcdf(found.assign_attrs(software=f"lidar-mi {__version__}"), out)
+        write_netcdf(written.assign_attrs(software=f"lidar-mi {__version__}"), out)
     else:
-        write_csv(out, found)
+        write_csv(out, written)
     output.print(f"winds    {out}")
     if not valid:
         end_without_result(f"no valid wind of {found['flag'].size}", found["flag"])
@@ -107,13 +120,14 @@ def _show(found: "xr.Dataset") -> None:
     """A table of valid winds, a few heights of the first profile, and how many there are."""
     import numpy as np
 
-    from lidar_mi.tables import Table, with_error
+    from lidar_mi.tables import Table, shown_part, with_error
 
     valid = (found["flag"] == 0).values
     profile = int(np.argmax(valid.any(1)))
     one = found.isel(time=profile)
     heights = np.flatnonzero(valid[profile])
-    chosen = heights[:: max(1, -(-heights.size // _ROWS))]
+    step = max(1, -(-heights.size // _ROWS))
+    chosen = heights[::step]
     rows = [
         (
             f"{float(one['height'][k]):.0f}",
@@ -128,4 +142,6 @@ def _show(found: "xr.Dataset") -> None:
     number = valid.shape[0]
     profiles = f"{number} profile{'s' if number > 1 else ''}"
     note = f"{int(valid.sum())} of {valid.size} winds are valid, of {profiles}."
+    if step > 1 or number > 1:
+        note += f" Shown: {shown_part(heights.size, step, 'height')} of this one."
     print_table(Table(f"wind, {time} UTC", rows, heads, note))

@@ -143,8 +143,18 @@ def judged(
             continue
         else:
             measured, reasons = _of_images(experiment, results["wind"], metrics)
+        measured["range"] = _nearest_range(experiment, table)
         found.append((table, judge(table, measured, reasons)))
     return found
+
+
+def _nearest_range(experiment: Experiment, table: RequirementTable) -> float:
+    """Of the ranges that the table allows, the one nearest to the slab's middle, if in the slab."""
+    near, far = experiment.scan.range, experiment.scan.range + experiment.scan.thickness
+    middle = (near + far) / 2
+    rows = (row for row in table.rows if row.quantity == "range")
+    allowed = next((min(max(middle, row.minimum), row.maximum) for row in rows), middle)
+    return allowed if near <= allowed <= far else middle
 
 
 def _of_both_lidars(
@@ -160,7 +170,6 @@ def _of_both_lidars(
     depth = doppler.lidar.range_bin
     vectors = math.floor(_apart(experiment) * metrics["sensor.vectors"])
     return {
-        "range": experiment.scan.range + experiment.scan.thickness / 2,
         "points_per_slab": metrics["sensor.lines_retrieved"] if along else vectors,
         "slabs_per_second": sensor.slabs_per_second,
         "slab_depth": depth if along else max(depth, experiment.scan.thickness),
@@ -183,7 +192,6 @@ def _of_images(
     method = next((m for m in methods if valid[m]), methods[0])
     vectors = valid[method] * wind.sizes["z"] * wind.sizes["y"]
     measured: dict[str, float | None] = {
-        "range": scan.range + scan.thickness / 2,
         "slab_depth": scan.thickness,
         "slabs_per_second": 1 / experiment.platform.dt,
         "points_per_slab": math.floor(_apart(experiment) * vectors),

@@ -13,7 +13,8 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     """Write all values of a data set, one row for each place.
 
     Columns are coordinates, then variables, as ``v [m s-1]``; numbers of the whole data set
-    are repeated in every row. After a column of flags, ``flag in words`` has the reasons,
+    are repeated in every row. ``y_vector`` and ``z_vector`` are there only where they differ from
+    ``y`` and ``z``. After a column of flags, ``flag in words`` has the reasons,
     or ``valid``. Missing numbers are ``NaN``.
 
     Raises
@@ -24,7 +25,9 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     rows = data.expand_dims("row") if not data.dims else data
     table = rows.to_dataframe(dim_order=[str(dim) for dim in rows.dims]).reset_index()
     places = [axis for axis in ("x", "y", "z") if axis in data.coords]
-    labels = [str(name) for name in data.coords if name not in places]
+    # vectors that are at the centres of their windows have no place of their own
+    same = [f"{axis}_vector" for axis in places if _equal(data, axis, f"{axis}_vector")]
+    labels = [str(name) for name in data.coords if name not in (*places, *same)]
     columns = [*labels, *places, *(str(name) for name in data.data_vars)]
     table = table[columns]
     for name in columns:
@@ -37,6 +40,10 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
         if "units" in data[name].attrs
     }
     write_text(path, table.rename(columns=heads).to_csv(index=False, na_rep="NaN"))
+
+
+def _equal(data: xr.Dataset, one: str, other: str) -> bool:
+    return other in data.coords and bool((data[one] == data[other]).all())
 
 
 def _in_words(flags: np.ndarray, attributes: dict[str, Any]) -> list[str]:

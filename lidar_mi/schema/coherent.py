@@ -195,7 +195,9 @@ class AirAtTheGround(Section):
     wind: tuple[
         Annotated[Speed, Within(-100, 100, "a hurricane")],
         Annotated[Speed, Within(-100, 100, "a hurricane")],
-    ] = Field((0.0, 0.0), description="along the flight and to its left, at all heights")
+    ] = Field(
+        (0.0, 0.0), description="along passage.heading (0: north) and to its left, at all heights"
+    )
     logarithmic_shear: LogarithmicShear | None = None
     turbulence: Turbulence | None = None
 
@@ -215,8 +217,8 @@ class CoherentDoppler(Section):
     )
     position: tuple[_Place, _Place, _Place] = Field(
         (0.0, 700.0, 2.0),
-        description="of the lidar: along the flight and to its left, from where the wake begins, "
-        "and above the ground",
+        description="of the lidar: along passage.heading and to its left, from where the wake "
+        "begins, and above the ground",
     )
     interval: Annotated[Time, Within(1, 1e6, "a week")] | None = Field(
         None, description="of a profile of winds; default: one for every scan"

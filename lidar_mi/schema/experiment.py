@@ -222,7 +222,11 @@ class Experiment(Tabular, Section):
     def _doppler_lidar_in_the_air_of_the_site(self) -> Self:
         if self.fringes is None:
             if self.imaged_wake is None and self.site != Site():
-                raise ValueError("site: not allowed with doppler.kind coherent alone")
+                raise ValueError(
+                    "site: not allowed with doppler.kind coherent, whose echo is that of aerosol "
+                    "and as strong as doppler.signal says; expected no site, or doppler.kind: "
+                    "fringes"
+                )
             return self
         if self.imaged_wake is None and self.site.sounding is not None:
             raise ValueError(

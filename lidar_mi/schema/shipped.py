@@ -185,9 +185,11 @@ def _found_shipped(name: str | Path, kinds: Sequence[_Kind]) -> Path:
         path.stem.lower(), [n for kind in kinds for n in _names(kind)], 1
     )
     hint = f"did you mean {close[0]}? Expected" if close else "expected"
-    raise InputError(
-        f"{name}: no such file; {hint} {kinds[0].called} or one of {', '.join(_names(kinds[0]))}"
-    )
+    names = ", ".join(_names(kinds[0]))
+    # those of the package have no files of one's own beside them
+    if kinds == [_INSTRUMENT]:
+        raise InputError(f"{name}: no such instrument; {hint} one of {names}")
+    raise InputError(f"{name}: no such file; {hint} {kinds[0].called} or one of {names}")
 
 
 def _names(kind: _Kind) -> list[str]:

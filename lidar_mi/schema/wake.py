@@ -9,6 +9,7 @@ from lidar_mi.schema.section import Section
 from lidar_mi.units import (
     Circulation,
     Extinction,
+    Given,
     Length,
     Mass,
     Number,
@@ -162,6 +163,23 @@ class ExtinctionMapping(Section):
     stretch: Annotated[Number, Within(1, 100, "1 is linear; 100 is a step")] = Field(
         2.0, description="contrast of thin tracer; 1 = linear"
     )
+
+    @model_validator(mode="after")
+    def _above_the_background(self) -> Self:
+        if self.maximum > self.background:
+            return self
+        named, other = "maximum", "background"
+        # a number without a unit is per metre
+        slip = not isinstance(self.background, Given) and 1e-3 * self.background < self.maximum
+        if slip or "maximum" not in self.model_fields_set:
+            named, other = other, named
+        value, limit = 1e3 * getattr(self, named), 1e3 * getattr(self, other)
+        side = "more" if named == "maximum" else "less"
+        meant = f": is {1e-3 * value:g} / km meant?" if slip else ""
+        raise ValueError(
+            f"{named}: {value:g} / km is not allowed; expected {side} than {other}, {limit:g} / km"
+            f"{meant}"
+        )
 
 
 class Texture(Section):

@@ -5,6 +5,7 @@ or colour that is taken for another or read by two rules, a wrong spacing, and f
 traceback.
 """
 
+import importlib
 import re
 import struct
 import sys
@@ -62,7 +63,11 @@ def test_files_that_are_none(tmp_path, values):
         (tmp_path / name).write_bytes(b"no picture")
     Image.fromarray(np.zeros((3, 4), np.uint8)).save(tmp_path / "good.png")
     for name, layer, message in (
-        ("none.png", None, "no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image"),
+        (
+            "none.png",
+            None,
+            r"no such file; expected an image \(EXR, PNG, TIFF, BMP, JPEG, FITS, npy, npz,",
+        ),
         ("bad.png", None, "no readable image"),
         ("bad.fits", None, "FITS"),
         ("bad.exr", None, "bad.exr"),
@@ -122,6 +127,7 @@ def test_a_colour_image_is_the_same_to_both_commands(tmp_path, monkeypatch):
         raise InputError("that was it")
 
     monkeypatch.setattr(rings, "analyse_rings", stop)
+    importlib.import_module("lidar_mi.retrieval.wind.series")  # which keeps the function
     monkeypatch.setattr(wind, "retrieve_wind", stop)
     for command in (
         ["rings", "colours.png"],

@@ -6,6 +6,7 @@ good values or none on bad ones.
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -478,3 +479,57 @@ def test_real_arm_file():
     np.testing.assert_allclose(found["range"][[0, -1]], [15, 12012])
     blind = ((found["flag"].values & LineFlag.BLIND_RANGE) > 0).all(0)
     assert blind[found["range"] < 90].all() and not blind[found["range"] > 90].any()
+
+
+def test_cfradial_is_read_by_its_documented_names(tmp_path):
+    """By plain xarray, and back by the reader of others' files; of two sweeps, one is an RHI."""
+    paths = [tmp_path / "a.hpl", tmp_path / "b.hpl"]
+    circle = made.lines()
+    slices = replace(
+        circle,
+        seconds=circle.seconds + 100,
+        azimuth=np.full_like(circle.azimuth, 30.0),
+        elevation=np.linspace(5.0, 40.0, circle.elevation.size),
+    )
+    for path, one in zip(paths, (circle, slices), strict=True):
+        path.write_text(made.halo_text(one))
+    lines = lm.read_lines_of_sight(paths)
+    lm.write_cfradial(lines, tmp_path / "c.nc")
+    with xr.open_dataset(tmp_path / "c.nc", engine="h5netcdf") as data:
+        assert data.attrs["Conventions"].startswith("CF/Radial")
+        modes = [one.decode() for one in data["sweep_mode"].values]
+        assert modes == ["azimuth_surveillance", "rhi"]
+        np.testing.assert_allclose(data["fixed_angle"], [circle.elevation[0], 30.0], atol=0.01)
+        half = circle.azimuth.size
+        assert data["sweep_start_ray_index"].values.tolist() == [0, half]
+        assert data["sweep_end_ray_index"].values.tolist() == [half - 1, 2 * half - 1]
+        velocity = data["radial_velocity"]
+        assert velocity.attrs["standard_name"].endswith("_away_from_instrument")
+        np.testing.assert_array_equal(velocity, lines["radial_velocity"])
+        np.testing.assert_allclose(10 ** (data["snr"] / 10), lines["snr"], rtol=1e-5)
+        assert (data["time"].values == lines["time"].values).all()
+    back = lm.read_lines_of_sight(tmp_path / "c.nc")
+    assert (
+        back.attrs["kind"] == "CfRadial 1"
+        and back["sweep"].values.tolist() == lines["sweep"].values.tolist()
+    )
+    for name in ("radial_velocity", "azimuth", "elevation", "range"):
+        np.testing.assert_allclose(back[name], lines[name], atol=1e-5)
+    with pytest.raises(lm.InputError, match="lines: azimuth is missing"):
+        lm.write_cfradial(lines.drop_vars("azimuth"), tmp_path / "d.nc")
+
+
+def test_a_lidar_that_moves_is_remarked_on(tmp_path):
+    """A ship that sails north at 10 m/s: 1852 m are a minute of latitude."""
+    known = made.lines()
+    data = made._cfradial(known)
+    way = 10.0 * known.seconds
+    data["latitude"] = "time", 47.0 + way / 1852 / 60
+    data["longitude"] = "time", np.full(way.size, 8.0)
+    data.attrs = {"Conventions": "CF/Radial", "version": "1.4"}
+    data.to_netcdf(tmp_path / "ship.nc", engine="h5netcdf")
+    remarks = lm.read_lines_of_sight(tmp_path / "ship.nc").attrs["remarks"]
+    assert f"the lidar moves by {way[-1] - way[0]:.0f} m (10 m/s): winds are off by" in remarks
+    anchored = data.assign(latitude=data["latitude"] * 0 + 47.0)
+    anchored.to_netcdf(tmp_path / "quay.nc", engine="h5netcdf")
+    assert "moves" not in lm.read_lines_of_sight(tmp_path / "quay.nc").attrs["remarks"]

@@ -121,3 +121,14 @@ def test_every_suffix_is_a_format_of_its_own(tmp_path, wind):
     for suffix, start in starts.items():
         write_wind(tmp_path / f"w{suffix}", wind, (0.5, 0.25))
         assert (tmp_path / f"w{suffix}").read_bytes().startswith(start)
+
+
+def test_places_of_vectors_are_columns_only_where_they_differ(tmp_path, wind):
+    z, y = xr.broadcast(wind["z"], wind["y"])
+    for shift, there in ((0.0, False), (0.1, True)):
+        placed = wind.assign_coords(y_vector=y + shift, z_vector=z)
+        write_wind(tmp_path / "w.csv", placed, (0.5, 0.25))
+        with (tmp_path / "w.csv").open() as file:
+            heads = next(csv.reader(file))
+        assert any(head.startswith("y_vector") for head in heads) == there
+        assert not any(head.startswith("z_vector") for head in heads)

@@ -118,8 +118,9 @@ def test_identical_images_are_remarked_on(here, lidar_mi):
     Image.fromarray(images[0]).save("a.png")
     words = "are the same, bit for bit"
     for files in (("same.tif",), ("a.png", "a.png"), ("same.tif", "--pairs", "all")):
-        code, out, _ = lidar_mi("retrieve", *files, *OPTIONS)
-        assert code == 0 and words in " ".join(out.split())
+        code, out, err = lidar_mi("retrieve", *files, *OPTIONS)
+        assert code == 1 and words in " ".join(out.split())
+        assert "no valid vector of " in err and (here / "wind.nc").is_file()
     pages("pair.tif", images)
     assert words not in lidar_mi("retrieve", "pair.tif", *OPTIONS)[1]
     # air has no rings, but that both frames are one is said before

@@ -227,6 +227,16 @@ def bad(*arguments, says):
             "wake.spacing=2 mm",
             says=["wake.spacing", "nodes, which memory"],
         ),
+        *(
+            bad("check", "tiny.yaml", "--set", f"wake.extinction.{change}", says=[says])
+            for change, says in (
+                # per metre
+                ("background=0.39", "background: 390 / km is not allowed; expected less than max"),
+                ("background=0.41", "maximum, 1.8 / km: is 0.41 / km meant?"),
+                ("background=2 / km", "background: 2 / km is not allowed; expected less than max"),
+                ("maximum=0.05 / km", "maximum: 0.05 / km is not allowed; expected more than bac"),
+            )
+        ),
         bad("check", "wake_senor", says=["wake_senor: no such file", "did you mean wake_sensor?"]),
         bad("check", "wake.yaml", says=["text.nc", "not NetCDF"]),
         bad("info", "smog", says=["smog", "no such file", "molecules", "spheroids"]),

@@ -153,8 +153,10 @@ def test_images_of_a_detector_come_first(here, lidar_mi):
 @pytest.mark.slow
 def test_thresholds_flag_more(here, lidar_mi):
     def valid(*more):
-        assert lidar_mi("retrieve", "0.exr", "1.exr", "--method", "cc", *OPTIONS, *more)[0] == 0
-        return int((xr.load_dataset("w.nc")["flag"] == 0).sum())
+        code, *_ = lidar_mi("retrieve", "0.exr", "1.exr", "--method", "cc", *OPTIONS, *more)
+        found = int((xr.load_dataset("w.nc")["flag"] == 0).sum())
+        assert code == (found == 0)
+        return found
 
     usual = valid()
     for option in ("--min-correlation", "--min-texture", "--min-isotropy"):
@@ -225,6 +227,9 @@ def test_a_picture_of_the_vectors(photographs, lidar_mi, tmp_path):
     with Image.open("w.png") as picture:
         # arrows and colours: a picture of one colour has nothing in it
         assert min(picture.size) > 100 and len(set(picture.convert("L").tobytes())) > 20
+    options = "--colours", "vorticity", "--lines", "streamlines"
+    assert lidar_mi(*files, "-o", "turns.nc", *options)[0] == 0
+    assert (tmp_path / "turns.png").read_bytes() != (tmp_path / "w.png").read_bytes()
     before = (tmp_path / "a.png").read_bytes()
     code, _, err = lidar_mi(*files, "-o", "a.nc")
     assert code == 2 and "a.png: is an input" in err

@@ -2,6 +2,7 @@
 writes or that forecasts another run, and an interrupt that leaves half of one."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -64,7 +65,7 @@ def test_run_folder_is_named_after_the_experiment(there, lidar_mi, quick):
 
 def test_check_summarises_a_run(there, lidar_mi):
     """Numbers that follow from the file by hand; nothing is written."""
-    changes = ("scan.range=210 m", "platform.speed=70 m/s", "platform.dt=0.2 s")
+    changes = ["scan.range=210 m", "platform.speed=70 m/s", "platform.dt=0.2 s"]
     before = files_in(there)
     code, out, err = lidar_mi("check", "tiny.yaml", *(w for c in changes for w in ("--set", c)))
     assert code == 0, err
@@ -75,7 +76,11 @@ def test_check_summarises_a_run(there, lidar_mi):
     # (16 - 8)/2 - 1/2 pixels in dt
     assert "search region winds up to 8.75 m/s; largest here" in output
     assert "extinction 0.1 to 0.1 1/km" not in output and "texture, rms 10%" in output
+    assert "not assessed: lidar.pulse_duration is 0" in output
     assert files_in(there) == before
+    changes.append("lidar.pulse_duration=10 ns")
+    code, out, err = lidar_mi("check", "tiny.yaml", *(w for c in changes for w in ("--set", c)))
+    assert re.search(r"one beam safe beyond \d+ m, with binoculars beyond \d+ m", words_of(out))
 
 
 def test_check_warns_of_winds_too_fast_to_follow(there, lidar_mi):

@@ -115,6 +115,8 @@ def test_a_new_file_replaces_no_other(there, lidar_mi):
         (("wake_sensor",), "a shipped experiment has this name"),
         (("mine", "--from", "wake_senser"), "did you mean wake_sensor?"),
         (("mine", "--from", "tiny.yaml"), "expected an experiment file or one of"),
+        (("mine", "--like", "halo"), "halo: no such instrument; "),
+        (("mine", "--like", "radar"), "expected one of aeroli, awiator, halo_streamline, live,"),
         (("nowhere/mine",), "is no folder"),
     ],
 )
@@ -268,3 +270,18 @@ def test_new_file_like_an_instrument(lidar_mi, tmp_path, monkeypatch):
     code, _, err = lidar_mi("new", "other", "--like", "windcube_200")
     assert code == 2 and "did you mean windcube_200s?" in err and "halo_streamline" in err
     assert not (tmp_path / "other.yaml").exists()
+
+
+def test_the_wind_of_a_lidar_on_the_ground_is_to_the_east_and_north(tmp_path, lidar_mi):
+    """5 m/s along a flight to the south and 2 m/s to its left, which is east; and without light."""
+    (tmp_path / "a.yaml").write_text(
+        instrument_file("halo_streamline").read_text() + "  passage: {heading: 180 deg}\n"
+    )
+    change = ("--set", "doppler.signal.cnr=-60")
+    _, out, _ = lidar_mi("check", str(tmp_path / "a.yaml"), *change)
+    said = words_of(out)
+    assert "mean wind 2 m/s to the east, -5 m/s to the north" in said
+    assert "noise of a velocity no signal at 1000 m" in said
+    change = ("--set", "site.altitude=1 km")
+    _, _, err = lidar_mi("check", str(tmp_path / "a.yaml"), *change)
+    assert "whose echo is that of aerosol and as strong as doppler.signal says" in err

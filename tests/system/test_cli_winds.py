@@ -27,7 +27,7 @@ def test_winds_of_a_scan(scan, tmp_path):
     assert done.returncode == 0, done.stderr
     words = words_of(done.stdout)
     assert "remark: vad.hpl: the header promises 9 rays, the file has 6" in words
-    assert "17 of 17 winds are valid, of 1 profile" in words
+    assert "17 of 17 winds are valid, of 1 profile. Shown: every 2nd of 17 heights" in words
     with xr.open_dataset(tmp_path / "winds.nc") as found:
         expected = lm.fit_winds_to_lines(lm.read_lines_of_sight(scan), noise=0.02)
         for name, known in zip("uvw", made.WIND, strict=True):
@@ -60,7 +60,7 @@ def test_no_figure_without_a_valid_wind(tmp_path):
         (("vad.hpl", "-o", "winds.txt"), "winds.txt: .txt is not allowed; expected .nc or .csv"),
         (
             ("vad.hpl", "--min-cnr", "90"),
-            "three valid lines that are not in one plane (scan: ppi; 0",
+            "vad.hpl: no height has three valid lines that are not in one plane (scan: ppi; 0",
         ),
         (
             ("stare.hpl",),
@@ -98,3 +98,19 @@ def test_many_profiles_are_drawn_as_maps():
     for some, panels in ((data, 6), (data.isel(time=[0]), 3)):
         figure = draw_wind_profiles(some)
         assert len(figure.axes) == panels and figure_rules.faults(figure) == []
+
+
+def test_winds_in_the_layout_of_actris(scan, tmp_path):
+    """Under the names of doppy, flagged winds in those that are not screened alone."""
+    done = in_process("winds", scan, "--layout", "actris", "-o", "w.nc", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    expected = lm.fit_winds_to_lines(lm.read_lines_of_sight(scan))
+    valid = expected["flag"] == 0
+    with xr.open_dataset(tmp_path / "w.nc", engine="h5netcdf") as found:
+        for ours, theirs in (("u", "uwind"), ("v", "vwind")):
+            np.testing.assert_allclose(found[f"{theirs}_raw"], expected[ours], atol=1e-6)
+            np.testing.assert_allclose(found[theirs], expected[ours].where(valid), atol=1e-6)
+            assert found[theirs].attrs["units"] == "m s-1"
+        from_where = np.rad2deg(np.arctan2(-found["uwind"], -found["vwind"])) % 360
+        np.testing.assert_allclose(found["wind_direction"], from_where, atol=1e-3)
+        assert found["height"].attrs["units"] == "m" and found["time"].dtype.kind == "M"

@@ -14,7 +14,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.assessment.metrics.requirements import (
+    Requirement,
+    RequirementTable,
+    read_requirements,
+)
 from lidar_mi.assessment.metrics.sensor import limit_metrics, vector_metrics
 from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.atmosphere.vortices.cores import Core
@@ -501,3 +505,23 @@ def test_a_check_reports_lines_in_one_plane(columns, rows, reported):
     (_, lines), *_ = found["both as one sensor"]
     assert lines.startswith(f"{columns * rows}, 20 pulses each")
     assert ("in one plane: no wind" in lines) == reported
+
+
+@pytest.mark.parametrize(
+    ("start", "limits", "expected"),
+    [
+        (150.0, {"maximum": 150.0}, 150.0),
+        (149.0, {"minimum": 151.5}, 151.5),
+        (160.0, {"maximum": 150.0}, 161.25),
+        (100.0, {"minimum": 150.0}, 101.25),
+    ],
+)
+def test_a_range_is_anywhere_in_the_slab(start, limits, expected):
+    table = RequirementTable("a", "a", "landing", (Requirement("range", **limits),))
+    metrics = {"sensor.lines_retrieved": 15, "sensor.vectors": 1000}
+    results = {"requirements": {0: table}, "truth": SimpleNamespace(wind={"u"})}
+    asked = changed(
+        scan={"range": f"{start} m", "thickness": "2.5 m"}, doppler={"lidar": {"range": start + 1}}
+    )
+    ((_, (row,)),) = judged(asked, results, metrics)
+    assert row.measured == expected and row.passed == (149 <= start <= 150)

@@ -32,7 +32,7 @@ from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.errors import deviations
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.vortices.cores import Core
-from lidar_mi.plots import ARROWS, arrow_length
+from lidar_mi.plots import ARROWS, arrow_length, arrow_stretch
 
 
 class ObservedAir(Protocol):
@@ -198,12 +198,14 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
         shorter = most / np.maximum(np.hypot(v, w)[flagged], most)
         shown = v[flagged] * shorter, w[flagged] * shorter
         axes.quiver(y[flagged], z[flagged], *shown, color="0.75", **style)
+    speed = np.hypot(v, w)[valid]
+    stretch = arrow_stretch(speed, None, scale.limit / scale.length)
     arrows = axes.quiver(
         y[valid],
         z[valid],
-        v[valid],
-        w[valid],
-        np.hypot(v, w)[valid],
+        v[valid] * stretch,
+        w[valid] * stretch,
+        speed,
         cmap="viridis",
         norm=Normalize(0, scale.limit),
         **style,

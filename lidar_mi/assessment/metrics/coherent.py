@@ -24,13 +24,22 @@ def lines_metrics(lines: xr.Dataset) -> dict[str, float]:
     """Number of lines, and noise of their velocities: stated, and found against the truth.
 
     ``coherent.lines``, ``coherent.noise`` (median of the stated standard errors, m/s),
-    ``coherent.rmse_v_los`` and ``coherent.bias_v_los`` (m/s), ``coherent.cnr`` (median, dB).
+    ``coherent.rmse_v_los`` and ``coherent.bias_v_los`` (m/s), ``coherent.cnr`` (median, dB), of
+    gates with a signal, ``coherent.signal_fraction`` of all.
     """
-    error = error_statistics(lines["radial_velocity"] - lines["radial_velocity_true"])
-    return {
+    signal = lines["flag"] == 0
+    found = {
         f"{PREFIX}lines": float(lines.sizes["time"]),
-        f"{PREFIX}noise": float(lines["radial_velocity_stderr"].median()),
-        f"{PREFIX}cnr": float(10 * np.log10(lines["snr"].median())),
+        f"{PREFIX}signal_fraction": float(signal.mean()),
+    }
+    if not signal.any():
+        return found
+    seen = lines[["radial_velocity", "radial_velocity_true", "radial_velocity_stderr", "snr"]]
+    seen = seen.where(signal)
+    error = error_statistics(seen["radial_velocity"] - seen["radial_velocity_true"])
+    return found | {
+        f"{PREFIX}noise": float(seen["radial_velocity_stderr"].median()),
+        f"{PREFIX}cnr": float(10 * np.log10(seen["snr"].median())),
         f"{PREFIX}rmse_v_los": error["rmse"],
         f"{PREFIX}bias_v_los": error["bias"],
     }

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from lidar_mi.assessment.digits import whole_percent
+from lidar_mi.assessment.digits import percent, whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import (
     Source,
@@ -52,12 +52,13 @@ def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged 
     -------
     list of str
         Sentences: which part of the error is the simulation's, unless it is as small as asked for;
-        errors of the wind, vortices, and one verdict per requirement table. Tables of phases of
-        flight at another air speed are named and not judged.
+        errors of the wind, vortices, what scatters back, and one verdict per requirement table.
+        Tables of phases of flight at another air speed are named and not judged.
     """
     simulated = simulation_sentence(experiment, metrics)
     lines = [simulated] if simulated else []
     lines += [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
+    lines += _scatterers(metrics)
     speed = experiment.platform.speed if experiment.imaged_wake else 0.0
     lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
     others = [table for table, _ in judged if not table.applies_at(speed)]
@@ -98,7 +99,7 @@ def _wind(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]
 
 
 def _sensor(experiment: Experiment, metrics: Mapping[str, float]) -> str:
-    head = f"Both lidars, {_place(experiment)}"
+    head = f"Both lidars, {_place(experiment)}{_without_noise(experiment)}"
     if not metrics["sensor.vectors"]:
         return f"{head}: no valid wind vector."
     far = far_from_cores(metrics, "sensor.", "rmse_")
@@ -129,7 +130,8 @@ def _images(experiment: Experiment, metrics: Mapping[str, float]) -> str:
         parts.append(f"{METHOD_NAMES[method]} {found}")
     true = _values(metrics, f"true_wind.{far}rms_", components)
     return (
-        f"Backscatter lidar, {_place(experiment)}: rms errors of {', '.join(components)}"
+        f"Backscatter lidar, {_place(experiment)}{_without_noise(experiment)}: rms errors of "
+        f"{', '.join(components)}"
         f"{_beyond(far)} by {'; '.join(parts)}; the true wind has {true} m/s."
     )
 
@@ -214,13 +216,29 @@ def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:
         return
 
 
+def _without_noise(experiment: Experiment) -> str:
+    return "" if experiment.detector else ", images without detector noise"
+
+
+def _scatterers(metrics: Mapping[str, float]) -> Iterator[str]:
+    """What scatters back, in one line."""
+    names = {"molecules": "molecules", "background": "clear background", "exhaust": "exhaust"}
+    parts = [
+        f"{text} {percent(fraction)}"
+        for key, text in names.items()
+        if (fraction := metrics.get(f"backscatter.fraction.{key}", 0)) > 0
+    ]
+    if parts:
+        yield f"Backscatter in the gate, mean over the image: {', '.join(parts)}."
+
+
 def _place(experiment: Experiment) -> str:
-    """Range and look-ahead time of the middle of the slab."""
+    """Range of the slab and the time until the aircraft reaches it."""
     scan, speed = experiment.scan, experiment.platform.speed
-    distance = scan.range + scan.thickness / 2
+    place = f"{scan.range:.6g} to {scan.range + scan.thickness:.6g} m ahead"
     if not speed:
-        return f"{distance:.4g} m ahead"
-    return f"{distance:.4g} m ahead ({look_ahead(distance, speed):.2g} s at {shown(speed, 'm/s')})"
+        return place
+    return f"{place} ({look_ahead(scan.range, speed):.2g} s at {shown(speed, 'm/s')})"
 
 
 def _values(metrics: Mapping[str, float], key: str, components: str) -> str:

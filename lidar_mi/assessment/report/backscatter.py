@@ -77,7 +77,7 @@ def backscatter_chapter(
         vectors = {"title": "The wind from the backscatter pair, vector by vector"} | vectors
     return Chapter(
         "The backscatter lidar",
-        [*lead, *_scatterers(metrics), _noise(experiment, metrics)],
+        [*lead, _noise(experiment, metrics)],
         drawn,
         numbers,
         compliance(
@@ -112,18 +112,6 @@ def _tables(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[Nu
             rows.append(("verdict", "", ["no skill" if none else "-" for none in [*unskilled, 0]]))
         heads = [SOURCE_NAMES[source] for source in sources]
         yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
-
-
-def _scatterers(metrics: Mapping[str, float]) -> Iterator[str]:
-    """What scatters back, in one line."""
-    names = {"molecules": "molecules", "background": "clear background", "exhaust": "exhaust"}
-    parts = [
-        f"{text} {percent(fraction)}"
-        for key, text in names.items()
-        if (fraction := metrics.get(f"backscatter.fraction.{key}", 0)) > 0
-    ]
-    if parts:
-        yield f"Backscatter in the gate, mean over the image: {', '.join(parts)}."
 
 
 def _noise(experiment: Experiment, metrics: Mapping[str, float]) -> str:

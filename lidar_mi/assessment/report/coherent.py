@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import xarray as xr
 
+from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.coherent import PREFIX, errors_by_age
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
@@ -22,11 +23,16 @@ def coherent_chapter(
         "of its lines of sight (lines_of_sight.nc). Every line sees the air at its own time, "
         "weighted with the pulse over the gate."
     )
-    noise = (
-        f"The velocities have a noise of {metrics[f'{PREFIX}noise']:.2g} m/s (median of that "
-        f"stated) at {metrics[f'{PREFIX}cnr']:.1f} dB; against the truth in the gates, "
-        f"{metrics[f'{PREFIX}rmse_v_los']:.2g} m/s (rms)."
-    )
+    signal = metrics[f"{PREFIX}signal_fraction"]
+    noise = "No gate has a signal: velocities are random."
+    if signal > 0:
+        noise = (
+            f"The velocities have a noise of {metrics[f'{PREFIX}noise']:.2g} m/s (median of that "
+            f"stated) at {metrics[f'{PREFIX}cnr']:.1f} dB; against the truth in the gates, "
+            f"{metrics[f'{PREFIX}rmse_v_los']:.2g} m/s (rms)."
+        )
+    if 0 < signal < 1:
+        noise += f" {whole_percent(1 - signal)} of the gates have no signal and are flagged."
     tables: list[NumberTable] = []
     if vortices is not None and f"{_VORTICES}place_error" in metrics:
         tables += [_by_age(vortices), _peer(metrics), _stated(metrics)]

@@ -21,7 +21,9 @@ _WINDS = f"{PREFIX}winds."
 def coherent_answer(metrics: Mapping[str, float]) -> Iterator[str]:
     """Sentences of the answer on what the lines of a coherent lidar tell."""
     valid = metrics.get(f"{_VORTICES}valid_fraction")
-    if valid is not None:
+    if metrics.get(f"{PREFIX}signal_fraction", 1.0) == 0:
+        yield "Coherent lidar: no signal in any gate, velocities are random."
+    elif valid is not None:
         head = f"Coherent lidar, {metrics[f'{_VORTICES}scans']:.0f} vertical slices"
         if f"{_VORTICES}place_error" not in metrics:
             yield f"{head}: no valid vortex."
@@ -38,6 +40,8 @@ def coherent_answer(metrics: Mapping[str, float]) -> Iterator[str]:
             "95 % intervals of circulation, distance and height hold "
             f"{', '.join(whole_percent(one) for one in covered)} of the errors."
         )
+    elif metrics.get(f"{_WINDS}valid_fraction") == 0:
+        yield "Coherent lidar: no valid wind."
     elif f"{_WINDS}rmse_u" in metrics:
         errors = ", ".join(fixed(metrics[f"{_WINDS}rmse_{name}"]) for name in "uvw")
         yield (

@@ -39,7 +39,7 @@ def sensor_chapter(
         "cross-flow wind of the backscatter lidar's images give the wind in three dimensions."
     )
     if speed:
-        ahead = look_ahead(experiment.scan.range + experiment.scan.thickness / 2, speed)
+        ahead = look_ahead(experiment.scan.range, speed)
         warning = f"At {speed:g} m/s the look-ahead time is {ahead:.2g} s."
     else:
         warning = "The platform is at rest: there is no look-ahead time"

@@ -75,11 +75,17 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
         return ""
     text = sentence[0].lower() + sentence[1:].removesuffix(".")
     samples, needed = metrics[_SAMPLES], _needed(experiment, metrics)
+    allowed = experiment.render.monte_carlo_fraction
     if experiment.render.samples_per_beam == "auto" and experiment.detector:
         times = f"; expected {float(f'{needed / samples:.2g}'):g} times as many" if needed else ""
         return f"render.max_samples: {text}{times}"
     # two digits of it are known
     expected = f"{float(f'{needed:.2g}'):.0f} or more" if needed else "more"
+    visible = 0.0 if needed else _texture_visible(experiment, metrics)
+    if visible:
+        expected += (
+            f": with {visible:.2g} its variance is {whole_percent(allowed)} of the texture's"
+        )
     automatic = ", or auto" if experiment.detector else ""
     return f"render.samples_per_beam: {text}; expected {expected}{automatic}"
 
@@ -119,6 +125,15 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
         f"{f' ({where})' if where else ''}; "
         "render.samples_per_beam: auto or more, or a larger render.max_samples, reduces it. "
     )
+
+
+def _texture_visible(experiment: Experiment, metrics: Mapping[str, float]) -> float:
+    """Samples per beam at which the noise is as small a part of the texture; 0: no texture."""
+    texture = experiment.wake.texture.rms if experiment.wake else 0.0
+    if not texture:
+        return 0.0
+    ratio = metrics[f"{Source.BACKSCATTER}.mc_relative_error"] / texture
+    return metrics[_SAMPLES] * ratio**2 / experiment.render.monte_carlo_fraction
 
 
 def _needed(experiment: Experiment, metrics: Mapping[str, float]) -> float:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.digits import three
 from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
 from lidar_mi.assessment.metrics.requirements import RequirementTable, look_ahead
 from lidar_mi.atmosphere.vortices.cores import find_cores
@@ -18,6 +19,7 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.preflight.coherent import coherent_rows, passage_rows
+from lidar_mi.experiment.stages.eye_safety import scan_safety
 from lidar_mi.experiment.stages.image_remarks import window_reach
 from lidar_mi.experiment.stages.light_budget import (
     backscatter_fractions,
@@ -25,6 +27,7 @@ from lidar_mi.experiment.stages.light_budget import (
     light_budget,
 )
 from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
+from lidar_mi.experiment.stages.sensor_cost import lidar_costs
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.experiment.truth.in_time import values_of_states
@@ -90,6 +93,7 @@ def sections(
         if asked.scan.timing:
             schedule = scan_schedule(asked.scan, results["plans"][0], prepared.search_path)
             yield "scan of the backscatter lidar", _timing(asked, schedule)
+        yield "eye safety (IEC 60825-1:2014)", _eye_safety(asked, results, prepared.search_path)
     if asked.fringes:
         yield _doppler(asked.fringes)
     if asked.coherent:
@@ -253,6 +257,36 @@ def _displacements(asked: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[
         followed = f"winds up to {reach:.3g} m/s; largest here {fastest:.3g} m/s"
         rows.append(("search region", followed))
     return rows
+
+
+def _eye_safety(asked: Experiment, results: Results, search_path: Path) -> list[tuple[str, str]]:
+    """From which distance eyes are safe in the beams, as a run computes it."""
+    safety = call(scan_safety, asked, plans=results["plans"], search_path=search_path)
+    if safety is None:
+        return [("backscatter lidar", "not assessed: lidar.pulse_duration is 0")]
+    beam = _safe(safety.hazard_distance, safety.aided_hazard_distance)
+    rows = [
+        ("one beam", beam),
+        ("the whole scan", _safe(safety.scan_hazard_distance)),
+        ("permissible", f"{safety.permissible_exposure:.3g} J/m^2 per pulse"),
+    ]
+    if asked.sensor:
+        slab = results["slab_wind"]
+        cost = call(lidar_costs, asked, slab_wind=slab, search_path=search_path)["doppler"]
+        if cost.permissible_exposure is not None:
+            found = _safe(cost.hazard_distance, cost.aided_hazard_distance)
+            rows.append(("Doppler lidar's beam", found))
+    return rows
+
+
+def _safe(distance: float | None, aided: float | None = 0.0) -> str:
+    """Where eyes are safe; None and infinity: nowhere."""
+    if distance is None or math.isinf(distance):
+        return "safe nowhere"
+    found = f"safe beyond {three(distance)} m" if distance > 0 else "safe where it leaves"
+    if aided is None or math.isinf(aided):
+        return f"{found}, with binoculars nowhere"
+    return f"{found}, with binoculars beyond {three(aided)} m" if aided > 0 else found
 
 
 def _doppler(doppler: Doppler) -> Section:

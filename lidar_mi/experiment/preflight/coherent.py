@@ -11,7 +11,7 @@ from lidar_mi.experiment.stages.coherent_lines import (
     receiver,
 )
 from lidar_mi.experiment.truth.passing_wake import PassingWake
-from lidar_mi.instrument.coherent.velocity_noise import cramer_rao
+from lidar_mi.instrument.coherent.velocity_noise import cramer_rao, random_velocity
 from lidar_mi.schema.coherent import CoherentDoppler
 from lidar_mi.units import shown
 
@@ -33,6 +33,9 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
         apart = f"{angle * level * signal.range:.3g} m at {signal.range:g} m"
         step = f", {math.degrees(angle):.3g} deg or {apart} apart"
     count = int(np.unique(lines.sweep).size)
+    stated = f"{noise:.2g} m/s in uniform air at {signal.range:g} m"
+    if noise > random_velocity(bandwidth):
+        stated = f"no signal at {signal.range:g} m: velocities there are random"
     return [
         ("laser", f"{shown(laser.wavelength, 'nm')}, pulses of {laser.pulse_length:g} m"),
         (
@@ -43,7 +46,7 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
         ("scan", f"{scan.kind}, {count} of {scan.duration:.3g} s"),
         ("lines", f"{lines.time.size} of {shown(scan.accumulation, 's')}{step}"),
         ("duration", f"{lines.time[-1] + scan.accumulation / 2:.4g} s"),
-        ("noise of a velocity", f"{noise:.2g} m/s in uniform air at {signal.range:g} m"),
+        ("noise of a velocity", stated),
         ("largest velocity", f"{bandwidth / 2:.3g} m/s"),
     ]
 
@@ -51,7 +54,11 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
 def passage_rows(doppler: CoherentDoppler, air: PassingWake) -> Rows:
     """The wind, and both vortices at the first and at the last line."""
     along, left = air.mean.at(np.array(doppler.passage.height))
-    rows = [("mean wind", f"{along:.3g} m/s along the flight, {left:.3g} m/s to its left")]
+    wind = f"{along:.3g} m/s along the flight, {left:.3g} m/s to its left"
+    if air.wake is None:
+        east, north = air.to_east_and_north(along, left)
+        wind = f"{east:z.3g} m/s to the east, {north:z.3g} m/s to the north"
+    rows = [("mean wind", wind)]
     if air.gusts is not None:
         rms = math.sqrt(float((air.gusts.amplitudes**2).sum()) / 6)
         rows.append(("turbulence", f"{rms:.2g} m/s rms of a component"))

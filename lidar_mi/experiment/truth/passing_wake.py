@@ -82,8 +82,12 @@ class PassingWake:
     ) -> Components:
         """Wind (m/s) to the east, to the north and up; a `WindField` about the lidar."""
         u, v, w = self.in_frame(*self.places(east, north, up), time)
+        return *self.to_east_and_north(u, v), w
+
+    def to_east_and_north(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Components along the flight and to its left in the lidar's frame."""
         s, c = math.sin(self.heading), math.cos(self.heading)
-        return s * u - c * v, c * u + s * v, w
+        return s * u - c * v, c * u + s * v
 
     def in_frame(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, time: np.ndarray) -> Components:
         """u, v, w (m/s) in the frame of the passage; x is along the flight."""

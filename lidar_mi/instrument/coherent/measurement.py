@@ -8,7 +8,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.scans import LineScan
-from lidar_mi.instrument.coherent.velocity_noise import cramer_rao
+from lidar_mi.instrument.coherent.velocity_noise import cramer_rao, random_velocity
 from lidar_mi.instrument.coherent.weighting import CoherentLidar, Signal, WindField, gate_moments
 
 START = np.datetime64("2000-01-01T00:00:00", "ns")
@@ -31,8 +31,10 @@ def measured_lines(
     """Radial velocities with noise, in the layout of `read_lines_of_sight`.
 
     Noise is normal with the standard deviation of the Cramér-Rao bound: of weak signals, below
-    some -20 dB, real estimates have false ones in addition, which are not modelled. Gates that
-    overlap share their samples: noise at the distance x correlates by 1 - x / gate length.
+    some -20 dB, real estimates have false ones in addition, which are not modelled. Where the bound
+    exceeds the spread of velocities that are uniform over the bandwidth, they are that, and
+    flagged. Gates that overlap share their samples: noise at the distance x correlates by
+    1 - x / gate length.
 
     Parameters
     ----------
@@ -50,7 +52,8 @@ def measured_lines(
     -------
     xr.Dataset, dims (time, range)
         `radial_velocity` (m s-1, positive away), `radial_velocity_stderr`, `radial_velocity_true`,
-        `spectral_width` (of the pulse and of the wind within the gate), `snr`, `flag` (0);
+        `spectral_width` (of the pulse and of the wind within the gate), `snr`, `flag` (1: no
+        signal);
         `azimuth` and `elevation` in degrees.
 
     Raises
@@ -73,6 +76,10 @@ def measured_lines(
     factor = np.linalg.cholesky(scipy.linalg.toeplitz(shared) + 1e-9 * np.eye(ranges.size))
     noise = random.standard_normal(true.shape) @ factor.T
     both = "time", "range"
+    lost = stderr > random_velocity(bandwidth)
+    stderr = np.where(lost, random_velocity(bandwidth), stderr)
+    # normal numbers made uniform
+    found = np.where(lost, bandwidth * (scipy.special.ndtr(noise) - 0.5), true + stderr * noise)
 
     def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
         return both, values, {"units": units, "long_name": long_name}
@@ -81,12 +88,16 @@ def measured_lines(
     degree = {"units": "degree"}
     return xr.Dataset(
         {
-            "radial_velocity": field(true + stderr * noise, "radial velocity, positive away"),
+            "radial_velocity": field(found, "radial velocity, positive away"),
             "radial_velocity_stderr": field(stderr, "standard error of the radial velocity"),
             "radial_velocity_true": field(true, "radial velocity without noise"),
             "spectral_width": field(width, "width of the Doppler spectrum"),
             "snr": field(ratio, "signal-to-noise ratio of the powers", "1"),
-            "flag": (both, np.zeros(true.shape, np.uint16), {"flag_meanings": ""}),
+            "flag": (
+                both,
+                lost.astype(np.uint16),
+                {"flag_masks": np.array([1], np.uint16), "flag_meanings": "no_signal"},
+            ),
         },
         {
             "time": ("time", time),

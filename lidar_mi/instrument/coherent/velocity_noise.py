@@ -54,6 +54,14 @@ def cramer_rao(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: fl
     return np.sqrt(bandwidth * np.asarray(width) / (samples * information))
 
 
+def random_velocity(bandwidth: float) -> float:
+    """Standard deviation (m/s) of a velocity that is uniform over the bandwidth.
+
+    An estimate without a signal has it; one with a larger bound has none.
+    """
+    return bandwidth / np.sqrt(12.0)
+
+
 def _information(alpha: np.ndarray) -> np.ndarray:
     """J (n,) of the peak ratios (n,); of many, by a spline of its logarithm, to 1e-6."""
     if alpha.size > _MANY:

@@ -57,6 +57,8 @@ NAMES = {
 """Ours, and those of the makers in lower case, the most telling first."""
 
 _UNITS = {name: unit for name, (unit, _) in FIELDS.items()} | {"range": "m", "altitude": "m"}
+_EARTH = 6.371e6  # m, mean radius
+_MOVED = 100.0  # m, within a scan: more than receivers of satellites are off
 _WORDS = ("long_name", "comment", "description", "note", "sign_convention", "positive")
 _NEVER = -9999.0  # ARM's missing value, which not every file declares
 _KINDS = (
@@ -197,6 +199,29 @@ def _place(data: xr.Dataset, names: Mapping[str, str], path: Path) -> dict[str, 
     return {name: value for name, value in place.items() if np.isfinite(value)}
 
 
+def _moving(data: xr.Dataset, names: Mapping[str, str], time: np.ndarray, path: Path) -> list[str]:
+    """A remark on a platform that moves, whose speed is in the velocities."""
+    found = _found(data, names)
+    there = [found.get(name) for name in ("latitude", "longitude")]
+    if any(one not in data.variables or data[one].size != time.size for one in there):
+        return []
+    latitude, longitude = (np.deg2rad(np.ravel(_numbers(data[one], "", path))) for one in there)
+    known = np.flatnonzero(np.isfinite(latitude) & np.isfinite(longitude))
+    if known.size < 2:
+        return []
+    north = _EARTH * (latitude[known] - latitude[known[0]])
+    east = _EARTH * np.cos(latitude[known]) * (longitude[known] - longitude[known[0]])
+    way = float(np.hypot(np.ptp(north), np.ptp(east)))
+    seconds = float((time[known[-1]] - time[known[0]]) / np.timedelta64(1, "s"))
+    if way < _MOVED or seconds <= 0:
+        return []
+    return [
+        f"the lidar moves by {way:.0f} m ({np.hypot(north[-1], east[-1]) / seconds:.2g} m/s): "
+        "winds are off by its velocity unless that was subtracted, and of the place in the middle "
+        "of the scan"
+    ]
+
+
 def _numbers(variable: xr.DataArray, ours: str, path: Path) -> np.ndarray:
     """Values in our unit, NaN where they are missing; outside of the valid range they stay."""
     if variable.dtype.kind not in "iuf":
@@ -320,7 +345,7 @@ def _flat(
         dict(place),
         _rejected(data, velocity, path),
         own,
-        remarks + more,
+        remarks + more + _moving(data, names, time, path),
     )
     return _apart(scan, data, path)
 

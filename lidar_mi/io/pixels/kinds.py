@@ -8,8 +8,10 @@ from pathlib import Path
 from lidar_mi.errors import InputError
 from lidar_mi.io.compression import compression
 
-_COMMON = "EXR, PNG, TIFF, BMP, JPEG or FITS image"
-KINDS = f"{_COMMON} (also JPEG 2000, GIF, WebP, PGM, PPM, PAM, PFM, npy, npz, mat, HDF5, im7)"
+KINDS = (
+    "image (EXR, PNG, TIFF, BMP, JPEG, FITS, npy, npz, mat, HDF5, JPEG 2000, GIF, WebP, PGM, PPM, "
+    "PAM, PFM, im7)"
+)
 """What is read, for messages."""
 
 _STARTS = (
@@ -43,9 +45,9 @@ def kind_of(path: Path) -> str:
         No such file, one that cannot be opened, or of a kind that is not read.
     """
     if path.is_dir():
-        raise InputError(f"{path}: is a folder; expected a file: an {_COMMON}")
+        raise InputError(f"{path}: is a folder; expected a file: an {KINDS}")
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected an {_COMMON}")
+        raise InputError(f"{path}: no such file; expected an {KINDS}")
     try:
         with path.open("rb") as file:
             start = file.read(1024)

@@ -70,12 +70,8 @@ class AtRest(NamedTuple):
 
     def __str__(self) -> str:
         parts = {"at rest": self.structure, "in one image only": self.stray.any(0)}
-        said = [
-            f"{int(p.sum())} ({p.double().mean():.2g} of all) {name}"
-            for name, p in parts.items()
-            if bool(p.any())
-        ]
-        return f"masked pixels: {', '.join(said)}" if said else ""
+        said = [f"{_counted(p)} {name}" for name, p in parts.items() if bool(p.any())]
+        return f"masked: {', '.join(said)}" if said else ""
 
     @property
     def hidden(self) -> torch.Tensor:
@@ -487,3 +483,10 @@ def _means(images: torch.Tensor, size: int) -> torch.Tensor:
 def _soft(image: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
     image = working(image)
     return averaged(image, torch.isfinite(image) & known, _SOFT)
+
+
+def _counted(pixels: torch.Tensor) -> str:
+    """How many, and as a fraction of all where that is a tenth of a per cent or more."""
+    number, fraction = int(pixels.sum()), float(pixels.double().mean())
+    words = f"{number} pixel{'s' * (number > 1)}"
+    return f"{words} ({100 * fraction:.2g} %)" if fraction >= 1e-3 else words

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.ground_winds.source_name import source_name
 
 _OUT_OF_PLANE = 0.05  # sine of the angle of a line with the plane: 3 degrees
 _PAUSE = 10  # times the time from line to line
@@ -114,8 +115,8 @@ def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan]
             scans.append(_plane_scan(lines.isel(time=index), noise, int(number), common))
     if not scans:
         raise InputError(
-            f"lines: {few} with usable values in a scan; expected {_LEAST_LINES} and "
-            f"{_LEAST_GATES} or more"
+            f"{source_name(lines)}: {few} with usable values in a scan; expected {_LEAST_LINES} "
+            f"and {_LEAST_GATES} or more"
         )
     remark = f"{lost} lines are in no scan of {_LEAST_LINES} lines and {_LEAST_GATES} gates"
     return scans, [remark] if lost else []
@@ -180,8 +181,9 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
     aside = _aside(azimuth, elevation, along)
     if not aside < _OUT_OF_PLANE:
         raise InputError(
-            f"lines: scan {number} leaves the vertical plane of azimuth {np.rad2deg(along):.1f} "
-            f"degrees by {np.rad2deg(np.arcsin(min(aside, 1))):.1f} degrees; expected an RHI"
+            f"{source_name(lines)}: scan {number} leaves the vertical plane of azimuth "
+            f"{np.rad2deg(along):.1f} degrees by {np.rad2deg(np.arcsin(min(aside, 1))):.1f} "
+            "degrees; expected an RHI"
         )
     angle = np.arctan2(np.sin(elevation), forward)
     order = np.argsort(angle, kind="stable")
@@ -189,7 +191,9 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
     velocity = np.where(usable, lines["radial_velocity"].values.astype(float), np.nan)[order]
     gates = np.flatnonzero(usable.any(0))
     if not np.ptp(angle) > 0:
-        raise InputError(f"lines: scan {number} looks in one direction; expected an RHI")
+        raise InputError(
+            f"{source_name(lines)}: scan {number} looks in one direction; expected an RHI"
+        )
     part = slice(gates[0], gates[-1] + 1)
     velocity = velocity[:, part]
     if "radial_velocity_stderr" in lines:

@@ -27,6 +27,7 @@ from lidar_mi.retrieval.ground_winds.profiles import (
     WindFlag,
     profile_dataset,
 )
+from lidar_mi.retrieval.ground_winds.source_name import source_name
 from lidar_mi.retrieval.ground_winds.tilt import unapplied_tilt
 
 _BLOCK = 5  # levels that share their turbulence
@@ -116,9 +117,9 @@ def fit_winds_to_lines(
                 profiles.append(_profile(one, cells, stated[index], lengths, remarks))
     if not any((one.condition < _IN_ONE_PLANE).any() for one in profiles):
         raise InputError(
-            "lines: no height has three valid lines that are not in one plane (scan: "
-            f"{lines.attrs.get('scan', 'unknown')}; {usable.sum()} of {usable.size} velocities are "
-            "valid); expected a VAD, DBS or PPI"
+            f"{source_name(lines)}: no height has three valid lines that are not in one plane "
+            f"(scan: {lines.attrs.get('scan', 'unknown')}; {usable.sum()} of {usable.size} "
+            "velocities are valid); expected a VAD, DBS or PPI"
         )
     if tilt > 0:
         for profile in profiles:

@@ -170,7 +170,7 @@ def retrieve_wind_volume(
     said = {
         "identical_images": same,
         "sampling": structure.said,
-        "defects": f"replaced voxels: {number} in {len(strange)} volumes" if number else "",
+        "defects": f"{number} voxels are replaced in {len(strange)} volumes" if number else "",
     }
     attributes |= {name: value for name, value in said.items() if value}
     coords = centres(stack[0], frame, "window")

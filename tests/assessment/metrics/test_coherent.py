@@ -99,6 +99,7 @@ def test_lines_and_winds():
             "radial_velocity_true": (shape, np.ones((2, 2))),
             "radial_velocity_stderr": (shape, np.full((2, 2), 0.1)),
             "snr": (shape, np.full((2, 2), 0.1)),
+            "flag": (shape, np.zeros((2, 2), int)),
         }
     )
     found = lines_metrics(lines)
@@ -118,3 +119,23 @@ def test_lines_and_winds():
         0.5,
         1,
     )
+
+
+def test_gates_without_a_signal_have_no_part_in_the_noise():
+    shape = ("time", "range")
+    lines = xr.Dataset(
+        {
+            "radial_velocity": (shape, [[1.1, 19.0], [0.9, -3.0]]),
+            "radial_velocity_true": (shape, np.ones((2, 2))),
+            "radial_velocity_stderr": (shape, [[0.1, 11.0], [0.1, 11.0]]),
+            "snr": (shape, [[0.1, 1e-9], [0.1, 1e-9]]),
+            "flag": (shape, [[0, 1], [0, 1]]),
+        }
+    )
+    found = lines_metrics(lines)
+    assert found["coherent.signal_fraction"] == 0.5
+    assert found["coherent.rmse_v_los"] == pytest.approx(0.1) == found["coherent.noise"]
+    assert lines_metrics(lines.assign(flag=lines["flag"] + 1)) == {
+        "coherent.lines": 2,
+        "coherent.signal_fraction": 0,
+    }

@@ -56,7 +56,8 @@ MEASURED = {
 def test_the_errors_of_both_lidars():
     (line,) = answer(an_experiment(), SENSOR)
     assert line == (
-        "Both lidars, 150 m ahead (2.1 s at 70 m/s): rms errors of u, v, w 0.23, 0.48, 10 m/s "
+        "Both lidars, 148.75 to 151.25 m ahead (2.1 s at 70 m/s), images without detector noise: "
+        "rms errors of u, v, w 0.23, 0.48, 10 m/s "
         "beyond two core radii (true wind 0.24, 2.8, 3.7); 56 % of the vectors are valid."
     )
     (line,) = answer(an_experiment(), SENSOR | {"sensor.spanned_fraction": 0.57})
@@ -64,7 +65,7 @@ def test_the_errors_of_both_lidars():
     (line,) = answer(an_experiment(), {"sensor.vectors": 0})
     assert line.endswith("no valid wind vector.")
     (line,) = answer(an_experiment(speed=0.0), SENSOR)
-    assert line.startswith("Both lidars, 150 m ahead: rms")
+    assert line.startswith("Both lidars, 148.75 to 151.25 m ahead, images without")
 
 
 def test_every_method_of_the_backscatter_lidar_with_its_skill():
@@ -283,6 +284,10 @@ def test_without_a_detector_all_noise_is_the_simulations():
     assert first.startswith(
         "No vector is valid with as much noise again, and noise of the images, 1 %"
     )
+    # 1 % of the light against a texture of 2 %: 64 (1/2)^2 / 0.1
+    experiment.wake = SimpleNamespace(texture=SimpleNamespace(rms=0.02))
+    remark = simulation_remark(experiment, metrics | lost)
+    assert remark.endswith("; expected more: with 1.6e+02 its variance is 10 % of the texture's")
 
 
 def test_of_volumes_the_noise_is_compared():
@@ -345,3 +350,28 @@ def test_what_the_lines_of_a_coherent_lidar_tell(metrics, lines):
     experiment = an_experiment()
     experiment.imaged_wake, experiment.coherent = None, True
     assert answer(experiment, metrics) == lines
+
+
+def test_the_answer_names_its_gates_its_noise_and_what_scatters():
+    metrics = NOISY | {
+        "backscatter.fraction.molecules": 0.235,
+        "backscatter.fraction.background": 0.2,
+        "backscatter.fraction.exhaust": 0.565,
+    }
+    first, second = answer(rendered("auto"), metrics | noise("cc", 0.01, 0.01))
+    assert first.startswith("Backscatter lidar, 148.75 to 151.25 m ahead (2.1 s at 70 m/s): rms")
+    assert second == (
+        "Backscatter in the gate, mean over the image: molecules 24 %, clear background 20 %, "
+        "exhaust 56 %."
+    )
+    without = {key.replace("_noisy", ""): value for key, value in NOISY.items()}
+    del without["backscatter.samples_per_beam"]
+    *_, line = answer(an_experiment(), without)
+    assert ", images without detector noise: rms errors" in line
+
+
+def test_a_coherent_lidar_without_a_signal_says_so():
+    experiment = an_experiment()
+    experiment.imaged_wake, experiment.coherent = None, True
+    (line,) = answer(experiment, {"coherent.lines": 9.0, "coherent.signal_fraction": 0.0})
+    assert line == "Coherent lidar: no signal in any gate, velocities are random."

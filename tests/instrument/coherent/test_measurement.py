@@ -52,3 +52,17 @@ def test_a_signal_that_is_not_allowed():
         measured_lines(wind, scan, lidar, -1.0)
     with pytest.raises(lm.InputError, match=r"snr: shape \(2,\)"):
         measured_lines(wind, scan, lidar, np.ones(2))
+
+
+def test_without_a_signal_velocities_are_uniform_and_flagged():
+    """Half of the gates at -60 dB: the bound would be thousands of m/s."""
+    lidar = CoherentLidar(gates=8)
+    snr = np.where(np.arange(8) < 4, 0.1, 1e-6)
+    scan = stare_scan(0.0, 1.0, 1.0, 500)
+    lines = measured_lines(wind, scan, lidar, snr, bandwidth=40.0)
+    assert (lines["flag"].values == (np.arange(8) >= 4)).all()
+    lost = lines["radial_velocity"].values[:, 4:]
+    assert np.abs(lost).max() < 20
+    # of a uniform number, mean square 1/3 and variance of the square 4/45
+    assert (lost**2).mean() / 400 == pytest.approx(1 / 3, abs=4 * np.sqrt(4 / 45 / lost.size))
+    np.testing.assert_allclose(lines["radial_velocity_stderr"][:, 4:], 40 / np.sqrt(12))

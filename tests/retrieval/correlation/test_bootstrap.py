@@ -293,7 +293,7 @@ def test_errors_are_not_known_where_the_motion_is_not_found_again(share, known):
         *(
             pytest.param(method, second, rms, marks=pytest.mark.slow)
             for method in ("cc", "multipass")
-            for second in ("advected", "true second state")
+            for second in ("advected", "stored state at t2")
             for rms in (0, 2)
         ),
     ],
@@ -343,7 +343,7 @@ OF_CORES = 0.80, 0.97
 SEEN = {
     "advected, texture 5 %": OF_CORES,
     "advected, texture 10 %": OF_CORES,
-    "true second state, texture 10 %": OF_CORES,
+    "stored state at t2, texture 10 %": OF_CORES,
     "0 % of the texture replaced": OF_CORES,
     "30 % of the texture replaced": NORMAL,
     "gain of 5 %": OF_CORES,

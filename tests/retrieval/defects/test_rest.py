@@ -12,7 +12,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.retrieval.defects.impulses import height
-from lidar_mi.retrieval.defects.rest import all_at_rest, saturated
+from lidar_mi.retrieval.defects.rest import all_at_rest, nothing_at_rest, saturated
 from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
@@ -296,3 +296,12 @@ def test_heights_are_above_the_median_of_the_neighbours(missing):
         warnings.simplefilter("ignore", RuntimeWarning)  # all of the neighbours are unknown
         expected = image - np.nanmedian(near, axis=0)
     np.testing.assert_allclose(height(torch.as_tensor(image)), expected, rtol=0, atol=1e-15)
+
+
+def test_masked_pixels_are_counted_and_a_fraction_said_where_it_matters():
+    rest, stray = torch.zeros(100, 200), torch.zeros(2, 100, 200)
+    rest[:30, :10] = 1
+    stray[0, 50, 50] = 1
+    defects = nothing_at_rest([rest, rest])._replace(structure=rest > 0, stray=stray > 0)
+    assert str(defects) == "masked: 300 pixels (1.5 %) at rest, 1 pixel in one image only"
+    assert str(nothing_at_rest([rest, rest])) == ""
