@@ -93,7 +93,7 @@ def retrieve_wind(
     checks : bool
         Remove or flag structure of the sampling, saturated areas, structure at rest, gains of
         columns and rows, a change of illumination, and images of unrelated air. Without it
-        "variational" is 15 % faster.
+        "variational" is 10 to 20 % faster.
     standard_errors : bool
         False: "cc", "ws" and "multipass" state none, and no vector is flagged because of its
         standard error; this halves their time. The other methods always state them.
