@@ -66,6 +66,7 @@ def test_vectors_near_the_rim_and_flagged_ones_do_not_count(truth):
     assert result.rms == 0 and result.valid < 1
 
 
+@pytest.mark.slow
 def test_programs_find_a_known_motion():
     """Each that is installed, of air that moves by 2 px to port and 1 px up; FF-PIV errs to 0."""
     random = np.random.default_rng(3)

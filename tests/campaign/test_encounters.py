@@ -9,6 +9,7 @@ import math
 import re
 
 import numpy as np
+import pytest
 import yaml
 
 from lidar_mi.assessment.report.campaign import page
@@ -55,6 +56,7 @@ def carried_out(folder, keep, mode, count, over=CIRCULATION):
     return ready
 
 
+@pytest.mark.slow
 def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
     ready = carried_out(tmp_path, "metrics", "perfect", 4)
     data = collect(ready)

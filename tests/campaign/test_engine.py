@@ -102,6 +102,7 @@ def test_a_detector_and_a_pulse_energy_need_no_new_images(tmp_path, client):
     assert noise[0] > 2 * noise[1] and np.isnan(found["detector.noise.all"].sel(sky="none")).all()
 
 
+@pytest.mark.slow
 def test_a_failure_is_a_result_and_running_again_does_what_is_missing(tmp_path, client):
     path = described(tmp_path, sweep={"scan.thickness": ["2 m", "3 m"]}, members=2)
     client.register_plugin(Faults(raising=(2.0,)))
@@ -135,6 +136,7 @@ def test_a_point_that_kills_its_worker_is_given_up_and_its_neighbours_are_not(tm
     assert "its worker was killed 3 times" in str(found["message"].values[1])
 
 
+@pytest.mark.slow
 def test_the_scheduler_sees_paths_and_numbers_only(tmp_path, client, monkeypatch):
     path = described(tmp_path, sweep={"retrieval.template": [6, 8]}, members=2)
     sizes, submit = [], client.submit

@@ -45,7 +45,16 @@ def predicted():
     return met()[1]
 
 
-@pytest.mark.parametrize("case", ["half", "aside", "above", "absent", "opposite"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "half",
+        *(
+            pytest.param(c, marks=pytest.mark.slow)
+            for c in ("aside", "above", "absent", "opposite")
+        ),
+    ],
+)
 def test_a_wrong_wake_costs_no_more_than_half_a_degree(predicted, case):
     """350 m2/s is predicted. At most half a degree more than with the autopilot."""
     encounter, wake = {

@@ -12,6 +12,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 pytestmark = pytest.mark.usefixtures("variant")
 
 
+@pytest.mark.slow
 def test_a_blurred_slab_is_recovered_by_gradient_descent():
     """With 1/10 of the full example's beams and 1/5 of its steps the error decreases by 25 %.
 

@@ -10,10 +10,11 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
+from lidar_mi.atmosphere.scattering import particle_scattering
 from lidar_mi.atmosphere.scattering.aerosols import AEROSOLS
 from lidar_mi.atmosphere.scattering.molecules import molecular_table
 from lidar_mi.atmosphere.scattering.particle_scattering import make_table
-from lidar_mi.atmosphere.scattering.tables import mix, particle_scattering, rayleigh_table
+from lidar_mi.atmosphere.scattering.tables import mix, rayleigh_table
 from lidar_mi.errors import InputError
 from lidar_mi.io import scattering_table
 from lidar_mi.io.scattering_table import aerosol_table, read_table, write_table

@@ -134,8 +134,10 @@ def case(name):
     "name",
     [
         "table",
-        "flow",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("extinction", "albedo", "blend")),
+        *(
+            pytest.param(n, marks=pytest.mark.slow)
+            for n in ("flow", "extinction", "albedo", "blend")
+        ),
     ],
 )
 def test_forward_is_the_transpose_of_backward(name):

@@ -68,6 +68,7 @@ def test_swirl_about_a_vortex_of_the_plane():
         assert (right - left) / 2 == pytest.approx(swirl, rel=0.03)
 
 
+@pytest.mark.slow
 def test_rings():
     """Where a plane cuts a ring there is a pair, and none between rings."""
     wake = FilamentsAlongPath(PairAlongPath(400.0, 40.0, 5.0, crow_wavelength=344.0), 30.0)

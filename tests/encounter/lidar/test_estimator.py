@@ -51,6 +51,7 @@ def test_slopes_that_are_expected_correct_the_fit(images):
     np.testing.assert_allclose(found.covariance, expected.covariance)
 
 
+@pytest.mark.slow
 def test_the_wind_is_by_the_most_accurate_method(images):
     estimator = Estimator(load_experiment("wake_sensor"))
     wind, _, seconds, *_ = estimator.pair_of(images.first, images.second, DT, 0.03)

@@ -104,6 +104,7 @@ def failing(wind):
     raise ValueError("a completion that fails")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [InThisProcess, InOwnProcess])
 def test_a_fault_surfaces_with_the_result(drifting, form):
     """Not as the wind is asked for: the vortices are fitted meanwhile."""

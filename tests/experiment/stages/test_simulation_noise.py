@@ -197,6 +197,7 @@ def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared
         assert np.log((changes**2).mean() / spread) == pytest.approx(0, abs=max(4 * sigma, 0.3))
 
 
+@pytest.mark.slow
 def test_common_numbers_state_the_error_that_images_do_not_share(prepared):
     """Of 12 seeds, differences between images moved by the true wind about their mean; and fewer
     samples are enough for the same fraction of the detector's noise."""
@@ -257,6 +258,7 @@ def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(pr
     assert bool(said) == run.answer[0].startswith("Noise of the simulation")
 
 
+@pytest.mark.slow
 def test_where_as_much_noise_again_leaves_no_valid_vector_it_is_said_of_the_images():
     """Of half the contrast, by molecules, and four samples."""
     molecules = {"extinction": {"molecules": "auto"}}

@@ -40,7 +40,7 @@ def test_one_window_states_no_error(method):
     assert not normalised_errors(method, 17, 5).size
 
 
-@pytest.mark.parametrize("side", [24, 28, 40])
+@pytest.mark.parametrize("side", [28, *(pytest.param(n, marks=pytest.mark.slow) for n in (24, 40))])
 @pytest.mark.parametrize(
     "method",
     ["multipass", *(pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "variational"))],

@@ -126,6 +126,7 @@ def test_stripes_leave_one_direction_open():
     assert float((zy / (zz * yy).sqrt()).median()) < -0.9
 
 
+@pytest.mark.slow
 def test_texture_that_is_not_advected_is_flagged():
     """Unrelated textures, and one moved beyond what the first pass can see."""
     first = shifted(0, 0, seed=6)[0]

@@ -26,6 +26,7 @@ def shifted_air(seed, moved=(-0.5, 1.0), shape=(90, 120)):
     return first, np.fft.ifft2(fourier_shift(np.fft.fft2(first), moved)).real
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("counts", "fraction", "noise", "method"),
     [
@@ -82,6 +83,7 @@ def test_a_defect_changes_no_valid_vector(seed):
     assert check(seed, methods=("multipass", "variational")) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "sort"), [(0, "mast"), (5, "border"), (13, "scratches")])
 def test_thin_structure_changes_no_valid_vector(seed, sort):
     """Of valid vectors 4 to 13 % were off by three stated errors or more: parts were not found."""

@@ -127,8 +127,9 @@ def test_noise_told_by_a_map_stays_where_it_is(monkeypatch):
     assert np.mean(ratios) == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.parametrize("level", [0.002, pytest.param(0.01, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("told", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [0.002, 0.01])
+@pytest.mark.parametrize("told", [True, False])
 def test_replaced_texture_is_found(level, told, monkeypatch):
     """Texture of a spectrum k^-4 at rest; means of four seeds, of which one is right to 20 %."""
     for fraction in (0.0, 0.1, 0.3):

@@ -134,6 +134,7 @@ def test_lines_may_lack_gates_and_come_in_any_order():
     assert (np.abs(found["y"] - whole["y"]) < 3 * whole["y_stderr"]).all()
 
 
+@pytest.mark.slow
 def test_over_the_top_and_to_the_west_is_the_same_plane():
     one = drawn(PAIR, 16)
     west = one.lines.assign_coords(azimuth=(one.lines["azimuth"] + 180) % 360)
@@ -192,6 +193,7 @@ def test_method_of_radial_velocities_finds_a_pair():
     np.testing.assert_allclose(found[:, 2], one.circulations, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_passes_up_and_down_in_one_sweep_are_two_scans():
     one = drawn(replace(PAIR, heights=(70.0, 100.0)), 8, slices(2, 11, count=2))
     apart = lm.fit_vortices_to_lines(one.lines)

@@ -57,6 +57,7 @@ def test_outside_is_nan():
     assert np.isfinite(inside.values[:, :2]).all() and np.isnan(inside.values[:, 2]).all()
 
 
+@pytest.mark.slow
 def test_pair_at_two_distances_stands_still():
     """The same air seen from 500 m and 485 m: without one grid 0.7 m off at the edge (7 m/s)."""
 

@@ -137,6 +137,7 @@ def test_unknown_lines(lines):
     refused("gap: none from 13.6965 to 13.7035 mm agrees", (lines[0], near), tolerance=3.5e-6)
 
 
+@pytest.mark.slow
 def test_lenses_that_are_not_achromatic(lines):
     other = line(MERCURY, 3, defects=replace(WITHOUT_WARMING, focal_length=1.003))
     refused("not achromatic", (lines[0], other))

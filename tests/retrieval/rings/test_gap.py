@@ -104,6 +104,7 @@ def test_gap_from_a_frame():
     assert abs(other.group - GAP).min() > 20 * found.gap_std
 
 
+@pytest.mark.slow
 def test_lines_of_one_height_are_not_told_apart():
     rings = analyse_rings(two_lines(faint=0.95))
     with pytest.raises(InputError, match="either order of the wavelengths"):

@@ -49,6 +49,7 @@ def check_frame(rings, fraction, splitting):
     assert (distance(fraction, rings.fraction) < 1 / SMALL["finesse"]).all(), splitting
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "splitting"), [("two", 0.44), ("three, unequal", 0.32)])
 def test_components_that_cross_the_next_order(kind, splitting):
     image, fraction = zeeman(kind, splitting)

@@ -80,6 +80,7 @@ def test_a_bad_image_costs_its_pairs_alone(images):
     np.testing.assert_array_equal(winds["y_vector"][1][0], winds["y"])
 
 
+@pytest.mark.slow
 def test_noise_is_that_of_the_earlier_image(images):
     levels = [0.01, 0.5, None, None]
     winds = retrieve_winds(
