@@ -32,6 +32,8 @@ FALSE_ALARM = 0.01
 
 _ASIDE = 45.0  # m of the scan beside the vortices
 _LIKELY_CORE = 3.0  # m
+_OVERLAP = 0.75
+"""Step of the gates over their length up to which the noise of neighbours is remarked on."""
 _MISFIT = 1e-4
 
 
@@ -156,12 +158,14 @@ def fit_vortices_to_lines(
                 f"pitch and roll of up to {np.rad2deg(tilt):.2f} degrees are not applied: "
                 f"{1000 * tilt:.1f} m of position per km of range, not in the errors"
             )
+        begun = len(found)
         for k, scan in enumerate(scans):
             if notice is not None:
                 notice("fitting vortices", (number + k / len(scans)) / len(sets))
             # matrices are small: threads would wait for each other longer than they compute
             with threadpool_limits(1, "blas"):
                 found.append(_scan(scan, lidar, given, kind, separations, false_alarm))
+        remarks += _of_overlapping_gates(found[begun:], one, lidar)
     about: dict[str, str | float] = {
         "profile": profile,
         "kind": kind,
@@ -188,6 +192,21 @@ def lidar_of(lines: xr.Dataset, pulse: float | None, gate: float | None) -> Cohe
     return CoherentLidar(
         pulse_duration=2 * pulse / scipy.constants.c, gate_length=gate, first_gate=gate
     )
+
+
+def _of_overlapping_gates(
+    scans: list[ScanVortices], lines: xr.Dataset, lidar: CoherentLidar
+) -> list[str]:
+    """A remark on fits with a misfit that noise common to neighbouring gates may make."""
+    misfit = sum(bool(one.flag & VortexFlag.MISFIT.value) for one in scans)
+    step = float(np.median(np.diff(lines["range"].values)))
+    if not misfit or step > _OVERLAP * lidar.gate_length:
+        return []
+    return [
+        f"{misfit} of {len(scans)} scans have a misfit: gates of {lidar.gate_length:g} m every "
+        f"{step:g} m overlap, and noise that neighbours have in common, which the fit takes for "
+        "independent, may be its cause"
+    ]
 
 
 def _scan(

@@ -250,3 +250,13 @@ def test_gate_and_pulse_are_those_of_the_data_set():
     stated = lines.assign_attrs(gate_length=30.0, pulse_length=25.0)
     assert lidar_of(stated, None, None).pulse_length == pytest.approx(25)
     assert lidar_of(stated, 40.0, 20.0).gate_length == 20
+
+
+@pytest.mark.parametrize(("gate_length", "remarked"), [(30.0, True), (15.0, False)])
+def test_overlapping_gates_are_named_as_a_cause_of_misfit(monkeypatch, gate_length, remarked):
+    """Gates every 15 m, and a limit that every fit exceeds."""
+    monkeypatch.setattr("lidar_mi.retrieval.ground_vortices.vortices._MISFIT", 2.0)
+    lines = drawn(PAIR, 3, slices(2.0, 11.0)).lines
+    found = lm.fit_vortices_to_lines(lines, gate_length=gate_length)
+    assert int(found["flag"][0]) & VortexFlag.MISFIT.value
+    assert ("noise that neighbours have in common" in found.attrs["remarks"]) == remarked
