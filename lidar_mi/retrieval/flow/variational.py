@@ -16,7 +16,6 @@ from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.flow.components import Response, differences, without_texture
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
-from lidar_mi.retrieval.flow.line_offsets import MOST_FITS, LineOffsets, line_offsets
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.noise_check import variance_by_coloured_noise
 from lidar_mi.retrieval.flow.other_motions import better_elsewhere
@@ -155,11 +154,8 @@ def variational_and_flow(
     settings: VariationalSettings | None = None,
     *,
     keep: bool = False,
-    offsets: LineOffsets | None = None,
 ) -> tuple[Displacement, Flow | None]:
     """`variational`, and if asked what the retrieval of the next images may start from.
-
-    Where lines of two images have offsets it is repeated on images without the `offsets`.
 
     There is none for volumes, for images of more than `settings.strips.largest` knots, and for
     images that do not determine the flow.
@@ -208,22 +204,6 @@ def variational_and_flow(
     assert prior is not None  # settings have a level at least
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
-    if len(stack) == 2 and windows.dims == 2 and posterior.response is not None:
-        known, response = offsets, posterior.response
-        now = line_offsets(images, linear, mesh, coefficients, settings, response, known)
-        offsets = now or known
-        if now and offsets and not offsets.settled and offsets.fits < MOST_FITS:
-            return variational_and_flow(
-                offsets.removed(images.stack, known),
-                windows,
-                min_correlation,
-                noise,
-                blur,
-                spacing,
-                settings,
-                keep=keep,
-                offsets=offsets,
-            )
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
@@ -245,10 +225,6 @@ def variational_and_flow(
         )
         finer = finer + coloured.to(finer)
     additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
-    if offsets:
-        by_lines = Mesh(mesh.axes, centres).field(offsets.flows.to(like)).to(covariance)
-        additional = additional + torch.einsum("nazy,nbzy->abzy", by_lines, by_lines)
-        lines = offsets.names
     covariance = covariance + additional
     said = {"noise_of_lines": lines} if lines else {}
     result = result._replace(covariance=covariance, attributes=said)
