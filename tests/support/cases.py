@@ -133,7 +133,8 @@ def _ending(done: Outcome) -> str | None:
         return "takes too long"
     if done.code < 0:
         return f"ended by signal {-done.code}"
-    if done.code not in (0, 2):
+    # 1: the result is written, and no vector of it is valid
+    if done.code not in (0, 2) and not (done.code == 1 and "lidar-mi: no valid" in done.err):
         ours = [line.strip() for line in done.err.splitlines() if "/lidar_mi/" in line]
         last = (done.err.strip().splitlines() or [""])[-1]
         return f"exit code {done.code}: {ours[-1:]} {last[:200]}"

@@ -24,20 +24,20 @@ RETRIEVE = ("retrieve", "a.png", "b.png", "--dt", "1", "--spacing", "1", "--stri
 
 
 def test_a_result_of_ours_is_replaced(images, lidar_mi):
-    assert lidar_mi(*RETRIEVE, "-o", "w.nc")[0] == 0
+    assert lidar_mi(*RETRIEVE, "-o", "w.nc")[0] == 1
     before = (images / "w.nc").stat().st_ino
-    assert lidar_mi(*RETRIEVE, "-o", "w.nc")[0] == 0
+    assert lidar_mi(*RETRIEVE, "-o", "w.nc")[0] == 1
     assert (images / "w.nc").stat().st_ino != before
 
 
 def test_a_table_of_ours_is_replaced_on_request(images, lidar_mi):
     """A table has no place for the name of its program: the message says what to do."""
-    assert lidar_mi(*RETRIEVE, "-o", "two.csv")[0] == 0
+    assert lidar_mi(*RETRIEVE, "-o", "two.csv")[0] == 1
     code, _, err = lidar_mi(*RETRIEVE, "-o", "two.csv")
     assert code == 2 and "(tables do not); expected --overwrite to replace it" in " ".join(
         err.split()
     )
-    assert lidar_mi(*RETRIEVE, "-o", "two.csv", "--overwrite")[0] == 0
+    assert lidar_mi(*RETRIEVE, "-o", "two.csv", "--overwrite")[0] == 1
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_overwriting_needs_its_option(images, lidar_mi):
     (images / "notes.nc").write_text("mine")
     assert lidar_mi(*RETRIEVE, "-o", "notes.nc")[0] == 2
     assert (images / "notes.nc").read_text() == "mine"
-    assert lidar_mi(*RETRIEVE, "-o", "notes.nc", "--overwrite")[0] == 0
+    assert lidar_mi(*RETRIEVE, "-o", "notes.nc", "--overwrite")[0] == 1
     assert (images / "notes.nc").read_bytes().startswith(b"\x89HDF")
 
 

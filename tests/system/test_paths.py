@@ -93,7 +93,8 @@ def fill(folder):
 
 def succeeds(call, *arguments):
     code, out, err = call(*arguments)
-    assert code == 0, (arguments, err)
+    # images of noise have no valid vector
+    assert code == 0 or (code == 1 and "no valid vector" in err), (arguments, err)
     return out
 
 

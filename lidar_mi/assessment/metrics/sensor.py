@@ -10,7 +10,6 @@ import xarray as xr
 from lidar_mi.assessment.metrics.errors import error_statistics
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable
 from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
-from lidar_mi.retrieval.combined.combine import CombinedFlag
 
 COMPONENTS = ("u", "v", "w")
 
@@ -56,6 +55,9 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
     """
     if found is None:
         return {"sensor.valid_fraction": 0.0, "sensor.vectors": 0}
+    # with torch, which `check` does without
+    from lidar_mi.retrieval.combined.combine import CombinedFlag
+
     valid = found["flag"].values == 0
     z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
     far = valid & outside_cores(y, z, list(cores))
