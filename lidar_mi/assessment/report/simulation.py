@@ -82,9 +82,9 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
     # two digits of it are known
     expected = f"{float(f'{needed:.2g}'):.0f} or more" if needed else "more"
     visible = 0.0 if needed else _texture_visible(experiment, metrics)
-    if visible:
+    if visible > samples:
         expected += (
-            f": with {visible:.2g} its variance is {whole_percent(allowed)} of the texture's"
+            f": with {visible:.2g} its variance is {whole_percent(allowed)} of that of the texture"
         )
     automatic = ", or auto" if experiment.detector else ""
     return f"render.samples_per_beam: {text}; expected {expected}{automatic}"

@@ -287,7 +287,9 @@ def test_without_a_detector_all_noise_is_the_simulations():
     # 1 % of the light against a texture of 2 %: 64 (1/2)^2 / 0.1
     experiment.wake = SimpleNamespace(texture=SimpleNamespace(rms=0.02))
     remark = simulation_remark(experiment, metrics | lost)
-    assert remark.endswith("; expected more: with 1.6e+02 its variance is 10 % of the texture's")
+    assert remark.endswith(
+        "; expected more: with 1.6e+02 its variance is 10 % of that of the texture"
+    )
 
 
 def test_of_volumes_the_noise_is_compared():

@@ -10,33 +10,47 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.retrieval.flow import direct, strips
+from lidar_mi.retrieval.flow import direct, iterative, strips
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, halves
 from lidar_mi.retrieval.flow.likelihood import Linear
-from lidar_mi.retrieval.flow.prior import Prior
+from lidar_mi.retrieval.flow.prior import KINDS, Prior
 from lidar_mi.retrieval.flow.prior_check import prior_check
-from lidar_mi.retrieval.flow.settings import StripSettings, VariationalSettings
+from lidar_mi.retrieval.flow.settings import IterativeSettings, StripSettings, VariationalSettings
 
 SETTINGS = VariationalSettings(
-    ridge=1e-2, strips=StripSettings(solved_core=5, solved_overlap=3, core=5, overlap=3)
+    ridge=1e-3,
+    strips=StripSettings(solved_core=5, solved_overlap=3, core=5, overlap=3),
+    # one step from rest: that of a retrieval starts near its end
+    solver=IterativeSettings(tolerance=1e-4),
 )
-CASES = {"direct": direct.solved, "strips": strips.solved}
-SHAPE = 44, 52
+CASES = {
+    "direct": (direct.solved, (44, 52), 4.0),
+    "strips": (strips.solved, (44, 52), 4.0),
+    "iterative": (iterative.solved, (16, 20, 22), 5.0),
+}
+SOLVERS = ["direct", "strips", pytest.param("iterative", marks=pytest.mark.slow)]
+DRAWS = {"direct": 0.0, "strips": 0.0, "iterative": 0.1}
+"""Accuracy of the posterior covariance."""
 
 
 class Model:
     """Slopes, a prior and dense matrices of both: the posterior covariance by brute force."""
 
     def __init__(self, solver):
-        self.solve, shape = CASES[solver], SHAPE
+        self.solve, shape, knots = CASES[solver]
         random = torch.Generator().manual_seed(2)
         normal = partial(torch.randn, generator=random, dtype=torch.float64)
-        axes = [Axis(n, 4.0) for n in shape]
+        axes = [Axis(n, knots) for n in shape]
         self.mesh = Mesh(axes, [torch.arange(n, dtype=torch.float64) for n in shape])
-        self.slope, self.weight = normal(2, *shape), 0.2 * normal(*shape).square() + 0.01
+        self.slope, self.weight = normal(len(shape), *shape), 0.2 * normal(*shape).square() + 0.01
         nodes = halves(axes, self.weight)
-        self.prior = Prior(torch.ones(4, *nodes.shape).double(), nodes, 5.0, (1.0, 1.0))
-        self.shape = 2, *(axis.knots for axis in axes)
+        self.prior = Prior(
+            torch.ones(len(KINDS[len(shape)]), *nodes.shape).double(),
+            nodes,
+            5.0,
+            (1.0,) * len(shape),
+        )
+        self.shape = len(shape), *(axis.knots for axis in axes)
         size = int(np.prod(self.shape))
         units = torch.eye(size, dtype=torch.float64).reshape(size, *self.shape)
         self.along = (self.mesh.field(units) * self.slope).sum(1).flatten(1).T
@@ -59,7 +73,7 @@ class Model:
 
 
 @pytest.mark.parametrize("wrong", [0.25, 1.0, 4.0])
-@pytest.mark.parametrize("solver", CASES)
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_ratio_is_that_of_the_true_bias_to_the_expected_one(solver, wrong):
     model = Model(solver)
     root = torch.linalg.inv(torch.linalg.cholesky(model.stiff)).T
@@ -75,17 +89,20 @@ def test_ratio_is_that_of_the_true_bias_to_the_expected_one(solver, wrong):
         posterior, linear = model.fit(truth, noise)
         check = prior_check(posterior, linear, model.mesh)
         ratios.append(check.ratio)
-        error = model.mesh.field(posterior.coefficients - truth.reshape(model.shape))
-        covariance = check.factor(model.mesh.places) * posterior.covariance(model.mesh.places)[0]
+        # at the rim a flow is known much worse than within
+        nodes = model.prior.mesh
+        error = nodes.field(posterior.coefficients - truth.reshape(model.shape))
+        covariance = check.factor(nodes.places) * posterior.covariance(nodes.places)[0]
         stated = covariance.diagonal().movedim(-1, 0)
-        squares.append(float((error.square() / stated).mean()))
-    for values, expected, method in ((ratios, wrong, 0.05), (squares, 1.0, 0.05)):
+        # covariances of draws are means over the prior's width
+        squares.append(float(error.square().mean() / stated.mean()))
+    for values, expected, method in ((ratios, wrong, 0.05), (squares, 1.0, 0.05 + DRAWS[solver])):
         scatter = np.std(values, ddof=1) / len(values) ** 0.5
         # the draws of the check know mean squares to some percent
         assert abs(np.mean(values) - expected) < 4 * scatter + method * expected
 
 
-@pytest.mark.parametrize("solver", CASES)
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_fraction_is_that_of_the_posterior_covariance(solver):
     model = Model(solver)
     noise = torch.zeros(model.weight.numel(), dtype=torch.float64)
@@ -97,5 +114,7 @@ def test_fraction_is_that_of_the_posterior_covariance(solver):
         root = torch.linalg.cholesky(covariance).T.reshape(-1, *model.shape)
         parts.append(model.prior.smooth(model.prior.mesh.field(root).square().sum((0, 1))))
     # of four draws each part is known to some ten percent about a place
-    torch.testing.assert_close(found.mean(), (parts[0] / parts[1]).mean(), rtol=0.05, atol=0)
+    torch.testing.assert_close(
+        found.mean(), (parts[0] / parts[1]).mean(), rtol=0.05 + DRAWS[solver], atol=0
+    )
     torch.testing.assert_close(found, parts[0] / parts[1], rtol=0.4, atol=0.05)
