@@ -157,7 +157,7 @@ def _lines(done: Outcome) -> str | None:
 
 
 def _left(case: Case, done: Outcome, before: set[str], after: set[str]) -> str | None:
-    new = after - before - (set(case.leaves) if done.code == 0 else set())
+    new = after - before - (set(case.leaves) if done.code in (0, 1) else set())
     if new or before - after:
         return f"exit code {done.code} leaves {sorted(new)}, removes {sorted(before - after)}"
     return None

@@ -16,6 +16,8 @@ from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.windows import linear_weights, separable
 
+Linearly = Callable[[torch.Tensor], torch.Tensor]
+
 
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, with the terms of its posterior.
@@ -31,6 +33,8 @@ class Posterior(NamedTuple):
     settings : VariationalSettings
     iteration : int
         Seeds the draws.
+    informed : callable
+        The information of every voxel times coefficients (n, components, knots).
     response : None
         See `variational.Posterior`: of volumes it would take a solution for every random field.
     """
@@ -41,6 +45,7 @@ class Posterior(NamedTuple):
     single: Prior
     settings: VariationalSettings
     iteration: int
+    informed: Linearly
     response: None = None
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -48,7 +53,7 @@ class Posterior(NamedTuple):
         solver = self.settings.solver
         before, after = (
             self.single.by_kind(self.single.rates(flows).square()).mean(0)
-            for flows in self._drawn(solver.draws, before=True)
+            for flows in self._drawn(solver.draws, True, solver.loose, solver.steps)
         )
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
         # added to both, as the draws have sampling noise
@@ -56,19 +61,42 @@ class Posterior(NamedTuple):
         # means over a few draws may differ with the wrong sign
         return (before - after).clamp(min=0) + more, energy + more
 
+    def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
+        """The prior's precision times coefficients (n, components, knots)."""
+        return _stiff(flows.to(self.prior.local), self.prior, self.settings.ridge)
+
+    def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
+        """Coefficients by gradients (n, ...), with the prior's precision times a strength."""
+        weaker, ridge = (
+            self.single._replace(local=strength * self.single.local),
+            self.settings.ridge,
+        )
+        ready = _preconditioner(self.curvature.to(weaker.local), weaker, ridge)
+        found = conjugate_gradients(
+            lambda c: self.informed(c) + _stiff(c, weaker, ridge),
+            gradients.to(weaker.local),
+            ready,
+            # what the prior does to a flow is smooth: a loose solution lacks it
+            self.settings.solver.tolerance,
+            self.settings.solver.steps,
+        )
+        return found.to(gradients)
+
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before.
 
         A mean over flows drawn and over the width of the prior, accurate to some 10 %. Before the
         images it is infinite: the prior leaves rigid motion free.
         """
-        (flows,) = self._drawn(self.settings.solver.final_draws, before=False)
+        solver = self.settings.solver
+        exact = solver.final_tolerance, solver.final_steps
+        (flows,) = self._drawn(solver.final_draws, False, *exact)
         flows = self.single.mesh.field(flows).to(self.prior.local)
         mean = self.prior.smooth((flows[:, :, None] * flows[:, None]).mean(0))
         after = interpolated(mean, self.prior.mesh.places, [p.to(mean) for p in places])
         return after, torch.full_like(after, torch.inf)
 
-    def _drawn(self, number: int, before: bool) -> list[torch.Tensor]:
+    def _drawn(self, number: int, before: bool, tolerance: float, steps: int) -> list[torch.Tensor]:
         """Flows (number, components, knots) drawn from the prior, if wanted, and the posterior.
 
         Both from the same random numbers: they are equal where the volumes inform nothing.
@@ -87,12 +115,16 @@ class Posterior(NamedTuple):
         right = prior.rates_transposed(weights.sqrt() * normal(*weights.shape))
         right = right + ridge**0.5 * normal(*like.shape)
         curvature = self.curvature.to(like)
-        flows = [self._flows(torch.zeros_like(curvature), right)] if before else []
+        flows = []
+        if before:
+            flows = [self._flows(torch.zeros_like(curvature), right, tolerance, steps)]
         root = _root(curvature)
         right = right + prior.mesh.transposed(_times(root, normal(len(root), *prior.mesh.shape)))
-        return [*flows, self._flows(curvature, right)]
+        return [*flows, self._flows(curvature, right, tolerance, steps)]
 
-    def _flows(self, curvature: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    def _flows(
+        self, curvature: torch.Tensor, right: torch.Tensor, tolerance: float, steps: int
+    ) -> torch.Tensor:
         mesh, ridge = self.single.mesh, self.settings.ridge
 
         def applied(c: torch.Tensor) -> torch.Tensor:
@@ -100,8 +132,7 @@ class Posterior(NamedTuple):
             return found + _stiff(c, self.single, ridge)
 
         ready = _preconditioner(curvature, self.single, ridge)
-        solver = self.settings.solver
-        return conjugate_gradients(applied, right, ready, solver.loose, solver.steps)
+        return conjugate_gradients(applied, right, ready, tolerance, steps)
 
 
 def solved(
@@ -128,16 +159,20 @@ def solved(
     # the step itself has every voxel
     steep = linear.weight * linear.slope
 
-    def applied(c: torch.Tensor) -> torch.Tensor:
+    def informed(c: torch.Tensor) -> torch.Tensor:
         along = (linear.slope * mesh.field(c.to(voxels))).sum(1, keepdim=True)
-        return mesh.transposed(along * steep).to(c) + _stiff(c, prior, ridge)
+        return mesh.transposed(along * steep).to(c)
+
+    def applied(c: torch.Tensor) -> torch.Tensor:
+        return informed(c) + _stiff(c, prior, ridge)
 
     right = mesh.transposed(linear.gradient).to(curvature)[None]
     right = right - _stiff(coefficients[None], prior, ridge)
     ready = _preconditioner(curvature, prior, ridge)
     (change,) = conjugate_gradients(applied, right, ready, solver.tolerance, solver.steps)
     single = prior.to(linear.slope)
-    return Posterior(coefficients + change, curvature, prior, single, settings, iteration)
+    solution = coefficients + change
+    return Posterior(solution, curvature, prior, single, settings, iteration, informed)
 
 
 def _times(matrix: torch.Tensor, flows: torch.Tensor) -> torch.Tensor:

@@ -18,10 +18,12 @@ class IterativeSettings:
     tolerance, loose : float
         Residual over the first one at which iteration ends: for the flow, for a drawn one.
     steps : int
-        Largest number of steps. Where the prior is strong, draws that end too early state too small
-        errors.
-    draws, final_draws : int
-        Flows drawn per round, and for the standard errors.
+        Largest number of steps.
+    draws : int
+        Flows drawn per round.
+    final_draws, final_tolerance, final_steps : int, float, int
+        The same for the standard errors. Where the prior is strong draws that end too early state
+        too small errors: to a tolerance of 0.1 half of the variance, to 0.01 three quarters.
     damping : float
         Fraction of the prior's expected energy added to both sides of the fixed point against the
         sampling noise of the draws: 0 is MacKay's step.
@@ -33,7 +35,9 @@ class IterativeSettings:
     loose: float = 1e-1
     steps: int = 120
     draws: int = 4
-    final_draws: int = 16
+    final_draws: int = 8
+    final_tolerance: float = 1e-3
+    final_steps: int = 2000
     damping: float = 0.05
     seed: int = 0
 

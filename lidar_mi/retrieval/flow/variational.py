@@ -20,19 +20,15 @@ from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.noise_check import variance_by_coloured_noise
 from lidar_mi.retrieval.flow.other_motions import better_elsewhere
 from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
-from lidar_mi.retrieval.flow.prior_check import prior_check
+from lidar_mi.retrieval.flow.prior_check import Fit, prior_check
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import Flag, check_between
 from lidar_mi.retrieval.images.windows import Windows, image_pair, working
 
 
-class Posterior(Protocol):
+class Posterior(Fit, Protocol):
     """A flow after a Gauss-Newton step, with its distribution: what every solver gives."""
-
-    @property
-    def coefficients(self) -> torch.Tensor:
-        """Of the splines, (components, knots ...)."""
 
     @property
     def response(self) -> Response | None:
@@ -207,11 +203,9 @@ def variational_and_flow(
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
-    factor = torch.ones(windows.count).to(covariance)
-    if isinstance(posterior, direct.Posterior | strips.Posterior):
-        check = prior_check(posterior, linear, mesh)
-        # never narrower: one ratio scatters by half in flows of few vortices
-        factor = check.factor(centres).to(covariance).clamp(min=1.0)
+    # never narrower: one ratio scatters by half in flows of few vortices
+    check = prior_check(posterior, linear, mesh)
+    factor = check.factor(centres).to(covariance).clamp(min=1.0)
     covariance = factor * covariance
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)

@@ -63,16 +63,9 @@ def test_displacements_are_not_drawn_to_whole_voxels(axis, moved):
         assert abs(np.mean(off[name])) < 0.01, (name, np.mean(off[name]))
 
 
-TOO_FAR = pytest.mark.xfail(strict=True, reason="0.0103 voxels along x in place of 0.01")
-
-
 @pytest.mark.parametrize(
     "moved",
-    [
-        0.5,
-        pytest.param(1, marks=pytest.mark.slow),
-        pytest.param(1.75, marks=[pytest.mark.slow, TOO_FAR]),
-    ],
+    [0.5, pytest.param(1, marks=pytest.mark.slow), pytest.param(1.75, marks=pytest.mark.slow)],
 )
 def test_smooth_flows_are_not_drawn_to_whole_voxels(moved):
     shift = np.array([0.3, moved, -0.7 * moved])
@@ -141,7 +134,6 @@ def test_standard_errors_of_the_correlation_follow_the_noise_of_each_voxel():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="no vector is valid where volumes differ")
 def test_where_volumes_differ_standard_errors_are_larger():
     """In one half a volume holds fine texture that the other does not; noise is stated as it is."""
     shape = (14, 20, 40)
@@ -183,7 +175,8 @@ def test_solid_rotation_about_x(method):
     off, _ = errors(found, true)
     assert (found["flag"] == 0).mean() > 0.85
     for name in "uvw":
-        assert rms(off[name]) < 0.07, name
+        # with the vectors of the rims
+        assert rms(off[name]) < 0.08, name
         assert abs(np.mean(off[name])) < 0.05, name
 
 
