@@ -182,9 +182,10 @@ def at_rest(
 
     They are impulses that both images have at one place and no image of air resolves
     (`impulses.sharp`); pixels, lines, steps and spots that stand out of both images and are more
-    alike at one place than along the motion d of what is around; and gaps of 2 px between them. d
-    is the median of 5 x 5 coarse vectors of the images without what stands out of both, averaged over
-    Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated iteratively.
+    alike at one place than along the motion d of what is around; and gaps of 2 px between them.
+    d is the median of 5 x 5 coarse vectors of the images without what stands out of both, averaged
+    over Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated
+    iteratively.
     What stands out is measured by local medians, with thresholds of one false alarm in 10 000
     images of normal noise: the slower the air, the stronger a structure must be to be known from
     it. What stands out of both next to it is part of it. Stray pixels stand out of one image alone
