@@ -30,7 +30,7 @@ PAGES = (
     (
         "wind",
         "Wind from images",
-        ("retrieval",),
+        ("retrieval", "experiment.own_images"),
         "[images](../guide/images.md), [methods](../guide/methods.md)",
     ),
     (

@@ -42,7 +42,7 @@ FIGURES = {
 }
 # picture: campaign, heading of the part of its report
 PARTS = {"design_map": ("design_map", "Requirements"), "encounters": ("encounters", "Bank angle")}
-EXAMPLES = ("dense", "recover_slab")
+EXAMPLES = ("dense", "inflow", "recover_slab")
 CHECKS = {"resolution": "resolution"}
 
 

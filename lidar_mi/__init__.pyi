@@ -10,6 +10,7 @@ from .encounter.lidar.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
+from .experiment.own_images import retrieve_files
 from .experiment.results import Run
 from .experiment.run import run
 from .experiment.truth.extinction import make_truth
@@ -83,6 +84,7 @@ __all__ = [
     "read_scan",
     "read_vortices",
     "register_plugins",
+    "retrieve_files",
     "retrieve_v_los",
     "retrieve_wind",
     "retrieve_wind_volume",

@@ -268,6 +268,7 @@ SpectralRadiance = Annotated[float, Unit("W/m^3/sr", "0.3 W/m^2/sr/nm")]
 Circulation = Annotated[float, Unit("m^2/s", "458 m^2/s")]
 DissipationRate = Annotated[float, Unit("m^2/s^3", "1e-4 m^2/s^3")]
 Temperature = Annotated[float, Unit("K", "10 K")]
+Pressure = Annotated[float, Unit("Pa", "850 hPa")]
 Memory = Annotated[float, Unit("byte", "8 GB")]
 Number = Annotated[float, Unit("", "0.5")]
 

@@ -13,12 +13,13 @@ EXAMPLES = (
     "lidar-mi export outputs/wake_sensor",
     "lidar-mi export outputs/wake_sensor --format csv -o tables",
     "lidar-mi export outputs/gust --format control",
+    "lidar-mi export outputs/inflow --format openfast",
 )
 
 
 def complete_format(incomplete: str) -> list[str]:
     """Formats, for a shell."""
-    return starting(incomplete, ("vtk", "csv", "mat", "control"))
+    return starting(incomplete, ("vtk", "csv", "mat", "openfast", "control"))
 
 
 def export(
@@ -27,8 +28,9 @@ def export(
         str,
         typer.Option(
             "--format",
-            help="vtk (ParaView), csv (spreadsheets, R), mat (MATLAB), or control: the lidar of "
-            "flights as a state-space block with its noise (.npz, .mat for Simulink).",
+            help="vtk (ParaView), csv (spreadsheets, R), mat (MATLAB), openfast (lines of a "
+            "coherent lidar, as OpenFAST's own), or control: the lidar of flights as a state-space "
+            "block with its noise (.npz, .mat for Simulink).",
             autocompletion=complete_format,
         ),
     ] = "vtk",

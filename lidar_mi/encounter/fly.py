@@ -23,6 +23,7 @@ from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.device import devices_in_words, on_its_device
 from lidar_mi.experiment.folder.records import REPORT
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.truth.clear_air import in_air_of_its_site
 from lidar_mi.experiment.truth.wake_along_path import described_wake, encounter_of
 from lidar_mi.plots import plot_flights
 from lidar_mi.progress import Notice, progress
@@ -205,7 +206,7 @@ def fly(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     encounter_of(experiment)
-    experiment = on_its_device(experiment)
+    experiment = in_air_of_its_site(on_its_device(experiment), experiment.folder)
     recorded = None
     if replay is not None:
         if lidar is not None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
-FORMATS = ("vtk", "csv", "mat")
+FORMATS = ("vtk", "csv", "mat", "openfast")
 _WINDS = ("wind", "wind_volume", "wind3d")
 _AHEAD = {"units": "m", "long_name": "distance ahead of the first image's telescope"}
 
@@ -49,11 +49,12 @@ def export(
     ----------
     folder : path
         Of a run or of a flight.
-    format : {"vtk", "csv", "mat"}
+    format : {"vtk", "csv", "mat", "openfast"}
         VTK: a file for each source and method, ``.vti`` on uniform grids, ``.vts`` for images of
         several gates, whose beams spread, ``.vtu`` for lines of sight and vortices. CSV: a table
         for each result, one row a vector, with units in the head and flags in words. MATLAB: a
-        file for each result, with structures ``units``, ``long_name``, ``dims``.
+        file for each result, with structures ``units``, ``long_name``, ``dims``. OpenFAST: lines of
+        a coherent lidar that looks into one direction, as `write_openfast`.
     out : path, optional
         Folder of the files. Default: one of the format's name in the run's folder.
     overwrite : bool
@@ -91,6 +92,8 @@ def export(
                 f"{folder}: a flight without results yet; expected "
                 f"{', '.join(FLIGHT_FILES.values())}, which lidar-mi fly writes at its end"
             )
+    elif format == "openfast":
+        results = {"lines_of_sight": _coherent_lines(folder)}
     else:
         results = dict(_results(folder, record))
     if not results:
@@ -115,8 +118,13 @@ def _files(
     """Files to be, and what writes each."""
     from lidar_mi.io.csv_file import write_csv
     from lidar_mi.io.mat_file import write_mat
+    from lidar_mi.io.openfast import write_openfast
     from lidar_mi.io.vtk_file import suffix, write_vtk
 
+    if format == "openfast":
+        path = out / "lines_of_sight.out"
+        yield path, partial(write_openfast, path, results["lines_of_sight"])
+        return
     write = {"vtk": write_vtk, "csv": write_csv, "mat": write_mat}[format]
     for name, data in results.items():
         parts = _one_by_one(name, data) if format == "vtk" else [(name, data)]
@@ -148,7 +156,9 @@ def _results(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[str, xr.
             # cross-flow winds have no x: they are means over the slab
             yield name, wind if "x" in wind.coords else wind.assign_coords(x=_slab(record))
     if (folder / RESULTS["lines"]).is_file():
-        yield "lines_of_sight", _placed_lines(read_netcdf(folder / RESULTS["lines"]))
+        lines = read_netcdf(folder / RESULTS["lines"])
+        coherent = "azimuth" in lines
+        yield "lines_of_sight", _gates(xr.decode_cf(lines)) if coherent else _placed_lines(lines)
     if (folder / RESULTS["vortices"]).is_file():
         fits = read_vortices(folder / RESULTS["vortices"])
         if fits:
@@ -206,6 +216,38 @@ def _placed_lines(lines: xr.Dataset) -> xr.Dataset:
         velocity = lines["platform_velocity"]
         split[f"platform_velocity_{axis}"] = velocity.sel(axis=axis, drop=True)
     return split.set_coords(["x", "y", "z"])
+
+
+def _coherent_lines(folder: Path) -> xr.Dataset:
+    path = folder / RESULTS["coherent_lines"]
+    lines = read_netcdf(path) if path.is_file() else xr.Dataset()
+    if "azimuth" not in lines:
+        raise InputError(
+            f"{folder}: has no lines of a coherent lidar; expected a run with doppler.kind: "
+            "coherent for the format openfast"
+        )
+    return xr.decode_cf(lines)
+
+
+def _gates(lines: xr.Dataset) -> xr.Dataset:
+    """Gates of a coherent lidar with their places to the east, to the north and up of it."""
+    first = lines["time"][0]
+    seconds = (lines["time"] - first) / np.timedelta64(1, "s")
+    azimuth, elevation = np.deg2rad(lines["azimuth"]), np.deg2rad(lines["elevation"])
+    level = lines["range"] * np.cos(elevation)
+    places = {
+        "x": ("to the east of the lidar", level * np.sin(azimuth)),
+        "y": ("to the north of the lidar", level * np.cos(azimuth)),
+        "z": ("above the lidar", lines["range"] * np.sin(elevation)),
+    }
+    coordinates = {"time": seconds.assign_attrs(units="s", long_name=f"after {first.values}")}
+    for name, (words, place) in places.items():
+        about = {"units": "m", "long_name": words}
+        coordinates[name] = place.transpose("time", "range").assign_attrs(about)
+    placed = lines.assign_coords(coordinates)
+    # what belongs to a vortex in place of a gate has no place in this list
+    other = [name for name, field in placed.variables.items() if {*field.dims} - {"time", "range"}]
+    return placed.drop_vars(other).stack(gate=("time", "range")).reset_index("gate")
 
 
 def _vortices(fits: "dict[str, VortexPairFit]") -> xr.Dataset:

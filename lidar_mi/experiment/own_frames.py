@@ -17,6 +17,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.stages.ring_images import ring_models
 from lidar_mi.experiment.stages.ring_instrument import laser_rings, pixel_noise
+from lidar_mi.experiment.truth.clear_air import in_air_of_its_site
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.etalon import mirrors
 from lidar_mi.io.images import read_frames, stated_units
@@ -43,7 +44,9 @@ def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") ->
         raise InputError(
             f"{name}: experiment {experiment.name!r} has no section doppler; expected one"
         )
-    return experiment.fringes
+    placed = in_air_of_its_site(experiment, experiment.folder).fringes
+    assert placed is not None
+    return placed
 
 
 def electrons(counts: np.ndarray, ccd: CCD) -> np.ndarray:

@@ -14,10 +14,10 @@ import numpy as np
 import scipy
 import torch
 
-from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
 from lidar_mi.atmosphere.scattering.line import Line, backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.stages.ring_instrument import TEMPERATURE_NODES, pixel_noise
+from lidar_mi.experiment.truth.clear_air import air_of
 from lidar_mi.instrument import double_edge, michelson
 from lidar_mi.instrument import etalon as fabry_perot
 from lidar_mi.instrument.ccd import CCD
@@ -218,7 +218,7 @@ def _line(
     lidar: DopplerLidar, temperature: float | None = None, aerosol: float | None = None
 ) -> Line:
     """The line at the lidar's altitude, or at another temperature, with another aerosol."""
-    pressure, usual, _ = standard_atmosphere(lidar.altitude)
+    pressure, usual = air_of(lidar)
     return backscatter_line(
         lidar.wavelength,
         usual if temperature is None else temperature,
@@ -254,7 +254,7 @@ def _receiver(
         Whether speeds are read from the ratio of two signals.
     """
     times = np.arange(harmonics.shape[1]) * delay
-    usual = standard_atmosphere(lidar.altitude).temperature
+    _, usual = air_of(lidar)
     temperatures = [usual * node for node in TEMPERATURE_NODES]
     # of molecules alone: aerosol is a signal of its own
     lines = [_line(lidar, kelvin, 0.0).characteristic(times) for kelvin in temperatures]

@@ -21,6 +21,7 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.magnitudes import unusual
 from lidar_mi.experiment.pipeline import Results, stages_of
 from lidar_mi.experiment.results import Run
+from lidar_mi.experiment.truth.clear_air import in_air_of_its_site
 from lidar_mi.progress import Notice, progress
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.reading import dump
@@ -116,7 +117,7 @@ def prepare(
             f"encounter: {experiment.name} is a flight, not a run; expected lidar-mi fly (lm.fly)"
         )
     beside = experiment.folder if beside is None else beside
-    experiment = on_its_device(experiment)
+    experiment = in_air_of_its_site(on_its_device(experiment), Path(beside))
     graph, log = stages_of(experiment), Log(notice)
     prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
     for text in unusual(experiment):

@@ -23,7 +23,9 @@ from lidar_mi.units import (
     Frequency,
     Length,
     Number,
+    Pressure,
     SpectralRadiance,
+    Temperature,
     Time,
     Within,
     quantity,
@@ -90,6 +92,12 @@ class DopplerLidar(Description):
     altitude: Annotated[Length, Within(-5004, 81020, "the standard atmosphere")] = Field(
         8500.0, description="of the air, for temperature and pressure"
     )
+    temperature: (
+        Annotated[Temperature, Within(50, 2000, "from the mesopause to a flame")] | None
+    ) = Field(None, description="of the air; default: the standard atmosphere's at altitude")
+    pressure: (
+        Annotated[Pressure, Within(1e-3, 1e7, "from 100 km altitude to a pressure cell")] | None
+    ) = Field(None, description="of the air; default: the standard atmosphere's at altitude")
     backscatter: Annotated[
         Backscatter, Within(1e-15, 1, "from the thermosphere to the densest smoke")
     ] = Field(3.104e-6, description="backscatter coefficient")

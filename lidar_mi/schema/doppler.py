@@ -129,24 +129,3 @@ class Doppler(Section):
         if self.path_samples == 1:
             raise ValueError("path_samples: 1 is not allowed; expected 0 or 2 and more")
         return self
-
-
-def at_site(lidar: DopplerLidar, altitude: float, band: str) -> DopplerLidar:
-    """A Doppler lidar in clear air at an altitude (m), where its own keys do not say otherwise.
-
-    Backscatter is that of molecules, and of as much aerosol as `aerosol_fraction` says; extinction
-    is that of molecules.
-    """
-    # loaded only where it is needed
-    from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
-    from lidar_mi.atmosphere.scattering.molecules import molecular_scattering
-
-    stated = lidar.model_fields_set
-    found = {"altitude": altitude}
-    here = lidar.altitude if "altitude" in stated else altitude
-    pressure, temperature, _ = standard_atmosphere(here)
-    air = molecular_scattering(lidar.wavelength, pressure, temperature, band)
-    if lidar.aerosol_fraction < 1:
-        found["backscatter"] = air.backscatter / (1 - lidar.aerosol_fraction)
-        found["extinction"] = air.extinction
-    return lidar.model_copy(update={key: v for key, v in found.items() if key not in stated})

@@ -15,7 +15,7 @@ from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.schema.coherent import CoherentDoppler
-from lidar_mi.schema.doppler import Doppler, at_site
+from lidar_mi.schema.doppler import Doppler
 from lidar_mi.schema.encounter import Encounter
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.retrieval import Retrieval
@@ -219,25 +219,13 @@ class Experiment(Tabular, Section):
         return self
 
     @model_validator(mode="after")
-    def _doppler_lidar_in_the_air_of_the_site(self) -> Self:
-        if self.fringes is None:
-            if self.imaged_wake is None and self.site != Site():
-                raise ValueError(
-                    "site: not allowed with doppler.kind coherent, whose echo is that of aerosol "
-                    "and as strong as doppler.signal says; expected no site, or doppler.kind: "
-                    "fringes"
-                )
-            return self
-        if self.imaged_wake is None and self.site.sounding is not None:
+    def _site_has_molecules_that_are_seen(self) -> Self:
+        if self.fringes is None and self.imaged_wake is None and self.site != Site():
             raise ValueError(
-                "site.sounding: not allowed without wake, as the Doppler lidar's air is that of "
-                "the standard atmosphere; expected site.altitude"
+                "site: not allowed with doppler.kind coherent, whose echo is that of aerosol "
+                "and as strong as doppler.signal says; expected no site, or doppler.kind: "
+                "fringes"
             )
-        if self.site.altitude is not None:
-            lidar = at_site(self.fringes.lidar, self.site.altitude, self.scattering.band)
-            doppler = self.fringes.model_copy(update={"lidar": lidar})
-            # the section is frozen from here on
-            object.__setattr__(self, "doppler", doppler)
         return self
 
     @model_validator(mode="after")

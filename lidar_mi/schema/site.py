@@ -17,8 +17,8 @@ class Site(Section):
     altitude: Annotated[Length, Within(-5000, 80000, "the standard atmosphere")] | None = Field(
         None,
         description="of the observed air above sea level, also for doppler.lidar where that does "
-        "not say otherwise; default: encounter.path.altitude of a flight, else 0 m, and for "
-        "doppler.lidar its own",
+        "not say otherwise; default: encounter.path.altitude of a flight, else 0 m, and without "
+        "sounding for doppler.lidar its own",
     )
     sounding: str | None = Field(
         None,

@@ -219,6 +219,7 @@ def _unit(field):
             (units.Inertia, "kg m²"),
             (units.Memory, "byte"),
             (units.Temperature, "K"),
+            (units.Pressure, "Pa"),
             (units.Number, None),
         )
     }

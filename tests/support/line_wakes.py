@@ -4,7 +4,7 @@ Places are integrated by Runge and Kutta's method of fourth order and velocities
 along the lines, from the swirl of a vortex and its images: no code of the retrieval.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -23,10 +23,15 @@ LIDAR = CoherentLidar(
 START = np.datetime64("2000-01-01", "ns")
 
 
-def slices(low=2.0, high=20.0, count=1, turn=0.5):
+def slices(low=2.0, high=20.0, count=1, turn=0.5, rate=3.0):
     """Scans to the east at 3 degrees a second, a line every 50 ms."""
     ends = np.deg2rad(low), np.deg2rad(high)
-    return rhi_scan(np.pi / 2, ends, np.deg2rad(3.0), 0.05, count=count, turn=turn)
+    return rhi_scan(np.pi / 2, ends, np.deg2rad(rate), 0.05, count=count, turn=turn)
+
+
+def averaging(length):
+    """The lidar with pulses and gates of a length, m."""
+    return replace(LIDAR, pulse_duration=2 * length / scipy.constants.c, gate_length=length)
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,9 @@ class Family:
         Of the middle, m.
     ground : float or None
         m.
+    lidar : CoherentLidar
+    rate : float
+        Of the scan, deg/s.
     """
 
     circulations: tuple[float, ...] = (-400.0, 400.0)
@@ -57,6 +65,8 @@ class Family:
     snr: float = 0.03
     heights: tuple[float, float] = (70.0, 150.0)
     ground: float | None = None
+    lidar: CoherentLidar = LIDAR
+    rate: float = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +100,7 @@ class Drawn:
 def drawn(family: Family, seed: int, scan: LineScan | None = None, *, wake=True) -> Drawn:
     """Scans of one wake of a family; without it, of its air."""
     random = np.random.default_rng([seed, 0xAE])
-    scan = slices() if scan is None else scan
+    scan = slices(rate=family.rate) if scan is None else scan
     number = len(family.circulations)
     middle = np.array([random.uniform(550, 850), random.uniform(*family.heights)])
     offset = family.separation * (np.arange(number) - (number - 1) / 2)
@@ -128,7 +138,7 @@ def drawn(family: Family, seed: int, scan: LineScan | None = None, *, wake=True)
             v, w = v + swirl[0], w + swirl[1]
         return v, np.zeros(x.shape), w
 
-    lines = measured_lines(wind, scan, LIDAR, family.snr, seed=seed, resolution=1.5)
+    lines = measured_lines(wind, scan, family.lidar, family.snr, seed=seed, resolution=1.5)
     return Drawn(lines, steps, places, strengths, np.array(family.core_radii))
 
 

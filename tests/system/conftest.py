@@ -3,7 +3,6 @@
 import gc
 import os
 import pickle
-import sys
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,10 +10,9 @@ from types import SimpleNamespace
 import pytest
 from filelock import FileLock
 
-from lidar_mi.cli import app as cli
 from lidar_mi.experiment import run as experiment
 from lidar_mi.schema import reading as config
-from tests.support.command_line import TINY
+from tests.support.command_line import TINY, in_process
 from tests.support.experiments import sketched_figures, whole_figures, without_figures
 
 SCENES = Path(str(files("lidar_mi.scenes")))
@@ -80,14 +78,11 @@ def there(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def lidar_mi(monkeypatch, capsys):
+def lidar_mi():
     """Runs the command in this process: exit code, output, error output."""
 
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["lidar-mi", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        out, err = capsys.readouterr()
-        return stop.value.code or 0, out, err
+        done = in_process(*arguments)
+        return done.returncode, done.stdout, done.stderr
 
     return call

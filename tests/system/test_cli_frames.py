@@ -70,7 +70,7 @@ def test_frames_are_named(here, lidar_mi):
     pages("stack.tif", exposures(4))
     code, _, err = lidar_mi("retrieve", "stack.tif", *OPTIONS)
     assert code == 2 and err.count("\n") == 1
-    assert "stack.tif: 4 frames; expected --frame" in err and "--pairs all" in err
+    assert "stack.tif: 4 frames; expected frame" in err and "pairs all" in err
     assert lidar_mi("retrieve", "stack.tif", "--frame", "1,2", *OPTIONS)[0] == 0
     (v, w), _ = of_file()
     assert v == pytest.approx(5, abs=0.3) and w == pytest.approx(-2.5, abs=0.3)
@@ -89,12 +89,12 @@ def test_frames_are_named(here, lidar_mi):
     ("arguments", "says"),
     [
         (("one.tif",), "one.tif: one image; expected two files"),
-        (("pair.tif", "pair.tif"), "pair.tif: 2 frames; expected --frame with a number for each"),
-        (("one.tif", "pair.tif", "--pairs", "all"), "pair.tif: 2 frames; expected --frame"),
-        (("pair.tif", "--frame", "0"), "--frame: one frame of pair.tif; expected two"),
+        (("pair.tif", "pair.tif"), "pair.tif: 2 frames; expected frame with a number for each"),
+        (("one.tif", "pair.tif", "--pairs", "all"), "pair.tif: 2 frames; expected frame"),
+        (("pair.tif", "--frame", "0"), "frame: one frame of pair.tif; expected two"),
         (("pair.tif", "--frame", "0,2"), "frame 2 is not there; expected --frame 0 to 1"),
         (("pair.tif", "--frame", "a"), "--frame: 'a' is not allowed; expected numbers from 0"),
-        (("pair.tif", "--frame", "0,1", "--pairs", "all"), "--frame, --pairs: both"),
+        (("pair.tif", "--frame", "0,1", "--pairs", "all"), "frame, pairs: both"),
         (("one.tif", "one.tif", "--frame", "0,0,0"), "3 numbers are not allowed with 2 files"),
         (("colours.tif",), "colours.tif: 2 channels of one moment"),
         (("axes.tif",), "axes.tif: images along several axes (T 2, Z 2)"),

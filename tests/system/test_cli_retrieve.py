@@ -88,15 +88,15 @@ def test_time_step_and_statistics(here, lidar_mi):
 
 def test_contradictions_are_said(here, lidar_mi):
     code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", "--dt", 100, *OPTIONS)
-    assert code == 0 and "warning: --dt 100 s, but 0.1 s by the headers" in words_of(out)
+    assert code == 0 and "warning: dt is 100 s as given, but 0.1 s by the headers" in words_of(out)
     code, out, _ = lidar_mi("retrieve", "1.exr", "0.exr", "--dt", 0.1, *OPTIONS)
     assert code == 0 and "warning: by their headers (-0.1 s)" in words_of(out)
     code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", "--dt", 0.1, *OPTIONS)
     assert code == 0 and "warning" not in out
     for files, words in (
         (("1.exr", "0.exr"), "images in the order of their times"),
-        (("silent0.exr", "silent1.exr"), "--dt: missing"),
-        (("0.exr", "1.exr", "timed2.exr", "--method", "cc"), "expected two, --pairs all"),
+        (("silent0.exr", "silent1.exr"), "dt: missing"),
+        (("0.exr", "1.exr", "timed2.exr", "--method", "cc"), "expected two, pairs all"),
         (("0.exr", "1.exr", "0.exr", "--pairs", "all"), "images in the order of their times"),
     ):
         code, _, err = lidar_mi("retrieve", *files, *OPTIONS)
@@ -147,7 +147,8 @@ def test_images_of_a_detector_come_first(here, lidar_mi):
     code, out, _ = lidar_mi("retrieve", "noisy0.exr", "noisy1.exr", "--layer", "Y", *OPTIONS)
     assert code == 0 and "Y_noisy" not in out
     code, _, err = lidar_mi("retrieve", "noisy0.exr", "1.exr", *OPTIONS)
-    assert code == 2 and "1.exr: without the layer Y_noisy" in err and "--layer Y" in err
+    assert code == 2 and "1.exr: without the layer Y_noisy" in err
+    assert "expected layer, such as Y" in err
 
 
 @pytest.mark.slow
@@ -217,7 +218,7 @@ def test_pixels_are_those_of_the_wind_in_metres(photographs, lidar_mi):
     units = [data["v"].attrs["units"] for data in (pixels, metres, timed)]
     assert units == ["px frame-1", "m s-1", "px s-1"] and pixels["y"].attrs["units"] == "px"
     code, _, err = lidar_mi(*files, "--pixels", "--spacing", 1)
-    assert code == 2 and "--pixels, --spacing" in err
+    assert code == 2 and "pixels, spacing" in err
 
 
 def test_a_picture_of_the_vectors(photographs, lidar_mi, tmp_path):

@@ -13,6 +13,7 @@ from scipy.io import loadmat
 import lidar_mi as lm
 from lidar_mi.io.exr import label_scan, write_scan
 from lidar_mi.io.netcdf import write_netcdf
+from lidar_mi.io.openfast import write_openfast
 from lidar_mi.io.yaml import to_yaml
 
 READERS = {
@@ -238,3 +239,58 @@ def test_export_refuses_in_one_line(folder, tmp_path, monkeypatch, lidar_mi):
     assert (folder / "csv" / "wind.csv").read_text() == "mine"
     lm.export(folder, "csv", overwrite=True)
     assert (folder / "csv" / "wind.csv").read_text() != "mine"
+
+
+@pytest.fixture
+def stare(tmp_path):
+    """A short run of a coherent lidar that looks upwind, to the north-east and 10 degrees up."""
+    keys = {"azimuth": "45 deg", "elevation": "10 deg", "count": 4}
+    experiment = lm.load_experiment(
+        "inflow", **{f"doppler.scan.{key}": value for key, value in keys.items()}
+    )
+    return lm.run(experiment, tmp_path / "stare").folder
+
+
+def test_lines_of_a_coherent_lidar_are_points_to_the_east_north_and_up(stare):
+    lines = xr.load_dataset(stare / "lines_of_sight.nc")
+    table = pd.read_csv(lm.export(stare, "csv")[0])
+    assert len(table) == lines["radial_velocity"].size
+    level = table["range [m]"] * np.cos(np.radians(10))
+    np.testing.assert_allclose(table["x [m]"], level / np.sqrt(2), rtol=1e-6)
+    np.testing.assert_allclose(table["y [m]"], level / np.sqrt(2), rtol=1e-6)
+    np.testing.assert_allclose(table["z [m]"], table["range [m]"] * np.sin(np.radians(10)))
+    assert list(table["time [s]"].unique()) == [0, 1, 2, 3]
+    np.testing.assert_allclose(
+        table.set_index(["time [s]", "range [m]"])["radial_velocity [m s-1]"].to_numpy(),
+        lines["radial_velocity"].transpose("time", "range").values.ravel(),
+    )
+    names = [path.name for format in ("vtk", "mat") for path in lm.export(stare, format)]
+    assert names == ["lines_of_sight.vtu", "lines_of_sight.mat"]
+
+
+def test_openfast_reads_the_wind_towards_the_lidar(stare, folder):
+    """Eight lines of head: names in the seventh and units in brackets in the eighth."""
+    (path,) = lm.export(stare, "openfast")
+    assert path.name == "lines_of_sight.out"
+    head = path.read_text().splitlines()[:8]
+    assert head[6].split() == ["Time", *(f"WindMeas{k}" for k in range(1, 7))]
+    assert head[7].split() == ["(s)", *["(m/s)"] * 6]
+    table = np.loadtxt(path, skiprows=8)
+    lines = xr.load_dataset(stare / "lines_of_sight.nc").transpose("time", "range")
+    expected = -lines["radial_velocity"].values / np.cos(np.radians(10))
+    np.testing.assert_allclose(table[:, 0], [0, 1, 2, 3])
+    np.testing.assert_allclose(table[:, 1:], expected, rtol=1e-5)
+    # half of the 10 m/s is seen at 45 degrees and more
+    assert 5 < table[:, 1:].mean() < 9
+    with pytest.raises(lm.InputError, match="no lines of a coherent lidar"):
+        lm.export(folder, "openfast")
+
+
+def test_lines_of_several_directions_are_no_measurement_of_openfast(stare):
+    lines = xr.load_dataset(stare / "lines_of_sight.nc")
+    turned = lines.assign_coords(azimuth=("time", np.array([0.0, 90, 180, 270])))
+    with pytest.raises(lm.InputError, match="several directions"):
+        write_openfast("a.out", turned)
+    up = lines.assign_coords(elevation=("time", np.full(4, 70.0)))
+    with pytest.raises(lm.InputError, match="elevation of 70 deg"):
+        write_openfast("a.out", up)

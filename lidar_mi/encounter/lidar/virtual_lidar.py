@@ -25,6 +25,7 @@ from lidar_mi.encounter.lidar.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.device import on_its_device
 from lidar_mi.experiment.stages.rendering import PILOT_SEED
+from lidar_mi.experiment.truth.clear_air import in_air_of_its_site
 from lidar_mi.experiment.truth.wake_along_path import encounter_of
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector_noise import noisy_scan
@@ -119,7 +120,8 @@ class VirtualLidar:
     ) -> None:
         if not isinstance(experiment, Experiment):
             experiment = load_experiment(experiment)
-        self.experiment = experiment = on_its_device(experiment)
+        experiment = in_air_of_its_site(on_its_device(experiment), experiment.folder)
+        self.experiment = experiment
         self.encounter = encounter_of(experiment)
         self.gates: Gates = gates_of(experiment)
         self.air: Air = air_of(experiment, self.gates)

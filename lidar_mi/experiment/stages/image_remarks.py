@@ -22,7 +22,6 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.schema.doppler import Doppler
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.retrieval import Retrieval
 from lidar_mi.schema.scattering import Scattering
@@ -49,15 +48,8 @@ def image_remarks(
     air: Scatterer,
     clear_air: ClearAir,
     site: Site,
-    doppler: Doppler | None,
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each."""
-    sounding = []
-    if doppler and site.sounding:
-        sounding = [
-            "site.sounding: only the backscatter lidar's air is that; the Doppler lidar's is of "
-            f"the standard atmosphere at {doppler.lidar.altitude:g} m"
-        ]
     flow = _of_the_flow(wake, truth.wind) if wake.file else []
     interpolated = flows[0].attrs.get("interpolated")
     grid = [f"wake.file: {interpolated}"] if interpolated else []
@@ -68,7 +60,6 @@ def image_remarks(
         *_of_the_light(lidar, scan, plans[0]),
         *_of_the_pattern(scan),
         *_of_the_molecules(wake.extinction, truth, scattering, air, clear_air, site),
-        *sounding,
     ]
 
 

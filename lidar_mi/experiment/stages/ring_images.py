@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 import xarray as xr
 
-from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
 from lidar_mi.atmosphere.scattering.line import Line, backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Only, Store
@@ -18,6 +17,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.stages.rendering import batches_of
 from lidar_mi.experiment.stages.ring_instrument import air_rings, laser_rings, pixel_noise
 from lidar_mi.experiment.stages.ring_reference import reference_frames
+from lidar_mi.experiment.truth.clear_air import air_of
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import DopplerLidar, photons, solar_background, speckle_modes
 from lidar_mi.instrument.etalon import Etalon
@@ -78,12 +78,20 @@ class Exposure:
 def air_line(
     doppler_lidar: Annotated[
         DopplerLidar,
-        Only("wavelength", "altitude", "laser_width", "aerosol_fraction", "line_shape"),
+        Only(
+            "wavelength",
+            "altitude",
+            "temperature",
+            "pressure",
+            "laser_width",
+            "aerosol_fraction",
+            "line_shape",
+        ),
     ],
 ) -> Line:
     """The spectral line of the air's light."""
     lidar = doppler_lidar
-    pressure, temperature, _ = standard_atmosphere(lidar.altitude)
+    pressure, temperature = air_of(lidar)
     return backscatter_line(
         lidar.wavelength,
         temperature,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
 from lidar_mi.atmosphere.scattering.line import Line, backscatter_line, laser_line
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.truth.clear_air import air_of
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon, harmonics
@@ -102,7 +102,7 @@ def air_rings(
     light_degree, background_degree : int
         Of the smooth variations of light and background that are fitted along.
     """
-    pressure, temperature, _ = standard_atmosphere(lidar.altitude)
+    pressure, temperature = air_of(lidar)
     # aerosol that is fitted has harmonics of its own: the line is that of molecules
     known = lidar.aerosol_fraction if aerosol_std == 0 else 0.0
 

@@ -1,5 +1,6 @@
 """The molecules of the air at the site: what they take from a beam and send back."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -9,9 +10,11 @@ from lidar_mi.atmosphere.air.standard_atmosphere import standard_atmosphere
 from lidar_mi.atmosphere.scattering.molecules import molecular_scattering
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Only
+from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.io.sounding import read_sounding
 from lidar_mi.schema.encounter import Encounter
+from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.input_files import find_file
 from lidar_mi.schema.scattering import Scattering
 from lidar_mi.schema.site import Site
@@ -66,6 +69,53 @@ def clear_air(
     source = site.sounding or "standard atmosphere"
     origin = f"{source} at {altitude:g} m: {pressure / 100:.4g} hPa, {temperature:.4g} K"
     return ClearAir(air.extinction, air.backscatter, origin)
+
+
+def in_air_of_its_site(experiment: Experiment, search_path: Path) -> Experiment:
+    """The experiment with its fringe-imaging Doppler lidar in the air of the site.
+
+    Altitude, pressure, temperature, backscatter and extinction are those of the site where
+    ``doppler.lidar`` does not state its own. Backscatter is that of molecules and of as much
+    aerosol as ``aerosol_fraction`` says, extinction that of molecules; light of aerosol alone
+    leaves both as they are. Without a site, all is as stated.
+
+    Raises
+    ------
+    InputError
+        As of `clear_air`.
+    """
+    doppler, site = experiment.fringes, experiment.site
+    if doppler is None or site == Site():
+        return experiment
+    lidar, stated = doppler.lidar, doppler.lidar.model_fields_set
+    here = lidar.altitude if "altitude" in stated else site_altitude(site, experiment.encounter)
+    of_site: dict[str, float] = {"altitude": here}
+    if site.sounding is not None:
+        of_site["pressure"], of_site["temperature"] = _air_at(here, site, search_path)
+    lidar = _where_unstated(lidar, of_site)
+    if lidar.aerosol_fraction < 1:
+        molecules = molecular_scattering(
+            lidar.wavelength, *air_of(lidar), experiment.scattering.band
+        )
+        backscatter = molecules.backscatter / (1 - lidar.aerosol_fraction)
+        of_site = {"backscatter": backscatter, "extinction": molecules.extinction}
+        lidar = _where_unstated(lidar, of_site)
+    changes = {"doppler": doppler.model_copy(update={"lidar": lidar})}
+    return experiment.model_copy(update=changes).read_from(experiment.folder)
+
+
+def air_of(lidar: DopplerLidar) -> tuple[float, float]:
+    """Pressure (Pa) and temperature (K) of a Doppler lidar's air."""
+    pressure, temperature, _ = standard_atmosphere(lidar.altitude)
+    return (
+        pressure if lidar.pressure is None else lidar.pressure,
+        temperature if lidar.temperature is None else lidar.temperature,
+    )
+
+
+def _where_unstated(lidar: DopplerLidar, values: Mapping[str, float]) -> DopplerLidar:
+    stated = lidar.model_fields_set
+    return lidar.model_copy(update={key: v for key, v in values.items() if key not in stated})
 
 
 def site_altitude(site: Site, encounter: Encounter | None) -> float:

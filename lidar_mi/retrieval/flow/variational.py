@@ -5,7 +5,8 @@ probable ones given the images and a prior of concentrated vorticity and small d
 What else makes the images differ is estimated from what the fit leaves (`components`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Protocol
 
 import torch
@@ -16,6 +17,7 @@ from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.flow.components import Response, differences, without_texture
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
+from lidar_mi.retrieval.flow.line_offsets import LineOffsets, line_offsets
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.noise_check import variance_by_coloured_noise
 from lidar_mi.retrieval.flow.other_motions import better_elsewhere
@@ -154,7 +156,41 @@ def variational_and_flow(
     """`variational`, and if asked what the retrieval of the next images may start from.
 
     There is none for volumes, for images of more than `settings.strips.largest` knots, and for
-    images that do not determine the flow.
+    images that do not determine the flow. Where lines of two images have offsets the fit is
+    repeated on images without them, and where these do not explain the images on the images.
+    """
+    fitted: Callable[..., tuple[Displacement, Flow | None] | LineOffsets] = partial(
+        _fitted,
+        windows=windows,
+        min_correlation=min_correlation,
+        noise=noise,
+        blur=blur,
+        spacing=spacing,
+        settings=settings,
+        keep=keep,
+    )
+    found = fitted(stack)
+    while isinstance(found, LineOffsets):
+        unexplained = found.settled
+        found = fitted(stack, sought=False) if unexplained else fitted(found.images, offsets=found)
+    return found
+
+
+def _fitted(
+    stack: Sequence[torch.Tensor],
+    windows: Windows,
+    min_correlation: float,
+    noise: float | torch.Tensor | None,
+    blur: float,
+    spacing: Sequence[float] | None,
+    settings: VariationalSettings | None,
+    keep: bool,
+    offsets: LineOffsets | None = None,
+    sought: bool = True,
+) -> tuple[Displacement, Flow | None] | LineOffsets:
+    """`variational_and_flow` of images without `offsets` of lines.
+
+    If they are `sought`, and those that are found now do not explain the images yet, these.
     """
     check_between("min_correlation", min_correlation, -1, 1)
     for image in stack[1:]:
@@ -200,6 +236,12 @@ def variational_and_flow(
     assert prior is not None  # settings have a level at least
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
+    if sought and len(stack) == 2 and windows.dims == 2 and posterior.response is not None:
+        offsets = line_offsets(
+            images, linear, mesh, coefficients, settings, posterior.response, offsets
+        )
+        if offsets and not offsets.explain:
+            return offsets
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
@@ -219,6 +261,10 @@ def variational_and_flow(
         )
         finer = finer + coloured.to(finer)
     additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
+    if offsets:
+        by_lines = Mesh(mesh.axes, centres).field(offsets.flows.to(like)).to(covariance)
+        additional = additional + torch.einsum("nazy,nbzy->abzy", by_lines, by_lines)
+        lines = offsets.names
     covariance = covariance + additional
     said = {"noise_of_lines": lines} if lines else {}
     result = result._replace(covariance=covariance, attributes=said)

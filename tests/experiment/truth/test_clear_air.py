@@ -2,6 +2,7 @@
 read or read in wrong units, particles and molecules counted twice, and a default that is silent.
 """
 
+import numpy as np
 import pytest
 
 import lidar_mi as lm
@@ -9,7 +10,8 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.stages.light_budget import backscatter_fractions, fractions_in_words
-from lidar_mi.experiment.truth.clear_air import clear_air
+from lidar_mi.experiment.stages.ring_images import air_line
+from lidar_mi.experiment.truth.clear_air import air_of, clear_air, in_air_of_its_site
 
 # U.S. Standard Atmosphere 1976: geometric altitude z (m), hPa, K. The tropopause is defined at the
 # geopotential altitude H = 11 km, with 226.32 hPa and 216.65 K; below it T = 288.15 K - 6.5 K/km H
@@ -158,12 +160,15 @@ def test_a_site_of_whose_air_the_images_have_nothing_is_told():
     assert not [text for text in asked.warnings if text.startswith("site")]
 
 
+def doppler_lidar(**keys):
+    found = lm.load_experiment("fringes", **keys)
+    return in_air_of_its_site(found, found.folder).doppler.lidar
+
+
 @pytest.mark.parametrize("altitude, pressure, temperature", STANDARD)
 def test_a_doppler_lidar_is_in_the_air_of_the_site(altitude, pressure, temperature):
     """355 nm: 2.759e-26 cm^2 a molecule (Bodhaine et al. 1999), 8.0e-6 / m / sr at sea level."""
-    there = lm.load_experiment(
-        "fringes", site={"altitude": altitude}, **{"doppler.lidar.wavelength": "355 nm"}
-    ).doppler.lidar
+    there = doppler_lidar(**{"site.altitude": altitude, "doppler.lidar.wavelength": "355 nm"})
     density = pressure / 1013.25 * 288.15 / temperature
     assert there.altitude == altitude
     assert there.extinction == pytest.approx(2.759e-30 * 2.547e25 * density, rel=2e-3)
@@ -171,36 +176,52 @@ def test_a_doppler_lidar_is_in_the_air_of_the_site(altitude, pressure, temperatu
 
 
 def test_what_a_doppler_lidar_says_itself_stays():
-    usual, stated = (
-        lm.load_experiment("fringes", **keys).doppler.lidar
-        for keys in (
-            {},
-            {
-                "site.altitude": 1000,
-                "doppler.lidar.altitude": 3000,
-                "doppler.lidar.aerosol_fraction": 0.5,
-                "doppler.lidar.extinction": "0.2 / km",
-            },
-        )
+    usual = doppler_lidar()
+    stated = doppler_lidar(
+        **{
+            "site.altitude": 1000,
+            "doppler.lidar.altitude": 3000,
+            "doppler.lidar.aerosol_fraction": 0.5,
+            "doppler.lidar.extinction": "0.2 / km",
+        }
     )
     assert usual.altitude == 8500
     assert (stated.altitude, stated.extinction) == (3000, 2e-4)
-    clear = lm.load_experiment("fringes", **{"site.altitude": 3000}).doppler.lidar
+    clear = doppler_lidar(**{"site.altitude": 3000})
     # as much light of aerosol as of molecules
     assert stated.backscatter == pytest.approx(2 * clear.backscatter, rel=1e-9)
 
 
-def test_a_site_that_a_doppler_lidar_cannot_use():
-    with pytest.raises(InputError, match=r"site\.sounding: not allowed without wake"):
-        lm.load_experiment("fringes", **{"site.sounding": "balloon.csv"})
+def test_a_doppler_lidar_is_in_the_air_of_a_sounding(tmp_path):
+    """Density by the gas law; the width of the molecules' line by the root of the temperature."""
+    file = tmp_path / "sounding.csv"
+    file.write_text("altitude (km), pressure (hPa), temperature (K)\n0, 900, 250\n2, 900, 250\n")
+    keys = {"doppler.lidar.wavelength": "355 nm", "doppler.lidar.line_shape": "rayleigh"}
+    keys |= {"doppler.lidar.laser_width": "50 MHz"}
+    standard = doppler_lidar(**keys, **{"site.altitude": 0})
+    cold = doppler_lidar(**keys, **{"site.altitude": "1 km", "site.sounding": str(file)})
+    assert (cold.altitude, *air_of(cold)) == pytest.approx((1000, 90000, 250))
+    density = 900 / 1013.25 * 288.15 / 250
+    assert cold.backscatter / standard.backscatter == pytest.approx(density, rel=1e-6)
+    # a Gaussian of standard deviation s has the characteristic function exp(-2 (pi s t)^2)
+    time = np.array([1e-10])
+    decay = [-np.log(abs(air_line(lidar).characteristic(time)[0])) for lidar in (cold, standard)]
+    assert decay[0] / decay[1] == pytest.approx(250 / 288.15, rel=2e-3)
+    with pytest.raises(InputError, match=r"3000 m .* has 0 to 2000 m"):
+        doppler_lidar(**{"site.altitude": "3 km", "site.sounding": str(file)})
+
+
+def test_a_site_that_a_doppler_lidar_on_the_ground_cannot_use():
     with pytest.raises(InputError, match="site: not allowed"):
         lm.load_experiment("airport", **{"site.altitude": 100})
 
 
 def test_the_air_of_the_site_survives_a_record(tmp_path):
-    found = lm.load_experiment("fringes", **{"site.altitude": 1000})
+    """What a run or a flight computes is of that air, and computed again it is the same."""
+    prepared = prepare(lm.load_experiment("fringes", **{"site.altitude": 1000})).experiment
+    assert prepared.doppler.lidar.altitude == 1000
     from lidar_mi.schema.reading import dump
 
     file = tmp_path / "again.yaml"
-    file.write_text(dump(found))
-    assert lm.load_experiment(file).doppler == found.doppler
+    file.write_text(dump(prepared))
+    assert prepare(lm.load_experiment(file)).experiment.doppler == prepared.doppler

@@ -269,7 +269,8 @@ def test_thin_structure_is_found_as_a_whole(thin, mean):
     assert structure[~there].mean() < 0.05
 
 
-@pytest.mark.parametrize("roll", [pytest.param((2, 0), marks=pytest.mark.slow), (-1, 3)])
+@pytest.mark.slow
+@pytest.mark.parametrize("roll", [(2, 0), (-1, 3)])
 def test_rolled_images_without_noise(roll):
     """Their factorisation failed. Errors: a seam where the image's ends meet is no texture."""
     y, z = axes(64, 48)
