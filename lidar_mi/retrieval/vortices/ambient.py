@@ -35,7 +35,7 @@ _BLOCKS = 150
 # Pixels beyond which the errors by turbulence are those of sums over two by two of them.
 _FEW = 4000
 # Of the strongest patterns of turbulence, for its likelihood.
-_PATTERNS = 96
+_PATTERNS = 64
 # Core radius of a further vortex, m, and radii of the cores of the pair about which none is sought.
 _CORE, _OWN = 2.5, 3.0
 # Of a block's mean with another's: the difference of two Gauss points each, over its side.
@@ -150,7 +150,10 @@ def in_ambient_wind(
     blocks = _blocks(y, z, max(1, math.ceil((y.numel() / _BLOCKS) ** 0.5)))
     stiff = torch.stack([(weight * slope[a] * slope[b]).sum(0) for a, b in _PAIRS])
     stiffness = _matrix(blocks.sums(stiff)) * dt**2
-    coupling = blocks.sums((weight * columns)[:, None] * slope).sum(2).flatten(1) * dt
+    steep = weight * slope
+    # one component at a time: what a cache holds
+    coupling = torch.cat([blocks.sums((columns * part).sum(1)).flatten(1) for part in steep], 1)
+    coupling = coupling * dt
     force = blocks.sums(weight * residual * slope).sum(1).flatten() * dt
     flat = columns.flatten(1)
     weighted = flat * weight.flatten()
@@ -185,8 +188,9 @@ def in_ambient_wind(
     eddies = -remaining @ (force + coupling.T @ step)
 
     shaped = absorbed.view(len(columns), 2, *blocks.shape)
-    spread_out = blocks.spread(shaped.to(jacobian)) * dt
-    projected = columns + (spread_out[:, :, None] * slope).sum(1)
+    projected = columns
+    for part, along in zip(shaped.to(jacobian).unbind(1), dt * slope, strict=True):
+        projected = torch.addcmul(projected, blocks.spread(part)[:, None], along)
     air = AmbientWind(step[-4:], centre, eddies.view(2, *blocks.shape), blocks.z, blocks.y)
     estimated = blocks.spread(air.eddies.to(jacobian)) * dt
     remains = residual + torch.tensordot(step.to(jacobian), columns, 1)
@@ -195,8 +199,8 @@ def in_ambient_wind(
         stored = blocks.spread(known.eddies.to(jacobian)) * dt
         remains = remains - (stored[:, None] * slope).sum(0)
     inverse = _solve(reduced, torch.eye(len(reduced), dtype=torch.float64, device=reduced.device))
-    response = ((weight * projected)[:, None] * slope).sum(2) * dt
-    response = torch.tensordot(inverse[:10].to(response), response, 1)
+    of_pair = torch.tensordot(dt * inverse[:10].to(projected), projected, 1)
+    response = torch.stack([(of_pair * part).sum(1) for part in steep], 1)
     by_prior = (inverse * prior) @ inverse
     here_by_eddies, ahead_by_eddies = _spread(response, found.parameters, y, z, variances)
     if misfit.residual.ndim == 2:
