@@ -50,8 +50,10 @@ def check(
     for title, rows in found:
         print_rows(title, rows)
     warned = sum(len(rows) for title, rows in found if ": warnings" in title)
-    warnings = f", {warned} warning{'s' * (warned > 1)} above" if warned else ""
-    output.print(f"all checks passed{warnings}", highlight=False)
+    verdict = "all checks passed"
+    if warned:
+        verdict = f"it can be run; {warned} warning{'s' * (warned > 1)} above"
+    output.print(verdict, highlight=False)
 
 
 def _sections(asked: "Experiment", notice: Notice, forecast: bool) -> Iterator["Section"]:

@@ -67,12 +67,16 @@ def end_without_result(reason: str, found: "xr.DataArray") -> NoReturn:
     found : xr.DataArray
         Flags with the CF attributes ``flag_masks`` and ``flag_meanings``; none is 0.
     """
+    _fail(f"{reason} (flags: {flags_in_words(found)})", NOTHING_FOUND)
+
+
+def flags_in_words(found: "xr.DataArray") -> str:
+    """How many vectors have each flag, from the CF attributes; empty: all are valid."""
     masks, names = found.attrs["flag_masks"], found.attrs["flag_meanings"].split()
     counts = (
         (name, int((found & int(mask) != 0).sum())) for name, mask in zip(names, masks, strict=True)
     )
-    said = ", ".join(f"{name} {count}" for name, count in counts if count)
-    _fail(f"{reason} (flags: {said})", NOTHING_FOUND)
+    return ", ".join(f"{name} {count}" for name, count in counts if count)
 
 
 def _message(error: BaseException) -> str | None:

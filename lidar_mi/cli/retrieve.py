@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from lidar_mi.cli.exit_codes import end_without_result
+from lidar_mi.cli.exit_codes import end_without_result, flags_in_words
 from lidar_mi.cli.options import Overwrite, complete_method
 from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.errors import InputError
@@ -276,6 +276,8 @@ def _print_statistics(wind: "xr.Dataset") -> None:
     title = f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid"
     unit = _speed(wind)
     print_table(Table(title, rows, ("valid vectors", f"v, {unit}", f"w, {unit}")))
+    if flags := flags_in_words(wind["flag"]):
+        output.print(f"flags    {flags}", soft_wrap=True)
 
 
 def _speed(wind: "xr.Dataset") -> str:

@@ -78,6 +78,7 @@ class Flights(Tabular):
         rows = [("experiment", self.experiment.name)]
         if self.folder is not None:
             rows.append(("folder", str(self.folder)))
+        rows += [("answer", text) for text in self.answer]
         rows += [("warning", text) for text in self.warnings]
         return [
             Table("flight", rows),

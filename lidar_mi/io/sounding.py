@@ -23,8 +23,9 @@ def read_sounding(path: str | Path) -> Sounding:
     """A sounding from a table with the columns altitude, pressure and temperature.
 
     A CSV file has them in its head, with units: "altitude (m), pressure (hPa), temperature (K)";
-    a NetCDF file as variables with the attribute ``units``. Other columns, such as humidity, are
-    ignored: water vapour changes the scattering of air by less than 1 %.
+    a NetCDF file as variables with the attribute ``units``. A pressure must have one. Other
+    columns, such as humidity, are ignored: water vapour changes the scattering of air by less than
+    1 %.
 
     Raises
     ------

@@ -16,6 +16,9 @@ from lidar_mi.units import conversion
 TIME = "t"
 """Name of the time, s."""
 
+_ALLOWED = {"rad": "deg or rad", "Pa": "Pa or hPa", "K": "K (that of 0 degrees Celsius: 273.15)"}
+"""Units of a column by its SI unit."""
+
 _HEAD = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?\s*")
 
 
@@ -26,7 +29,7 @@ def read_timed_table(
 
     A CSV file has a head with names and units, "t (s), roll (deg)", and lines that begin with #
     are comments; a NetCDF file has variables of one dimension with the attribute ``units``. Without
-    a unit, times and lengths are SI; angles must have one.
+    a unit, times and lengths are SI; angles and pressures must have one.
 
     Parameters
     ----------
@@ -78,10 +81,9 @@ def read_timed_table(
 
 
 def _factor(unit: str | None, target: str, name: str, path: Path) -> float:
-    angle = target == "rad"
-    allowed = f"expected {'deg or rad' if angle else f'{target} or a unit that converts to it'}"
+    allowed = f"expected {_ALLOWED.get(target, f'{target} or a unit that converts to it')}"
     if unit is None:
-        if angle:
+        if target in ("rad", "Pa"):
             raise InputError(f"{path}: {name}: without a unit; {allowed}")
         return 1.0
     try:

@@ -187,7 +187,7 @@ def test_shells_complete_commands_and_experiments(here, monkeypatch):
     assert options.complete_scene("puff") == ["puff", "puff_mine.xml"]
     assert options.complete_contents("so") == ["soot"] and "0.exr" in options.complete_contents("")
     assert options.complete_method("v") == ["variational", "vortex_fit"]
-    assert complete_format("") == ["vtk", "csv", "mat", "control"]
+    assert complete_format("") == ["vtk", "csv", "mat", "openfast", "control"]
 
 
 @pytest.fixture

@@ -334,8 +334,8 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
     return [
         f"Wake and ailerons together have {three(ours)} times the rolling moment of the wake "
         f"with the lidar, and {three(perfect)} times with perfect preview (rms). With perfect "
-        "preview the cause is the limits of the ailerons and the plan, which minimises the roll "
-        "angle and not the moment. Only what exceeds this is due to errors of the lidar."
+        "preview the cause is the limits of the ailerons and the controller, which may minimise "
+        "the roll angle and not the moment. Only what exceeds this is due to errors of the lidar."
     ]
 
 

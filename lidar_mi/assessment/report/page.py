@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from lidar_mi.assessment.digits import percent
+from lidar_mi.assessment.digits import percent, whole_percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
@@ -242,6 +242,9 @@ def simulated(
             f"scattering by {air.aerosol or air.table or air.phase.replace('_', ' ')}, orders up "
             f"to {render.max_order}, {samples_of(experiment, metrics)}, {render.variant}"
         )
+        molecules = metrics.get("backscatter.fraction.molecules", 0.0)
+        if molecules:
+            light += f"; {whole_percent(molecules)} of the backscatter by molecules of the air"
         rows.append(("light", light))
         chosen = experiment.volume or experiment.retrieval
         methods = ", ".join(METHOD_NAMES[name] for name in chosen.methods)
@@ -254,6 +257,8 @@ def simulated(
             f"{shown(other.wavelength, 'nm')}, {shown(other.pulse_energy, 'mJ')}, "
             f"{other.range_bin:g} m at {other.range:g} m, in air of {other.altitude:g} m altitude"
         )
+        if other.pressure is not None and other.temperature is not None:
+            beam += f" ({other.pressure / 100:.4g} hPa, {other.temperature:.4g} K)"
         rows.append(("Doppler lidar", beam))
     if experiment.sensor:
         lines = experiment.sensor.directions

@@ -29,6 +29,7 @@ from lidar_mi.experiment.stages.light_budget import (
 from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
 from lidar_mi.experiment.stages.sensor_cost import lidar_costs
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
+from lidar_mi.experiment.truth.clear_air import air_in_words
 from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.experiment.truth.in_time import values_of_states
 from lidar_mi.instrument.doppler import DopplerLidar, photons
@@ -296,6 +297,7 @@ def _doppler(doppler: Doppler) -> Section:
         ("beam divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
         ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
         ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
+        ("air", air_in_words(lidar)),
         ("photons of a pulse", f"{photons(lidar):.3g}"),
         ("methods", ", ".join(doppler.retrieval.methods)),
     ]

@@ -156,18 +156,19 @@ def _of_the_molecules(
     clear_air: ClearAir,
     site: Site,
 ) -> list[str]:
-    """Molecules that a file does not ask for, as none of before they were, or leaves out."""
+    """Molecules that a file does not ask for, neither by itself nor by a site, or leaves out."""
     if mapping.molecules == 0 and site.model_fields_set:
         return [
             "site: the images have none of its air, as wake.extinction.molecules is 0; expected "
             "auto, by which molecules scatter"
         ]
-    if "molecules" in mapping.model_fields_set or not clear_air.extinction:
+    asked = "molecules" in mapping.model_fields_set or site.model_fields_set
+    if asked or not clear_air.extinction:
         return []
     fractions = backscatter_fractions(mapping, truth, air, clear_air)
     return [
-        "wake.extinction.molecules: not set, which is auto and was 0 up to version 1.0.0rc1: "
-        f"backscatter by {fractions_in_words(fractions, scattering)} "
+        "wake.extinction.molecules: not set, so those of the air (auto): backscatter by "
+        f"{fractions_in_words(fractions, scattering)} "
         f"({clear_air.origin}); expected auto or 0"
     ]
 

@@ -45,7 +45,8 @@ def clear_air(
     Raises
     ------
     InputError
-        A sounding that cannot be used, or that does not reach the site's altitude; a wavelength at
+        A sounding that cannot be used, that does not reach the site's altitude, or whose pressure
+        there is below half or above twice that of the standard atmosphere; a wavelength at
         which the refractive index of air is not known.
     """
     stated = wake_extinction.molecules
@@ -146,5 +147,24 @@ def _air_at(altitude: float, site: Site, search_path: Path) -> tuple[float, floa
         )
     # pressure falls exponentially between levels
     logarithm = np.interp(altitude, sounding.altitude, np.log(sounding.pressure))
-    temperature = np.interp(altitude, sounding.altitude, sounding.temperature)
-    return float(np.exp(logarithm)), float(temperature)
+    pressure = float(np.exp(logarithm))
+    temperature = float(np.interp(altitude, sounding.altitude, sounding.temperature))
+    # half to twice: no weather, but a wrong unit or another planet
+    usual = standard_atmosphere(altitude).pressure
+    for name, value, least, most in (
+        ("pressure", pressure / 100, usual / 200, usual / 50),
+        ("temperature", temperature, 150.0, 350.0),
+    ):
+        if not least <= value <= most:
+            unit = "hPa" if name == "pressure" else "K"
+            raise InputError(
+                f"{file}: {name}: {value:.4g} {unit} at {altitude:g} m is not allowed; expected "
+                f"{least:.4g} to {most:.4g} {unit}"
+            )
+    return pressure, temperature
+
+
+def air_in_words(lidar: DopplerLidar) -> str:
+    """Altitude, pressure and temperature of a Doppler lidar's air."""
+    pressure, temperature = air_of(lidar)
+    return f"at {lidar.altitude:g} m: {pressure / 100:.4g} hPa, {temperature:.4g} K"

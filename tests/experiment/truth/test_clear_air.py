@@ -84,7 +84,16 @@ def test_sounding_is_interpolated(tmp_path):
             "altitude (m), pressure (hPa), temperature (K)\n9, 1, 200\n0, 1, 200\n",
             "altitude: 0 m in row 2 after 9 m",
         ),
-        ("altitude (m), pressure (hPa), temperature (K)\n0, 1, 0\n9, 1, 2\n", "temperature: 0 K"),
+        ("altitude, pressure, temperature\n0, 1013, 288\n9, 1012, 288\n", "pressure: without a"),
+        (
+            "altitude (m), pressure (Pa), temperature (K)\n0, 1013, 288\n9, 1012, 288\n",
+            r"pressure: 10.13 hPa at 0 m is not allowed; expected 506.6 to 2026 hPa",
+        ),
+        ("altitude (m), pressure (hPa), temperature (degC)\n0, 1013, 15\n9, 1012, 15\n", "273.15"),
+        (
+            "altitude (m), pressure (hPa), temperature (K)\n0, 1e3, 0\n9, 1e3, 2\n",
+            "temperature: 0 K",
+        ),
     ],
 )
 def test_soundings_that_cannot_be_used(tmp_path, text, message):
