@@ -27,6 +27,7 @@ defects              winds of images with defects, by families that judge; only 
 resolution           winds from fewer, larger pixels, against their bound; only by name
 line_vortices        vortices from slices of a Doppler lidar: errors, coverage, false alarms; only
                      by name
+pairs_in_air         tracks of pairs in families of air, half of which only judge; only by name
 """
 
 import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here imports drjit
@@ -49,7 +50,15 @@ GROUPS = (
     "loads",
     "coverage",
 )
-OPEN = ("common_numbers", "instrument", "flows", "defects", "resolution", "line_vortices")
+OPEN = (
+    "common_numbers",
+    "instrument",
+    "flows",
+    "defects",
+    "resolution",
+    "line_vortices",
+    "pairs_in_air",
+)
 """Run only by name: some of their rows fail."""
 TOLD = ("coverage", "flows", "defects")
 """Groups whose texts hold their tables."""

@@ -83,7 +83,7 @@ class JSBSimAircraft:
         self._climb = path.climb_angle
         check_aeroplane(aircraft.model, path)
         self._fdm = trimmed(aircraft.model, path, FLAPS)
-        self.density = self._fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
+        self.density = air_density(self._fdm)
         self.strips = strips_of(self._fdm, aircraft.lift_slope)
         # derivatives take aircraft of their own, with the flaps of this one
         again = partial(trimmed, aircraft.model, path, [self._fdm["fcs/flap-cmd-norm"]])
@@ -228,6 +228,11 @@ def state_in_path(
 def neu_place(fdm: "FGFDMExec") -> np.ndarray:
     """North, east, up, m."""
     return foot * np.array([fdm[f"position/from-start-neu-{axis}-ft"] for axis in "neu"])
+
+
+def air_density(fdm: "FGFDMExec") -> float:
+    """Of the air at the aircraft, kg/m^3."""
+    return fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
 
 
 def _wing(fdm: "FGFDMExec") -> tuple[float, float, np.ndarray]:

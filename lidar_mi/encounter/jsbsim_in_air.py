@@ -3,9 +3,8 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.constants import foot, slug
 
-from lidar_mi.aircraft.jsbsim_aircraft import neu_place, state_in_path, strips_of
+from lidar_mi.aircraft.jsbsim_aircraft import air_density, neu_place, state_in_path, strips_of
 from lidar_mi.aircraft.jsbsim_derivatives import set_loads
 from lidar_mi.aircraft.jsbsim_trim import loaded
 from lidar_mi.aircraft.state import AircraftState, loads_in_wind
@@ -88,7 +87,6 @@ class JSBSimInAir:
         self.state = state_in_path(fdm, np.array(origin), self._climb, fdm.get_sim_time() - begun)
         if self.state is None:
             return False
-        density = fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
-        loads = loads_in_wind(self._strips, self.state, self._wind, density)
+        loads = loads_in_wind(self._strips, self.state, self._wind, air_density(fdm))
         set_loads(fdm, loads.force, loads.moment)
         return bool(fdm.run())

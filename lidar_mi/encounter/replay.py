@@ -96,6 +96,8 @@ def _pair(one: xr.Dataset) -> VortexPairFit | None:
         one.attrs["profile"],
         *(np.nan,) * 4,
         reasons=tuple(reasons.split("; ")) if reasons else (),
+        shared=one["estimate_shared"].values,
+        shared_length=float(one["estimate_shared_length"]),
     )
 
 

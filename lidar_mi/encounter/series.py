@@ -26,7 +26,14 @@ QUANTITIES = tuple(
 
 SOURCES = ("estimate", "track", "truth")
 
-ESTIMATED = ("estimated", "estimate_parameters", "estimate_covariance", "estimate_reasons")
+ESTIMATED = (
+    "estimated",
+    "estimate_parameters",
+    "estimate_covariance",
+    "estimate_shared",
+    "estimate_shared_length",
+    "estimate_reasons",
+)
 """Of the track's data set: the fits as they were delivered, from which a flight is replayed."""
 
 MEASURED = ("error_v_los", "error_u", "error_v", "error_w", "vectors")
@@ -167,9 +174,13 @@ def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
     there = [pair is not None for pair in pairs]
     parameters = np.full((len(pairs), count), np.nan)
     covariance = np.full((len(pairs), count, count), np.nan)
+    shared, lengths = np.zeros_like(covariance), np.zeros(len(pairs))
     for number, pair in enumerate(pairs):
         if pair is not None:
             parameters[number], covariance[number] = pair.parameters, pair.covariance
+            lengths[number] = pair.shared_length
+            if pair.shared is not None:
+                shared[number] = pair.shared
     reasons = ["; ".join(pair.reasons) if pair is not None else "" for pair in pairs]
     about = {"long_name": "m2 s-1, log of m, m, m of port and starboard; mean v and w in m s-1"}
     found = xr.Dataset(
@@ -177,6 +188,12 @@ def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
             "estimated": ("slab", np.array(there, float), {"units": "1", "long_name": "1: a fit"}),
             "estimate_parameters": (("slab", "parameter"), parameters, about),
             "estimate_covariance": (("slab", "parameter", "parameter_2"), covariance, about),
+            "estimate_shared": (("slab", "parameter", "parameter_2"), shared, about),
+            "estimate_shared_length": (
+                "slab",
+                lengths,
+                {"units": "m", "long_name": "over which errors by the ambient wind are shared"},
+            ),
             "estimate_reasons": ("slab", np.array(reasons, dtype=object)),
         },
         {"parameter": list(PARAMETERS), "parameter_2": list(PARAMETERS)},

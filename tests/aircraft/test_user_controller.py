@@ -53,6 +53,10 @@ def fly(controller):
             lambda aircraft: lambda preview, state: Commands(aileron=float("nan")),
             "Commands.aileron: nan (float) at 0.00 s of flight; expected a finite number, rad",
         ),
+        (
+            lambda aircraft: lambda preview, state: Commands(aileron=-20.0),
+            "Commands.aileron: -20 rad at 0.00 s of flight is not allowed; expected at most 1.57",
+        ),
     ],
 )
 def test_faults_are_one_line_that_names_the_controller(controller, message):

@@ -103,13 +103,15 @@ def _sensor(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     if not metrics["sensor.vectors"]:
         return f"{head}: no valid wind vector."
     far = far_from_cores(metrics, "sensor.", "rmse_")
-    errors = _values(metrics, f"sensor.{far}rmse_", "uvw")
-    true = _values(metrics, f"sensor.{far}rms_", "uvw")
+    # an error of what is not there says nothing
+    components = "vw" if metrics.get(f"sensor.{far}rms_u") == 0 else "uvw"
+    errors = _values(metrics, f"sensor.{far}rmse_", components)
+    true = _values(metrics, f"sensor.{far}rms_", components)
     of_true = f" (true wind {true})" if true else ""
     valid, spanned = metrics["sensor.valid_fraction"], metrics.get("sensor.spanned_fraction", 1.0)
     between = " between the lines of sight" if spanned < 1 else ""
     return (
-        f"{head}: rms errors of u, v, w {errors} m/s{_beyond(far)}{of_true}; "
+        f"{head}: rms errors of {', '.join(components)} {errors} m/s{_beyond(far)}{of_true}; "
         f"{whole_percent(valid / spanned)} of the vectors{between} are valid."
     )
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from scipy.stats import chi2 as chi_square
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices.covariance import far_from_minimum
@@ -23,6 +24,9 @@ _MATCH = 0.5
 # 2000, Phys. Fluids 12, 245-248), so that two circular ones are no model of them; and smoke that
 # hides a vortex, as it is round like it, looks as if the core were wide.
 _WIDEST = 0.3
+# Chi-square of one more vortex that a pair in turbulence exceeds by chance in one of 1000 slabs, at
+# 150 places.
+_FURTHER = float(chi_square.isf(1e-3 / 150, 1))
 
 
 def step_limits(
@@ -73,6 +77,7 @@ def checked_fit(
     y: np.ndarray,
     turned: np.ndarray,
     inclined: np.ndarray | None = None,
+    further: float = 0.0,
 ) -> VortexPairFit:
     """The fit, with the reasons for which it is not accepted."""
     theta = found.parameters[:10].cpu().numpy()
@@ -101,6 +106,11 @@ def checked_fit(
                 f"{side} core radius {radius:.1f} m; expected at most {_WIDEST:g} of the "
                 f"separation of {separation:.1f} m"
             )
+    if not further <= _FURTHER:
+        reasons.append(
+            f"there are more than two vortices (chi-square of one more {further:.0f}; expected at "
+            f"most {_FURTHER:.0f})"
+        )
     return VortexPairFit(
         theta,
         covariance,

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from lidar_mi.retrieval.images.windows import averaged
+from lidar_mi.retrieval.vortices.ambient import ALONG, Ambient
 from lidar_mi.retrieval.vortices.model_error import (
     ModelError,
     Response,
@@ -67,9 +68,15 @@ def model_error_of(
 
 
 def parameter_covariance(
-    found: Solution, residual_error: ModelError, departure: ModelError, excess: float
+    found: Solution,
+    residual_error: ModelError,
+    departure: ModelError,
+    excess: float,
+    ambient: torch.Tensor,
 ) -> np.ndarray:
     """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and by the flow's departure.
+
+    And that by the ambient wind (10, 10).
 
     The part by noise is multiplied by `excess`: for H of noisy slopes, 1 / `curvature`^2. The part
     of the departure in the residuals is `residual_error`.
@@ -78,7 +85,7 @@ def parameter_covariance(
     spread = spread + spread_of(_responses(found), departure).double()
     # the sandwich: its errors hold although the weights are not the inverse covariance
     inverse = _inverse(found)
-    covariance = (inverse @ spread @ inverse)[:10, :10]
+    covariance = (inverse @ spread @ inverse)[:10, :10] + ambient
     attenuation = _attenuation(found)
     # a bias of unknown size: fully correlated between the parameters
     covariance = covariance + torch.outer(attenuation, attenuation)
@@ -86,6 +93,16 @@ def parameter_covariance(
         remaining = _remaining_step(found)
         covariance = covariance + torch.outer(remaining, remaining)
     return covariance.cpu().numpy()
+
+
+def shared_error(ambient: Ambient) -> tuple[np.ndarray, float]:
+    """Covariance (10, 10) of the parameters' error by the ambient wind, and its length along x, m.
+
+    The length is that of an exponential with the mean of the parameters' correlations at `ALONG`.
+    """
+    here, ahead = (part.cpu().numpy() for part in (ambient.covariance, ambient.ahead))
+    correlation = float(np.clip((np.diagonal(ahead) / np.diagonal(here)).mean(), 1e-6, 1 - 1e-6))
+    return here, -ALONG / np.log(correlation)
 
 
 def _responses(found: Solution) -> torch.Tensor:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lidar_mi.retrieval.vortices.ambient import Ambient, AmbientWind, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import model_error_of
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images, Path, View
 from lidar_mi.retrieval.vortices.model_error import ModelError
@@ -37,7 +38,9 @@ _CLOSE, _STEPS = 0.05, 4
 # Largest error of the last step by curvature, in standard errors of all parameters together,
 # without the part that is corrected near the cores; the unfiltered images are warped at most so
 # often.
-_CURVATURE_ERROR, _ROUNDS = 0.1, 4
+_CURVATURE_ERROR, _ROUNDS = 0.1, 6
+# Change of the ambient wind's displacements (px, rms) for which the images are warped again.
+_AMBIENT = 0.1
 # Rms normalised difference of fit and start beyond which one of them is wrong.
 _REJECTED = 4.0
 
@@ -47,9 +50,9 @@ Limits = Callable[[torch.Tensor, torch.Tensor], bool]
 
 
 class NearbyFit(NamedTuple):
-    """A solution, its images, their misfit without the whitening filter, the model error."""
+    """A solution in its ambient wind, its images, their unwhitened misfit, the model error."""
 
-    solution: Solution
+    ambient: Ambient
     images: Images
     unwhitened: Misfit
     error: ModelError
@@ -93,6 +96,7 @@ def start_fit(start: VortexPairFit, make: Builder, limits: Limits) -> StartedFit
     theta = theta.to(make.pair.device)
     if not limits(theta, torch.zeros_like(theta)):
         return None
+    make = replace(make, ambient=start.ambient)
     white = make(*_WHITE)
     to_first, to_second = white.paths(theta)
     first, uncertain = white.view(0, to_first), _displacement_error(start, make)
@@ -171,7 +175,10 @@ def fit_near(
         if plain is None:
             return None
         # where air changes, the weights of the estimates below lead elsewhere
-        if not close and _curvature_error(plain, theta, misfit, make) > _CURVATURE_ERROR:
+        if not close and (
+            _curvature_error(plain.normal, plain.parameters - theta, misfit, make)
+            > _CURVATURE_ERROR
+        ):
             theta = plain.parameters
             continue
         close = True
@@ -191,19 +198,35 @@ def fit_near(
             if found is None:
                 return None
             solution = found
-        if _curvature_error(solution, theta, misfit, make) < _CURVATURE_ERROR:
-            error = model_error_of(solution, lags, changes=True)
-            remaining = residual_after(misfit, solution.parameters - theta)
-            return NearbyFit(solution, images, misfit._replace(residual=remaining), error)
-        theta, variance = solution.parameters, moves
+        ambient = in_ambient_wind(solution, white.y, white.z, make.dt, white.ambient)
+        reached = ambient.solution.parameters[: len(theta)]
+        step = reached - theta
+        if not limits(theta, step):
+            return None
+        change = _change(white, ambient.wind) * make.dt
+        far = float(change.square().mean().sqrt()) / min(make.spacing)
+        curved = _curvature_error(solution.normal, step, misfit, make)
+        if far < _AMBIENT and curved < _CURVATURE_ERROR:
+            error = model_error_of(ambient.solution, lags, changes=True)
+            remaining = residual_after(misfit, step) + (misfit.slope * change).sum(0)
+            return NearbyFit(ambient, images, misfit._replace(residual=remaining), error)
+        white = replace(white, ambient=ambient.wind)
+        theta, variance = reached, moves
     return None
 
 
-def _curvature_error(found: Solution, theta: torch.Tensor, misfit: Misfit, make: Builder) -> float:
-    """Standard errors that a linear step from theta to a solution may be off by curvature."""
-    step = found.parameters - theta
+def _change(images: Images, wind: AmbientWind) -> torch.Tensor:
+    """Change (2, z, y) of the ambient wind at the pixels, m/s."""
+    change = wind.at(images.y, images.z)
+    return change if images.ambient is None else change - images.ambient.at(images.y, images.z)
+
+
+def _curvature_error(
+    normal: torch.Tensor, step: torch.Tensor, misfit: Misfit, make: Builder
+) -> float:
+    """Standard errors that a linear step may be off by curvature."""
     far = _displaced(step, misfit, make) / _CURVED
-    return float(step @ found.normal @ step) ** 0.5 * far
+    return float(step @ normal @ step) ** 0.5 * far
 
 
 def _near(limits: Limits, theta: torch.Tensor, found: Solution | None) -> Solution | None:
@@ -237,7 +260,7 @@ def _displacement_error(start: VortexPairFit, make: Builder) -> float:
     """Standard error, px, of the start's displacements over the images, where it is large."""
     places = [np.linspace(axis[0], axis[-1], _PROBES) for axis in (make.y, make.z)]
     # the air's departure from the model is no error of the start
-    _, spread = replace(start, model_error=0.0).wind_and_covariance(
+    _, spread = replace(start, model_error=0.0, ambient=None).wind_and_covariance(
         places[0][None, :], places[1][:, None]
     )
     px = make.dt / min(make.spacing)

@@ -31,11 +31,13 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
+from lidar_mi.retrieval.vortices.ambient import Ambient, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import (
     change_by_flow,
     curvature,
     model_error_of,
     parameter_covariance,
+    shared_error,
 )
 from lidar_mi.retrieval.vortices.detection import detect
 from lidar_mi.retrieval.vortices.from_start import (
@@ -442,19 +444,21 @@ def _iterated(found: Solution, make: Builder, limits: Limits) -> VortexPairFit:
         if not images.passed > 0:
             return no_fit(make.profile, "the images have no structure in common")
         best = fit(images, best.parameters, limits, error.variance, 10, TOLERANCE)
-    error = model_error_of(best, _NOISE_LAGS, changes=True)
-    return _checked(make, best, images, white(best.parameters), error)
+    ambient = in_ambient_wind(best, white.y, white.z, make.dt)
+    error = model_error_of(ambient.solution, _NOISE_LAGS, changes=True)
+    return _checked(make, ambient, images, white(best.parameters), error)
 
 
 def _checked(
-    make: Builder, best: Solution, images: Images, misfit: Misfit, error: ModelError
+    make: Builder, ambient: Ambient, images: Images, misfit: Misfit, error: ModelError
 ) -> VortexPairFit:
     """The pair of a solution in images, with its errors; `misfit` is that without whitening."""
+    best = ambient.solution
     # half of the slopes of noise and change are in those of the mean: the misfit curves less
     q = curvature(best, make.spacing)
     # parameters follow a departure: they err by all of it, not by what they have left
     departure = model_error_of(best, _NOISE_LAGS, changes=True, before=error)
-    covariance = parameter_covariance(best, error, departure, 1 / q**2)
+    covariance = parameter_covariance(best, error, departure, 1 / q**2, ambient.covariance)
     valid = misfit.valid
     # image 1 at its places, and image 2 at its own: the residual with image 1 times its gain
     first = -misfit.jacobian[10]
@@ -463,7 +467,7 @@ def _checked(
     match = float(torch.corrcoef(torch.stack([first[valid], second[valid]]))[0, 1])
     known = make.noise > 0
     chi2 = float((misfit.residual.square() / misfit.scatter)[valid].mean()) if known else np.nan
-    return checked_fit(
+    pair = checked_fit(
         best,
         covariance,
         make.profile,
@@ -476,7 +480,10 @@ def _checked(
         # a roll rate of 1 rad/s that is not known moves the images by this
         change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
         None if make.telescope is None else _change_by_slopes(make, make.telescope, best, images),
+        ambient.further,
     )
+    shared, length = shared_error(ambient)
+    return replace(pair, ambient=ambient.wind, shared=shared, shared_length=length)
 
 
 def _change_by_slopes(

@@ -25,6 +25,7 @@ from lidar_mi.retrieval.images.spline import (
     mismatch,
     transform_sizes,
 )
+from lidar_mi.retrieval.vortices.ambient import AmbientWind
 from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity, wind
 from lidar_mi.retrieval.vortices.pixel_times import ImagedAir, PixelTimes, imaged_air
 from lidar_mi.retrieval.vortices.robust_fit import Misfit
@@ -111,6 +112,7 @@ class Images:
     frozen: bool
     times: PixelTimes | None = None
     whitening: Spline | None = None
+    ambient: AmbientWind | None = None
 
     @cached_property
     def linear(self) -> torch.Tensor:
@@ -182,14 +184,30 @@ class Images:
             time = self.y.new_tensor([-self.dt / 2, self.dt / 2])[:, None, None]
             began = wind(steady, self.y, self.z, self.profile)[:, None]
             middle, place = advected(steady, self.y[None], self.z[None], time, self.profile, began)
-            place = place + moving[:, None, None, None] * time
+            place = place + (moving[:, None, None, None] + self._ambient[:, None]) * time
             return [
                 Path(steady, middle[:, k], self._pixels(place[:, k]), time[k], None) for k in (0, 1)
             ]
         both = [
             imaged_air(self.times, k, steady, moving, self.y, self.z, self.profile) for k in (0, 1)
         ]
-        return [Path(steady, air.middle, self._pixels(air.place), air.time, air) for air in both]
+        return [
+            Path(
+                steady,
+                air.middle,
+                self._pixels(air.place + self._ambient * air.time),
+                air.time,
+                air,
+            )
+            for air in both
+        ]
+
+    @cached_property
+    def _ambient(self) -> torch.Tensor:
+        """Ambient wind (2, z, y) at the places, taken to be uniform over a path."""
+        if self.ambient is None:
+            return self.y.new_zeros(2, 1, 1)
+        return self.ambient.at(self.y, self.z)
 
     def _pixels(self, place: torch.Tensor) -> torch.Tensor:
         """Row and column (2, ...) of places (2, ...) in m."""
@@ -321,6 +339,8 @@ class Builder:
         None: -dt / 2 and dt / 2.
     of_first : Splines, optional
         Of the first image, computed without the second one: its filter is that of both.
+    ambient : AmbientWind, optional
+        In addition to the wind of the pair.
     """
 
     pair: torch.Tensor
@@ -336,6 +356,7 @@ class Builder:
     telescope: tuple[float, float, float] | None = None
     times: PixelTimes | None = None
     of_first: Splines | None = None
+    ambient: AmbientWind | None = None
 
     @property
     def spacing(self) -> tuple[float, float]:
@@ -425,6 +446,7 @@ class Builder:
             self.profile,
             self.frozen,
             self.times,
+            ambient=self.ambient,
         )
 
     def with_change(

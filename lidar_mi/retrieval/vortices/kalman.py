@@ -1,4 +1,4 @@
-"""Kalman filter and smoother of a state of which the first elements are measured.
+"""Kalman filter and smoother of a state that linear measurements observe.
 
 Covariances are updated in Joseph's form, a sum of positive semidefinite terms: they stay symmetric
 and positive whatever the gain and the rounding (Bar-Shalom, Li, Kirubarajan 2001, Estimation with
@@ -11,36 +11,44 @@ from scipy.linalg import cho_factor, cho_solve
 
 
 def updated(
-    state: np.ndarray, covariance: np.ndarray, measured: np.ndarray, error: np.ndarray
+    state: np.ndarray,
+    covariance: np.ndarray,
+    measured: np.ndarray,
+    error: np.ndarray,
+    observed: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """State and covariance after a measurement of the first elements of the state.
+    """State and covariance after a measurement.
 
     Parameters
     ----------
     state, covariance : ndarray, shapes (n,) and (n, n)
         Before.
-    measured, error : ndarray, shapes (m,) and (m, m), m <= n
+    measured, error : ndarray, shapes (m,) and (m, m)
         The measurement and its covariance; its error is independent of that of the state.
+    observed : ndarray, shape (m, n)
+        Derivatives H of the measurement by the state.
     """
-    m = len(measured)
-    # K = P H^T S^-1 with H = [1 0]
-    gain = cho_solve(cho_factor(covariance[:m, :m] + error), covariance[:m]).T
-    remains = np.eye(len(state))
-    remains[:, :m] -= gain
+    cross = observed @ covariance
+    # K = P H^T S^-1
+    gain = cho_solve(cho_factor(cross @ observed.T + error), cross).T
+    remains = np.eye(len(state)) - gain @ observed
     after = remains @ covariance @ remains.T + gain @ error @ gain.T
-    return state + gain @ (measured - state[:m]), (after + after.T) / 2
+    return state + gain @ (measured - observed @ state), (after + after.T) / 2
 
 
 def innovation(
-    state: np.ndarray, covariance: np.ndarray, measured: np.ndarray, error: np.ndarray
+    state: np.ndarray,
+    covariance: np.ndarray,
+    measured: np.ndarray,
+    error: np.ndarray,
+    observed: np.ndarray,
 ) -> float:
     """Normalised square of a measurement's departure from its prediction: chi-square of (m,).
 
     Arguments as of `updated`.
     """
-    m = len(measured)
-    departure = measured - state[:m]
-    factor = cho_factor(covariance[:m, :m] + error)
+    departure = measured - observed @ state
+    factor = cho_factor(observed @ covariance @ observed.T + error)
     return float(departure @ cho_solve(factor, departure))
 
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from lidar_mi.atmosphere.vortices.vortex import Vortex
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.quantity import Quantity
+from lidar_mi.retrieval.vortices.ambient import AmbientWind
 from lidar_mi.retrieval.vortices.model import (
     Profile,
     angular_velocity,
@@ -45,7 +46,8 @@ class VortexPairFit(Tabular):
         Of image 1 and image 2, each advected to mid-time by the fit; of fits to vectors the
         fraction of their variance that is explained.
     model_error : float
-        Rms departure of each wind component from the model, m s^-1, estimated from the residuals.
+        Rms departure of each wind component from the pair in its ambient wind, m s^-1, estimated
+        from the residuals.
     model_error_length : float
         Its correlation length, m.
     success : bool
@@ -64,6 +66,12 @@ class VortexPairFit(Tabular):
         if all motion of the air along x were visible in oblique beams; see `with_slopes`.
     slopes, slope_covariance : ndarray, shapes (2,) and (2, 2), optional
         Of the pair's axis, dy/dx and dz/dx, where more than one slab determines them.
+    ambient : AmbientWind, optional
+        Gradient and turbulence of the air around the pair.
+    shared : ndarray, shape (10, 10), optional
+        The part of the covariance that is by the ambient wind, which slabs nearby share.
+    shared_length : float
+        Over which along x its correlation falls to 1/e, m; 0: slabs share nothing.
     """
 
     parameters: np.ndarray
@@ -80,6 +88,9 @@ class VortexPairFit(Tabular):
     inclined: np.ndarray | None = None
     slopes: np.ndarray | None = None
     slope_covariance: np.ndarray | None = None
+    ambient: AmbientWind | None = None
+    shared: np.ndarray | None = None
+    shared_length: float = 0.0
 
     @property
     def success(self) -> bool:
@@ -241,7 +252,8 @@ class VortexPairFit(Tabular):
         -------
         Dataset
             `v`, `w`, `v_stderr`, `w_stderr` (m s^-1) and `vw_correlation`, dims (row, column) or
-            those of the arrays. The errors contain those of the parameters and the model error.
+            those of the arrays. The errors contain those of the parameters, the model error and the
+            rms of the ambient wind, which is no part of the values.
         """
         y, z = np.broadcast_arrays(np.asarray(y, dtype=float), np.asarray(z, dtype=float))
         values, covariance = self.wind_and_covariance(y, z)
@@ -275,7 +287,7 @@ class VortexPairFit(Tabular):
         slope = [sensitivity(about, direction.view(2, *[1] * lateral.ndim)) for direction in unit]
         covariance = torch.as_tensor(self.covariance)
         v, w = (torch.tensordot(covariance, part, 1) for part in slope)
-        model = self.model_error**2
+        model = self.model_error**2 + (self.ambient.rms**2 if self.ambient else 0.0)
         spread = torch.stack(
             [(v * slope[0]).sum(0) + model, (w * slope[1]).sum(0) + model, (v * slope[1]).sum(0)]
         )

@@ -1,12 +1,12 @@
 """The track of a pair of vortices over successive slabs of air along a flight path.
 
 An extended Kalman filter of the pair's parameters and of its slopes along the path
-(`lidar_mi.retrieval.vortices.track_motion`), fed with the fits of the slabs. The errors of
-different slabs are taken for independent: slabs do not overlap, so that their images have different
-air and different photons. Valid while texture and the turbulence that the pair does not describe
-decorrelate over less than the distance of the slabs. An error that all slabs have in common, such
-as a drift of the reported attitude, does not average out: keep it out of the fits, and add it to
-what `Track.pair_at` returns (`VortexPairFit.with_common_error`).
+(`lidar_mi.retrieval.vortices.track_motion`), fed with the fits of the slabs. Slabs do not overlap,
+so that their images have different photons. But large eddies reach over several slabs: the part of
+an error that is by the ambient wind (`VortexPairFit.shared`) is a state of its own, a Gauss-Markov
+process along the path (Bar-Shalom, Li, Kirubarajan 2001, 8.2). An error that all slabs have in
+common, such as a drift of the reported attitude, does not average out: keep it out of the fits, and
+add it to what `Track.pair_at` returns (`VortexPairFit.with_common_error`).
 """
 
 from dataclasses import dataclass, field, replace
@@ -35,6 +35,11 @@ from lidar_mi.retrieval.vortices.track_motion import (
 )
 
 MEASURED = len(PARAMETERS)
+_MOVING = MEASURED + len(SLOPES)
+# A fit observes the parameters and the error that slabs share, which follows the slopes.
+_OBSERVED = np.hstack([np.eye(MEASURED), np.zeros((MEASURED, len(SLOPES))), np.eye(MEASURED)])
+# Least variance of the shared error, over that of the fit: covariances must have an inverse.
+_LEAST_SHARED = 1e-6
 # Of port and starboard, along y and z.
 _MEAN_SLOPES = np.array([[0.5, 0, 0.5, 0], [0, 0.5, 0, 0.5]])
 
@@ -108,11 +113,11 @@ class Slab:
     ----------
     x, time : float
         m and s.
-    state, covariance : ndarray, shapes (14,) and (14, 14)
-        After the update of the slab, if there was one.
-    predicted : ndarray, shape (14,)
+    state, covariance : ndarray, shapes (24,) and (24, 24)
+        Parameters, slopes and shared errors after the update of the slab, if there was one.
+    predicted : ndarray, shape (24,)
         Before it.
-    transition, noise : ndarray, shape (14, 14)
+    transition, noise : ndarray, shape (24, 24)
         Derivatives of the prediction by the state of the slab before, and its own covariance.
     innovation : float or None
         Normalised square of the fit's departure from the prediction, also of a rejected fit; None
@@ -166,12 +171,12 @@ class Track:
     @property
     def state(self) -> np.ndarray:
         """Parameters and slopes (14,) in the newest slab."""
-        return self.slabs[-1].state
+        return self.slabs[-1].state[:_MOVING]
 
     @property
     def covariance(self) -> np.ndarray:
         """Of the state, (14, 14)."""
-        return self.slabs[-1].covariance
+        return self.slabs[-1].covariance[:_MOVING, :_MOVING]
 
     @property
     def profile(self) -> Profile:
@@ -249,6 +254,7 @@ class Track:
         nearest = int(np.argmin([abs(slab.x - x) for slab in self.slabs]))
         # smoothed, not filtered: later slabs determine the slopes and the mean wind
         slab, (state, covariance) = self.slabs[nearest], self._smoothed[nearest]
+        state, covariance = state[:_MOVING], covariance[:_MOVING, :_MOVING]
         wandering = self.settings.wandering
         dt = time - slab.time
         state, covariance, _, _ = _predicted(
@@ -281,7 +287,7 @@ class Track:
         x, time = np.broadcast_arrays(np.asarray(x, float), np.asarray(time, float))
         places, times = (np.array([getattr(s, name) for s in self.slabs]) for name in ("x", "time"))
         nearest = np.abs(x[..., None] - places).argmin(-1)
-        states = np.stack([state for state, _ in self._smoothed], -1)[:, nearest]
+        states = np.stack([state[:_MOVING] for state, _ in self._smoothed], -1)[:, nearest]
         found = advected_states(states, x - places[nearest], time - times[nearest], self.profile)
         return found[:MEASURED]
 
@@ -305,7 +311,7 @@ class Track:
     @cached_property
     def _inductions(self) -> np.ndarray:
         """Drift without the mean wind in the smoothed slabs, (2, number), m/s."""
-        states = np.array([state for state, _ in self._smoothed]).T
+        states = np.array([state[:_MOVING] for state, _ in self._smoothed]).T
         # the rest of the drift is mutual induction
         states[MEAN_WIND] = 0
         return oblique_drift(torch.as_tensor(states), self.profile).numpy()
@@ -342,11 +348,15 @@ def first_track(
         )
     settings = settings or TrackSettings()
     # one plane shows nothing of the slopes: they have their prior
-    state = np.concatenate([pair.parameters, np.zeros(len(SLOPES))])
+    state = np.concatenate([pair.parameters, np.zeros(len(SLOPES) + MEASURED)])
     covariance = np.zeros((len(state), len(state)))
+    shared = _shared(pair)
     covariance[:MEASURED, :MEASURED] = pair.covariance
+    # the parameters err by what the fit erred: with the other sign
+    covariance[_MOVING:, _MOVING:] = shared
+    covariance[:MEASURED, _MOVING:] = covariance[_MOVING:, :MEASURED] = -shared
     # of each slope, and of port and starboard in common
-    covariance[MEASURED:, MEASURED:] = settings.unlike_slope**2 * np.eye(
+    covariance[MEASURED:_MOVING, MEASURED:_MOVING] = settings.unlike_slope**2 * np.eye(
         len(SLOPES)
     ) + settings.slope**2 * np.kron(np.ones((2, 2)), np.eye(2))
     # there is no slab before that it could have come from
@@ -382,17 +392,18 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         raise InputError(f"pair.profile: {fit.profile!r} is not that of the track")
     if track.lost and fit is not None and _has_sense(fit):
         return first_track(fit, x, time, track.settings)
-    state, covariance, transition, noise = _predicted(
-        track.state,
-        track.covariance,
+    last = track.slabs[-1]
+    state, covariance, transition, noise = _further(
+        last.state,
+        last.covariance,
         x - track.x,
         time - track.time,
         track.settings.wandering,
-        track.profile,
+        fit or track.fit,
     )
     predicted, square, used = state, None, None
     if fit is not None:
-        measured = fit.parameters, fit.covariance
+        measured = fit.parameters, _own(fit), _OBSERVED
         # also of what is rejected below: `Track.inflation` counts it
         square = kalman.innovation(state, covariance, *measured)
         if _has_sense(fit) and square <= chi2.ppf(track.settings.gate, MEASURED):
@@ -424,6 +435,38 @@ def _predicted(
     # the walk along the path comes first, so that it drifts on in time
     noise = later @ path @ later.T + time
     return reached, transition @ covariance @ transition.T + noise, transition, noise
+
+
+def _further(
+    state: np.ndarray,
+    covariance: np.ndarray,
+    dx: float,
+    dt: float,
+    wandering: Wandering,
+    fit: VortexPairFit,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`_predicted` with the shared error, whose covariance becomes that of a fit."""
+    reached, _, moved, walked = _predicted(
+        state[:_MOVING], covariance[:_MOVING, :_MOVING], dx, dt, wandering, fit.profile
+    )
+    correlation = np.exp(-abs(dx) / fit.shared_length) if fit.shared_length > 0 else 0.0
+    transition, noise = np.zeros((2, len(state), len(state)))
+    transition[:_MOVING, :_MOVING], noise[:_MOVING, :_MOVING] = moved, walked
+    transition[_MOVING:, _MOVING:] = correlation * np.eye(MEASURED)
+    noise[_MOVING:, _MOVING:] = (1 - correlation**2) * _shared(fit)
+    reached = np.concatenate([reached, correlation * state[_MOVING:]])
+    return reached, transition @ covariance @ transition.T + noise, transition, noise
+
+
+def _shared(pair: VortexPairFit) -> np.ndarray:
+    """Covariance of the error that successive slabs share; next to none where none is stated."""
+    least = _LEAST_SHARED * np.diag(np.diagonal(pair.covariance))
+    return least if pair.shared is None else (1 - _LEAST_SHARED) * pair.shared + least
+
+
+def _own(pair: VortexPairFit) -> np.ndarray:
+    """Covariance of the error of one slab alone."""
+    return pair.covariance - _shared(pair)
 
 
 def _is_fit(pair: VortexPairFit) -> bool:

@@ -17,10 +17,12 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
+from lidar_mi.retrieval.vortices.ambient import AmbientWind, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import (
     change_by_flow,
     model_error_of,
     parameter_covariance,
+    shared_error,
 )
 from lidar_mi.retrieval.vortices.model import Profile, rotations, sensitivity, wind
 from lidar_mi.retrieval.vortices.model_error import mean_length
@@ -40,9 +42,15 @@ class _Vectors:
     value: torch.Tensor
     valid: torch.Tensor
     profile: Profile
+    ambient: torch.Tensor | float = 0.0
+    """Wind (2, z, y) in addition to that of the pair."""
+
+    def off(self, parameters: torch.Tensor) -> torch.Tensor:
+        """What is left of the vectors, m/s."""
+        return self.value - wind(parameters, self.y, self.z, self.profile) - self.ambient
 
     def __call__(self, parameters: torch.Tensor) -> Misfit:
-        off = self.value - wind(parameters, self.y, self.z, self.profile)
+        off = self.off(parameters)
         residual = (self.root * off).sum(1)
         about = rotations(parameters, self.y, self.z, self.profile)
         jacobian = torch.stack([-sensitivity(about, along) for along in self.root], 1)
@@ -151,14 +159,20 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         spread = float(1.4826 * (off - off.median()).abs().median())
         if spread > 0:
             model = replace(model, root=model.root / spread)
-    # weights and model error depend on each other
+    # weights, model error and ambient wind depend on each other
+    lateral, vertical = torch.as_tensor(grid_y), torch.as_tensor(grid_z)
+    around: AmbientWind | None = None
     for _ in range(3):
         error = model_error_of(best, 1.0)
-        best = fit(model, best.parameters, limits, error.variance, 12, TOLERANCE)
+        best = fit(model, best.parameters[:10], limits, error.variance, 12, TOLERANCE)
+        ambient = in_ambient_wind(best, lateral, vertical, 1.0, around)
+        around, best = ambient.wind, ambient.solution
+        model = replace(model, ambient=around.at(lateral, vertical))
     error = model_error_of(best, 1.0)
-    covariance = parameter_covariance(best, error, model_error_of(best, 1.0, before=error), 1.0)
+    departure = model_error_of(best, 1.0, before=error)
+    covariance = parameter_covariance(best, error, departure, 1.0, ambient.covariance)
     chi2 = float(best.misfit.residual[:, valid].square().mean()) if known else np.nan
-    residual = (model.value - wind(best.parameters, model.y, model.z, profile))[:, valid]
+    residual = model.off(best.parameters)[:, valid]
     varied = model.value[:, valid] - model.value[:, valid].mean(1, keepdim=True)
     explained = 1 - float(residual.square().sum() / varied.square().sum())
     spacing = (float(np.diff(y).mean()) * float(np.diff(z).mean())) ** 0.5
@@ -173,7 +187,10 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         z,
         y,
         change_by_flow(best, torch.stack([-model.z, model.y])),
+        further=ambient.further,
     )
+    shared, length = shared_error(ambient)
+    pair = replace(pair, ambient=around, shared=shared, shared_length=length)
     v_stderr, w_stderr = common
     rotation, centre = common_rotation(vectors)
     return pair.with_common_error(v_stderr, w_stderr, rotation, centre)

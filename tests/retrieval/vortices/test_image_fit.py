@@ -142,7 +142,7 @@ def test_a_third_of_the_texture_is_replaced():
     assert found.success, found.reasons
     stderr = np.sqrt(np.diag(found.covariance))
     assert (np.abs(found.parameters - vector(*uneven())) < 4 * stderr).all()
-    assert stderr[0] < 12
+    assert stderr[0] < 16
 
 
 @pytest.mark.slow
@@ -462,10 +462,10 @@ def oblique_images(angle, distance, fraction):
 
 
 def test_motion_along_oblique_beams():
-    """Change of the circulations by half of the motion along x: as by their derivatives, to 15 %.
+    """Change of the circulations by half of the motion along x: as by their derivatives, to 30 %.
 
-    20 degrees: 3.8 of 350 m2/s. Without that motion, errors are those of the ellipse that the
-    oblique plane makes of the swirl.
+    20 degrees: 5.6 of 350 m2/s. The weights differ, as both fits estimate their ambient wind.
+    Without that motion, errors are those of the ellipse that the oblique plane makes of the swirl.
     """
     distance, slopes = 148.75, np.array([np.tan(np.radians(20)), 0.0])
     fits = []
@@ -476,7 +476,7 @@ def test_motion_along_oblique_beams():
     seen = (fits[1].parameters - fits[0].parameters)[[0, 4]]
     corrected = fits[1].with_slopes(slopes, np.zeros((2, 2)))
     removed = (fits[1].parameters - corrected.parameters)[[0, 4]]
-    assert seen == pytest.approx(removed, rel=0.15) and removed.min() > 3.5
+    assert seen == pytest.approx(removed, rel=0.3) and removed.min() > 5
     assert np.abs((corrected.parameters - true)[[0, 4]]).max() < 3.5
     with pytest.raises(InputError, match=r"telescope: .* x < 0"):
         fit_vortices(*images, 0.1, telescope=(1.0, 0.0, 0.0))

@@ -23,6 +23,7 @@ def test_filter_and_smoother_are_the_batch_estimate(walk):
     errors = [spread(random, MEASURED, 0.5) for _ in range(STEPS)]
     mean, prior = random.standard_normal(STATES), spread(random, STATES, 2.0)
     measured = random.standard_normal((STEPS, MEASURED))
+    observed = random.standard_normal((MEASURED, STATES))
 
     # every state as a linear function of the first and of the walks
     means, rows = [mean], [np.eye(STATES, STATES * STEPS)]
@@ -34,13 +35,14 @@ def test_filter_and_smoother_are_the_batch_estimate(walk):
         sources[k * STATES : (k + 1) * STATES, k * STATES : (k + 1) * STATES] = part
 
     def batch(number, known):
-        seen = np.concatenate([row[:MEASURED] for row in rows[:known]])
+        seen = np.concatenate([observed @ row for row in rows[:known]])
         error = np.zeros((MEASURED * known,) * 2)
         for k in range(known):
             error[k * MEASURED : (k + 1) * MEASURED, k * MEASURED : (k + 1) * MEASURED] = errors[k]
         both = rows[number] @ sources @ seen.T
         gain = both @ np.linalg.inv(seen @ sources @ seen.T + error)
-        departure = measured[:known].ravel() - np.concatenate([m[:MEASURED] for m in means[:known]])
+        expected = np.concatenate([observed @ mean for mean in means[:known]])
+        departure = measured[:known].ravel() - expected
         return means[number] + gain @ departure, rows[number] @ sources @ rows[
             number
         ].T - gain @ both.T
@@ -52,7 +54,7 @@ def test_filter_and_smoother_are_the_batch_estimate(walk):
             state = transitions[k - 1] @ state
             covariance = transitions[k - 1] @ covariance @ transitions[k - 1].T + noises[k - 1]
         predicted.append(state)
-        state, covariance = kalman.updated(state, covariance, measured[k], errors[k])
+        state, covariance = kalman.updated(state, covariance, measured[k], errors[k], observed)
         filtered.append((state, covariance))
         for got, expected in zip(filtered[-1], batch(k, k + 1), strict=True):
             np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-10)
@@ -65,7 +67,7 @@ def test_filter_and_smoother_are_the_batch_estimate(walk):
 
 def test_innovation_in_closed_form():
     prior, error = np.diag([3.0, 5.0, 7.0]), np.diag([1.0, 4.0])
-    got = kalman.innovation(np.zeros(3), prior, np.array([2.0, 3.0]), error)
+    got = kalman.innovation(np.zeros(3), prior, np.array([2.0, 3.0]), error, np.eye(2, 3))
     assert got == pytest.approx(4 / 4 + 9 / 9)
 
 
@@ -74,7 +76,9 @@ def test_covariance_stays_positive_where_a_difference_would_not():
     covariance = np.diag([1e8, 1e8, 1.0]) + 1e8 * np.ones((3, 3))
     state = np.zeros(3)
     for k in range(1, 21):
-        state, covariance = kalman.updated(state, covariance, np.ones(2), 1e-8 * np.eye(2))
+        state, covariance = kalman.updated(
+            state, covariance, np.ones(2), 1e-8 * np.eye(2), np.eye(2, 3)
+        )
         assert (covariance == covariance.T).all()
         np.testing.assert_allclose(np.diagonal(covariance)[:2], 1e-8 / k, rtol=1e-3)
         spread = np.sqrt(np.diagonal(covariance))

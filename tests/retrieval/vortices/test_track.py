@@ -273,3 +273,22 @@ def test_memory_is_bounded_and_an_update_is_fast():
     # two moves a step; 5 ms are allowed for one, and other programs may slow it
     assert (time.process_time() - begin) / 40 < 2 * 0.005 * 3
     assert len(track.slabs) == 30 and SPEED / RATE * 40 == track.x
+
+
+@pytest.mark.parametrize("length", [1e6, 20.0, 0.0])
+def test_an_error_that_slabs_share_does_not_average_out(length):
+    """The variance of the mean of n errors, half of which are a Gauss-Markov process along x.
+
+    Generalised least squares: 1 / sum of the inverse covariance.
+    """
+    number, part, track = 10, 0.5, None
+    for x, at in zip(*times(number), strict=True):
+        pair = replace(fit(oblique()(x, at), ERROR), shared=part * ERROR, shared_length=length)
+        track = updated(track, pair, x, at) if track else first_track(pair, x, at, STEADY)
+    along = times(number)[0]
+    lag = np.abs(np.subtract.outer(along, along))
+    together = np.exp(-lag / length) if length else np.eye(number)
+    expected = 1 / np.linalg.inv(part * together + (1 - part) * np.eye(number)).sum()
+    got = np.diagonal(track.covariance)[[0, 4]] / np.diagonal(ERROR)[[0, 4]]
+    # places have slopes as well, and their errors correlate with those of the circulations
+    np.testing.assert_allclose(got, expected, rtol=0.05)
