@@ -87,3 +87,19 @@ def test_air_that_moves_as_fitted_is_not_flagged():
 
 def test_a_flow_that_is_far_off_is_flagged():
     assert found(texture(1), (SHIFT[0] + 5, SHIFT[1] - 4)).double().mean() > 0.9
+
+
+def test_a_pattern_that_repeats_has_no_motion_that_is_sure():
+    """Waves along both axes, at their motion and at one a period off, with and without noise."""
+    z, y = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    for period, noise in ((5, 0.0), (5, 0.02), (7, 0.02)):
+        random = np.random.default_rng(period)
+
+        def wave(t, period=period, noise=noise, random=random):
+            moved = (z - t * SHIFT[0], y - t * SHIFT[1])
+            air = 1 + 0.3 * sum(np.sin(2 * np.pi * one / period) for one in moved)
+            return torch.as_tensor(air + noise * random.standard_normal(SHAPE))
+
+        stack = [wave(0), wave(1)]
+        for off in (0, period):
+            assert found(stack, (SHIFT[0], SHIFT[1] - off)).double().mean() > 0.98, (period, off)
