@@ -1,6 +1,8 @@
 """The motion around every pixel, from coarse vectors, and images read further on along it."""
 
+import numpy as np
 import torch
+from scipy.ndimage import map_coordinates
 from torch.nn.functional import grid_sample, pad
 
 from lidar_mi.retrieval.correlation.first_pass import whole_pixels
@@ -35,7 +37,11 @@ def motion_around(
 
 
 def moved(image: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """The image (z, y) read d (2, z, y) px further on, by cubics."""
+    """The image (z, y) read d (2, z, y) px further on, by cubics; or a volume (x, z, y)."""
+    if image.ndim > 2:
+        there = np.indices(image.shape) + d.cpu().numpy()
+        read = map_coordinates(image.cpu().numpy(), there, order=3, mode="nearest")
+        return torch.as_tensor(read).to(image)
     place = [torch.arange(n).to(d) for n in image.shape]
     at = [
         2 * (p + part) / (n - 1) - 1

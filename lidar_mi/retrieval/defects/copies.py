@@ -8,7 +8,13 @@ import torch
 from scipy.stats import t as student
 
 from lidar_mi.retrieval.correlation.motion import moved
-from lidar_mi.retrieval.defects.faint_pattern import residual, standing, without_lines
+from lidar_mi.retrieval.defects.faint_pattern import (
+    in_blocks,
+    inner,
+    residual,
+    standing,
+    without_lines,
+)
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.windows import Windows, working
 
@@ -18,8 +24,9 @@ FALSE_ALARM = 5e-3
 _LARGEST, _FITS = 0.6, 4
 # Blurred air in a vortex pair gives up to 0.007 where there is next to no noise.
 _LEAST = 0.01
-# Side of the blocks, px, whose sums are nearly independent, their least number, the masked rim.
-_BLOCK, _FEW_BLOCKS, _RIM = 16, 12, 4
+# Side of the blocks of images and volumes, px, whose sums are nearly independent, their least
+# number, the masked rim.
+_BLOCK, _FEW_BLOCKS, _RIM = {2: 16, 3: 9}, 12, 4
 # Relative error of a fraction by the orders left out: 0.2 is found as 0.194 to 0.197 in three pairs
 # of texture of 2 px moved by 1.5 px.
 _HIGHER_ORDERS = 0.03
@@ -80,37 +87,35 @@ def copy_at_rest(images: Sequence[torch.Tensor], found: Displacement, windows: W
 
         a ((m(x + d) + m(x - d)) / 2 - m(x)),
 
-    which is even in d, as no displacement is. It is the half sum of its part that is of one sign
-    along d and of the other across it, and of its isotropic part, which is also that of images of
+    which is even in d, as no displacement is. It is the sum of a part that is of one sign
+    along d and of the other across it, and of an isotropic part, which is also that of images of
     different blur. Both are regressed on, besides m, the difference by contrast. The
-    coefficients have the covariance of the scores' scatter over blocks of 16 px (White 1980,
-    Econometrica 48, 817-838). Where they differ by more than `_UNLIKE` standard errors, the
-    directed one counts alone. To second order in d over the size of the structure.
+    coefficients have the covariance of the scores' scatter over blocks of 16 px, in volumes of 9 px
+    (White 1980, Econometrica 48, 817-838). Where they differ by more than `_UNLIKE` standard
+    errors, the directed one counts alone. To second order in d over the size of the structure.
 
     Parameters
     ----------
-    images : sequence of torch.Tensor, shape (z, y)
+    images : sequence of torch.Tensor, shape (z, y) or (x, z, y)
         Two.
     found : Displacement
         A field fitted to the images as a whole.
     windows : Windows
     """
     difference, mean, known, d = residual(images[:2], found, windows)
-    known[:_RIM] = known[-_RIM:] = False
-    known[:, :_RIM] = known[:, -_RIM:] = False
-    rows, columns = (n // _BLOCK for n in known.shape)
-    if rows * columns < _FEW_BLOCKS or known.double().mean() < 0.5:
+    dims = windows.dims
+    inside = inner(known, _RIM)
+    known = known & inside
+    side = _BLOCK[dims]
+    if math.prod(n // side for n in known.shape) < _FEW_BLOCKS or 2 * known.sum() < inside.sum():
         return Copy()
     limit = _CLIPPED * 1.4826 * difference[known].abs().median()
     mean = mean - mean[known].mean()
-    across = torch.stack([-d[1], d[0]])
-    along, across = ((moved(mean, s) + moved(mean, -s)) / 2 for s in (d, across))
-    even = map(without_lines, (along - across, along + across - 2 * mean, mean))
-    fields = (torch.stack([*even, difference.clamp(-limit, limit)]) * known)[
-        :, : rows * _BLOCK, : columns * _BLOCK
-    ]
-    blocks = fields.reshape(4, rows, _BLOCK, columns, _BLOCK).movedim(3, 2).flatten(3).flatten(1, 2)
-    blocks = working(blocks.movedim(0, -1)).cpu()
+    along, *across = ((moved(mean, s) + moved(mean, -s)) / 2 for s in turned(d))
+    sideways = sum(across)
+    even = (((dims - 1) * along - sideways) / dims, (along + sideways - dims * mean) / dims, mean)
+    fields = torch.stack([*map(without_lines, even), difference.clamp(-limit, limit)])
+    blocks = working(in_blocks(fields * known, side).movedim(0, -1)).cpu()
     terms, observed = blocks[..., :3], blocks[..., 3:]
     number = len(blocks)
     gram = (terms.mT @ terms).sum(0)
@@ -125,9 +130,21 @@ def copy_at_rest(images: Sequence[torch.Tensor], found: Displacement, windows: W
         part = ((covariance[0, 0] - covariance[0, 1]) / apart).clamp(0.0, 1.0)
         weight = torch.stack([1 - part, part])
     stderr = (weight @ covariance @ weight).sqrt()
-    if not 0 < 2 * stderr < _LARGEST:  # slow air tells nothing
+    if not 0 < stderr < _LARGEST:  # slow air tells nothing
         return Copy()
-    return Copy(float(2 * weight @ value), float(2 * stderr), number - 3)
+    return Copy(float(weight @ value), float(stderr), number - 3)
+
+
+def turned(d: torch.Tensor) -> list[torch.Tensor]:
+    """Vectors (2, z, y) or (3, x, z, y), and those of their length at right angles to them."""
+    if len(d) == 2:
+        return [d, torch.stack([-d[1], d[0]])]
+    # from the axis that is least along them
+    axis = torch.eye(3).to(d)[d.abs().flatten(1).mean(1).argmin()].reshape(3, 1, 1, 1).expand_as(d)
+    length = d.norm(dim=0).clamp(min=1e-9)
+    one = torch.linalg.cross(d, axis, dim=0)
+    one = one * length / one.norm(dim=0).clamp(min=1e-9)
+    return [d, one, torch.linalg.cross(d / length, one, dim=0)]
 
 
 def without_copy(
@@ -147,7 +164,7 @@ def without_copy(
         From two images to the field.
     found : Displacement
         Of the images as they are.
-    images : sequence of torch.Tensor, shape (z, y)
+    images : sequence of torch.Tensor, shape (z, y) or (x, z, y)
         Two.
     windows : Windows
     field : callable

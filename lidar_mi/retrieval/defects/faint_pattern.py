@@ -92,17 +92,17 @@ def standing(
     Parameters
     ----------
     images : sequence of torch.Tensor, shape (z, y)
-        The first two of them count.
+        The first two of them count. Of volumes none is found.
     found : Displacement
         A field fitted to the images as a whole.
     windows : Windows
     false_alarm : float
     """
+    if windows.dims > 2:
+        return Standing()
     left, mean, known, d = residual(images[:2], found, windows)
     speed = d.norm(dim=0)
-    use = known & (speed > _SLOWEST)
-    use[:_RIM] = use[-_RIM:] = False
-    use[:, :_RIM] = use[:, -_RIM:] = False
+    use = known & (speed > _SLOWEST) & inner(known, _RIM)
     if not bool(use.any()):
         return Standing()
     limit = _CLIPPED * 1.4826 * left[use].abs().median()
@@ -110,9 +110,7 @@ def standing(
     excess, power = _along_and_across(left.clamp(-limit, limit), d / speed.clamp(min=1e-6))
     whole, _ = _along_and_across(shift, d / speed.clamp(min=1e-6))
     sums = torch.stack([excess, power, whole, torch.ones_like(power)]) * use
-    rows, columns = (n // _BLOCK for n in use.shape)
-    sums = sums[:, : rows * _BLOCK, : columns * _BLOCK]
-    sums = sums.reshape(4, rows, _BLOCK, columns, _BLOCK).sum((2, 4)).flatten(1)
+    sums = in_blocks(sums, _BLOCK).sum(-1)
     sums = sums[:, (sums[3] > _BLOCK**2 / 4) & (sums[1] > 0)].cpu()
     number = sums.shape[1]
     if number < _FEW_BLOCKS:
@@ -155,10 +153,25 @@ def residual(
 
 
 def without_lines(field: torch.Tensor) -> torch.Tensor:
-    """A field (z, y) less the means of its columns and of its rows."""
-    for axis in (0, 1):
+    """A field (z, y) less the means of its columns and of its rows; of volumes all lines."""
+    for axis in range(field.ndim):
         field = field - field.nanmean(axis, keepdim=True)
     return field
+
+
+def inner(pixels: torch.Tensor, rim: int) -> torch.Tensor:
+    """All pixels but those of a rim, True."""
+    inside = torch.zeros_like(pixels, dtype=torch.bool)
+    inside[tuple(slice(rim, n - rim) for n in pixels.shape)] = True
+    return inside
+
+
+def in_blocks(fields: torch.Tensor, side: int) -> torch.Tensor:
+    """Fields (n, ...) cut into blocks of this side, (n, blocks, pixels)."""
+    dims = fields.ndim - 1
+    for axis in range(1, dims + 1):
+        fields = fields.unfold(axis, side, side)
+    return fields.flatten(dims + 1).flatten(1, dims)
 
 
 def _along_and_across(image: torch.Tensor, unit: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 
 from lidar_mi.retrieval.correlation.first_pass import coarse_windows
 from lidar_mi.retrieval.correlation.motion import motion_around, moved
+from lidar_mi.retrieval.defects.faint_pattern import in_blocks, inner
 from lidar_mi.retrieval.images.windows import Windows, averaged, box_sum, working
 
 FALSE_ALARM = 1e-4
@@ -249,17 +250,14 @@ def _pixels(relative: Sequence[np.ndarray], d: torch.Tensor, false_alarm: float)
     up errors of the motion, and draws vectors to that motion.
     """
     known = d.square().sum(0) >= _LEAST_DISPLACEMENT**2
-    known[:_RIM] = known[-_RIM:] = False
-    known[:, :_RIM] = known[:, -_RIM:] = False
+    known &= inner(known, _RIM)
     if not bool(known.any()):
         return 0.0
     one, two = (torch.as_tensor(r).to(d) for r in relative)
     one, two = (_clipped(_sharp(r), known) for r in (one - moved(two, d), two - moved(one, -d)))
     around = (two.roll(1, 0) + two.roll(-1, 0) + two.roll(1, 1) + two.roll(-1, 1)) / 4
     sums = torch.stack([one * (two - around) * known, one**2 * known, two**2 * known, known.to(d)])
-    rows, columns = (n // _BLOCK for n in known.shape)
-    sums = sums[:, : rows * _BLOCK, : columns * _BLOCK]
-    sums = sums.reshape(4, rows, _BLOCK, columns, _BLOCK).sum((2, 4)).flatten(1)
+    sums = in_blocks(sums, _BLOCK).sum(-1)
     sums = sums[:, sums[3] > _BLOCK**2 / 2]
     number = sums.shape[1]
     if number < _FEW_BLOCKS:

@@ -76,11 +76,7 @@ def described(gain: torch.Tensor) -> str:
 
 def _block_means(image: torch.Tensor) -> np.ndarray:
     """NaN where less than half of a block is finite."""
-    values = working(image).cpu().numpy()
-    rows, columns = (n // _BLOCK for n in values.shape)
-    blocks = values[: rows * _BLOCK, : columns * _BLOCK]
-    blocks = blocks.reshape(rows, _BLOCK, columns, _BLOCK)
-    known = np.isfinite(blocks)
-    number = known.sum((1, 3))
-    total = np.where(known, blocks, 0.0).sum((1, 3))
-    return np.where(number > _BLOCK**2 / 2, total / np.maximum(number, 1), np.nan)
+    blocks = working(image).unfold(0, _BLOCK, _BLOCK).unfold(1, _BLOCK, _BLOCK).flatten(2)
+    many = blocks.isfinite().sum(-1) > _BLOCK**2 / 2
+    means = torch.where(blocks.isfinite(), blocks, torch.nan).nanmean(-1)
+    return torch.where(many, means, torch.nan).cpu().numpy()

@@ -32,8 +32,6 @@ _WEAK = 0.5
 _GAP = 2
 # Length of lines, px.
 _LINE = 9
-# Of the images' mean squared difference, that of areas at rest.
-_STILL = 0.1
 # Fraction of their height by which spots at rest differ at most.
 _DIFFER = 0.3
 # Spots at rest must be so many times those that are by chance.
@@ -184,9 +182,10 @@ def at_rest(
 
     They are impulses that both images have at one place and no image of air resolves
     (`impulses.sharp`); pixels, lines, steps and spots that stand out of both images and are more
-    alike at one place than along the motion d of what is around; and areas that these cut off. d is
-    the median of 5 x 5 coarse vectors of the images without what stands out of both, averaged over
-    Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated iteratively.
+    alike at one place than along the motion d of what is around; and gaps of 2 px between them.
+    d is the median of 5 x 5 coarse vectors of the images without what stands out of both, averaged
+    over Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated
+    iteratively.
     What stands out is measured by local medians, with thresholds of one false alarm in 10 000
     images of normal noise: the slower the air, the stronger a structure must be to be known from
     it. What stands out of both next to it is part of it. Stray pixels stand out of one image alone
@@ -345,7 +344,7 @@ def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
 
 
 def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots, areas."""
+    """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots."""
     sharp = found
     for of in _fields(pair):
         field = of(found)
@@ -353,7 +352,7 @@ def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Te
         if field.size == 1:
             sharp = sharp | new
         found = found | new
-    return _with_sharp(found | _enclosed(pair, found), sharp)
+    return _with_sharp(_closed(found, 1), sharp)
 
 
 def _with_sharp(found: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
@@ -417,28 +416,6 @@ def _beyond_chance(new: torch.Tensor, field: _Field, least: torch.Tensor) -> tor
         chance.append(int(_alike(rolled, least).sum()))
     # the median, as lines at rest fall on themselves
     return new & (int(new.sum()) >= _BEYOND_CHANCE * float(np.median(chance)))
-
-
-def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
-    """Areas cut off by what is at rest that change by less than a tenth of what others do."""
-    if not bool(found.any()):
-        return found
-    square = (pair[1] - pair[0]).square()
-    known = square.isfinite() & ~found
-    if not bool(known.any()):
-        return torch.zeros_like(found)
-    limit = _STILL * float(square[known].mean())
-    closed = _closed(found, 1)
-    still = torch.zeros_like(found)
-    for part in (~closed, closed & ~found):
-        area, number = ndimage.label(part.cpu().numpy())
-        use = (known & part).cpu().numpy()
-        numbers, values = area[use], square.cpu().numpy()[use]
-        change = np.bincount(numbers, values, number + 1) - limit * np.bincount(
-            numbers, minlength=number + 1
-        )
-        still |= torch.as_tensor((change < 0)[area], device=found.device) & part
-    return still
 
 
 def _closed(pixels: torch.Tensor, reach: int) -> torch.Tensor:

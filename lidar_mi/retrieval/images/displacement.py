@@ -49,10 +49,12 @@ class Displacement(NamedTuple):
         return self.d[-1]
 
     def medians(self) -> "Displacement":
-        """Of 3 x 3 vectors of images, without chance peaks; NaN where no vector is known."""
-        wide = pad(self.d, (1, 1, 1, 1), value=torch.nan)
-        around = wide.unfold(-2, 3, 1).unfold(-2, 3, 1).flatten(-2)
-        return self._replace(d=around.nanmedian(-1).values)
+        """Of 3 vectors along each axis, without chance peaks; NaN where no vector is known."""
+        dims = len(self.d)
+        around = pad(self.d, (1, 1) * dims, value=torch.nan)
+        for axis in range(1, dims + 1):
+            around = around.unfold(axis, 3, 1)
+        return self._replace(d=around.flatten(-dims).nanmedian(-1).values)
 
     @classmethod
     def empty(cls, windows: Windows, like: torch.Tensor) -> "Displacement":

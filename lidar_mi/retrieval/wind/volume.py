@@ -15,6 +15,7 @@ from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance, enoug
 from lidar_mi.retrieval.correlation.multipass import multipass
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
+from lidar_mi.retrieval.defects.copies import Copy, without_copy
 from lidar_mi.retrieval.defects.rest import all_at_rest
 from lidar_mi.retrieval.defects.sampling import no_structure, sampling
 from lidar_mi.retrieval.defects.unrelated import unrelated
@@ -85,7 +86,7 @@ def retrieve_wind_volume(
         Of "correlation" or "variational". Default: those of volumes.
     checks : bool
         Replace voxels that stand out of their neighbours, as hard targets and dead gates do, and
-        remove or flag structure of the sampling.
+        remove or flag structure of the sampling, and of two volumes a copy of one in the other.
     device : str or torch.device
         Where to compute.
 
@@ -97,7 +98,8 @@ def retrieve_wind_volume(
         `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
         beyond half a voxel in some direction). Those of "correlation" are from `bootstrap` where
         there are enough windows. Rejected vectors keep their value, or NaN where
-        there is none. `identical_images`, `sampling` and `defects` as of `wind.retrieve_wind`.
+        there is none. `identical_images`, `sampling`, `copy_at_rest` and `defects` as of
+        `wind.retrieve_wind`.
 
     Raises
     ------
@@ -151,8 +153,8 @@ def retrieve_wind_volume(
     seen = [
         torch.where(s, torch.nan, v) if s.any() else v for s, v in zip(strange, seen, strict=True)
     ]
-    found = within_memory(
-        lambda: _displacements(seen, known, method, frame, validation, settings, steps)
+    found, copy = within_memory(
+        lambda: _displacements(seen, known, method, frame, validation, settings, steps, checks)
     )
     if same or structure.spoilt or structure.thinned:
         found = found._replace(flag=found.flag | Flag.AT_REST.value)
@@ -170,6 +172,7 @@ def retrieve_wind_volume(
     said = {
         "identical_images": same,
         "sampling": structure.said,
+        "copy_at_rest": str(copy),
         "defects": f"{number} voxels are replaced in {len(strange)} volumes" if number else "",
     }
     attributes |= {name: value for name, value in said.items() if value}
@@ -185,8 +188,12 @@ def _displacements(
     validation: VectorValidation,
     settings: MultipassSettings | VariationalSettings | None,
     steps: Sequence[float],
-) -> Displacement:
-    """Displacements in voxels, with errors and flags; `steps` are the spacings, m."""
+    checks: bool,
+) -> tuple[Displacement, Copy]:
+    """Displacements in voxels, with errors and flags, and a copy that was removed.
+
+    `steps` are the spacings, m; copies are looked for with `checks` and in two volumes.
+    """
     defects = all_at_rest(raw, frame)
     volumes, relative = without_attenuation(defects.masked(raw), noise)
     options: dict[str, Any] = {
@@ -197,8 +204,20 @@ def _displacements(
     if method == "variational":
         options |= {"more": volumes[2:], "spacing": steps}
     estimate = partial(METHODS[method], template=frame.template, search=frame.search, **options)
-    found = estimate(*volumes[:2], stride=frame.stride)
+    found, copy, unexplained = estimate(*volumes[:2], stride=frame.stride), Copy(), False
+    if checks and len(volumes) == 2:
+        bright = [volume + 1 for volume in volumes]
+
+        def again(*pair: torch.Tensor) -> Displacement:
+            return estimate(*(one - 1 for one in pair), stride=frame.stride)
+
+        local = Displacement.medians if method == "correlation" else lambda one: one
+        found, copy, clean = without_copy(again, found, bright, frame, local)
+        unexplained = copy.significant and clean is bright
+        volumes = [one - 1 for one in clean]
     flag = defects.flags(found, raw, frame, True) | of_fit(found.covariance)
+    if unexplained:
+        flag = flag | Flag.AT_REST.value
     if method == "correlation":
         if enough_windows(frame):
             textured = flag & Flag.LOW_TEXTURE.value == 0
@@ -218,7 +237,7 @@ def _displacements(
     # shear lowers the correlation of windows as large as a volume is thick: all windows together
     if bool(unrelated(volumes, frame, False, relative).all()):
         flag = flag | Flag.UNRELATED.value
-    return found._replace(flag=flag)
+    return copy.widened(found)._replace(flag=flag), copy
 
 
 def without_attenuation(

@@ -8,7 +8,7 @@ import pytest
 import torch
 import xarray as xr
 
-from lidar_mi.retrieval.defects.copies import Copy, copy_at_rest
+from lidar_mi.retrieval.defects.copies import Copy, copy_at_rest, turned
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.windows import Windows
@@ -148,6 +148,26 @@ def test_windows_without_a_copy_have_none(method):
             random = np.random.default_rng(seed)
             images = [image + 0.03 * random.standard_normal(SHAPE[1]) for image in images]
         assert "copy_at_rest" not in retrieved(images, method).attrs
+
+
+@pytest.mark.parametrize(("name", "fraction"), [("lag of volumes", 0.080), ("clean volumes", 0.0)])
+def test_windows_in_volumes_give_the_wind_of_the_air(name, fraction):
+    """With 8 % of volume 1 in volume 2 nearly all vectors were beyond four stated errors."""
+    truth, volumes = BY_NAME[name].pair(1)
+    wind = of_family(volumes, "correlation")
+    error, stated, valid = errors(truth, wind)
+    assert valid.mean() > 0.9
+    assert np.mean((np.abs(error / stated)[:, valid] > 4).any(0)) <= 0.01
+    found = float(wind.attrs.get("copy_at_rest", "0").split()[0]) / 100
+    assert found == pytest.approx(fraction, abs=0.01)
+
+
+def test_vectors_at_right_angles():
+    d = torch.randn(3, 4, 5, 6, generator=torch.Generator().manual_seed(1))
+    every = torch.stack(turned(d))
+    products = torch.einsum("iaxyz,jaxyz->ijxyz", every, every)
+    expected = torch.eye(3)[:, :, None, None, None] * d.square().sum(0)
+    torch.testing.assert_close(products, expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
