@@ -14,10 +14,13 @@ from lidar_mi.retrieval.correlation.first_pass import coarse_windows
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
 from lidar_mi.retrieval.images.windows import Windows, linear_weights, separable
 
-AS_WELL = 0.15
-"""Misfit of another solution over that of 1.5 to 3 px beside the flow.
+AS_LIKELY = 0.05
+"""Likelihood of another solution over that of the flow."""
+AS_WELL, FINER = 0.15, 0.025
+"""Misfit of another solution over that of 1.5 to 3 px beside the flow, as far as it is known.
 
-Parabolas through whole pixels leave 0.14 of a lattice of 4 px, 0.08 of 5 px.
+In a lattice of 5 px parabolas through whole pixels leave 0.08 of it, polynomials of fourth degree
+0.023; in one of 4 px 0.14 and 0.06, so that a motion by halves of a pixel is overlooked.
 """
 FALSE_ALARM = 1e-3
 """Probability that a window of images that are as the model has them is better explained."""
@@ -36,9 +39,9 @@ def better_elsewhere(
     likelihoods). Those within 2 px of the flow are on its own maximum. The flow of a window that
     is better explained is wrong as far as the window reaches, two standard deviations.
 
-    A displacement that is not better is another solution if its misfit is small against that of all
-    displacements 1.5 to 3 px beside the flow (`AS_WELL`), which are excluded with the certainty
-    above: a pattern that repeats. Where texture is weak, they are not.
+    A displacement that is as likely (`AS_LIKELY`) is another solution if all those 1.5 to 3 px
+    beside the flow are excluded with the certainty above: a pattern that repeats. Where texture is
+    weak, they are not.
 
     Parameters
     ----------
@@ -94,7 +97,31 @@ def better_elsewhere(
     better = (far >= 2) & (least < -sure)
     # a pattern that repeats: a displacement explains it, and those next to the flow do not
     beside = torch.where((far > 1.5) & (far < 3), misfit, torch.inf).amin((0, 1))
-    better |= (far >= 3) & (least < AS_WELL * beside) & (beside > sure)
+    alike = ((far >= 3) & (least < AS_WELL * beside)).any(0).any(0) & (beside > sure)
+    found = better.any(0).any(0)
+    if alike.any():
+        finer = _between_pixels(wide[:, :, alike])
+        apart = far[1:-1, 1:-1, alike] >= 3
+        again = torch.where(apart, finer, torch.inf).amin((0, 1))
+        found[alike] |= again < FINER * beside[alike] - math.log(AS_LIKELY)
     around = 2 * math.ceil(2 * size / step) + 1
-    found = max_pool2d(better.any(0).any(0).to(flow)[None], around, 1, around // 2)[0]
-    return separable(found, [linear_weights(c, a) for a, c in pairs]) > 0
+    wrong = max_pool2d(found.to(flow)[None], around, 1, around // 2)[0]
+    return separable(wrong, [linear_weights(c, a) for a, c in pairs]) > 0
+
+
+def _between_pixels(misfit: torch.Tensor) -> torch.Tensor:
+    """Least misfits about whole displacements, (n - 4, m - 4, ...) of (n, m, ...).
+
+    Polynomials of fourth degree in both axes, at eighths of a pixel.
+    """
+    offsets, nodes = torch.linspace(-0.5, 0.5, 9).to(misfit), torch.arange(-2, 3).to(misfit)
+    gaps = nodes[:, None] - nodes + torch.eye(5).to(misfit)
+    away = (offsets[:, None, None] - nodes).expand(-1, 5, -1).clone()
+    away.diagonal(dim1=1, dim2=2).fill_(1.0)
+    weights = (away / gaps).prod(-1)  # of Lagrange, (offset, node)
+    rows = torch.einsum("ok,nm...k->onm...", weights, misfit.unfold(0, 5, 1))
+    least = torch.full_like(rows[0, :, 4:], torch.inf)
+    for row in rows:
+        both = torch.einsum("ok,nm...k->onm...", weights, row.unfold(1, 5, 1))
+        least = torch.minimum(least, both.amin(0))
+    return least
