@@ -10,7 +10,7 @@ from lidar_mi.retrieval.ground_vortices.fit import Assumptions
 from lidar_mi.retrieval.ground_vortices.radial_velocities import by_radial_velocities
 from lidar_mi.retrieval.ground_vortices.scan_plane import plane_scans
 from lidar_mi.retrieval.ground_vortices.vortices import fit_vortices_to_lines, lidar_of
-from tests.support.line_wakes import START, Drawn, Family, drawn, drawn_from, slices
+from tests.support.line_wakes import START, Drawn, Family, averaging, drawn, drawn_from, slices
 
 from .report import Check, Comparison, Row
 
@@ -28,6 +28,7 @@ FIRST_OF_AIR = 55_000
 
 SIMULATED = Path(__file__).resolve().parents[1] / "scenes" / "wake_volume_40s.nc"
 SMALL = Family(circulations=(-150.0, 150.0), core_radii=(1.6, 1.6), separation=28.0)
+AVERAGED = Family(sigma=0.35, length=60.0, rate=4.0)
 GROUND = Family(sigma=0.4, length=40.0, ground=-1.5, heights=(22.0, 45.0))
 FAMILIES: dict[str, tuple[Family, dict]] = {
     "0.1 m/s, 60 m": (Family(sigma=0.1, length=60.0), {}),
@@ -45,6 +46,8 @@ FAMILIES: dict[str, tuple[Family, dict]] = {
         {"kind": "single"},
     ),
     "near the ground": (GROUND, {"ground": -1.5}),
+    "pulses and gates of 60 m, 4°/s": (replace(AVERAGED, lidar=averaging(60.0)), {}),
+    "pulses and gates of 90 m, 4°/s": (replace(AVERAGED, lidar=averaging(90.0)), {}),
     "simulated wake": (Family(sigma=0.2), {}),
 }
 INNER = ("Burnham-Hallock, fitted as Lamb-Oseen", "simulated wake")

@@ -35,6 +35,8 @@ _LIKELY_CORE = 3.0  # m
 _OVERLAP = 0.75
 """Step of the gates over their length up to which the noise of neighbours is remarked on."""
 _MISFIT = 1e-4
+_LONGEST = 90.0
+"""Pulses and gates (m) up to which stated errors were compared with true ones."""
 
 
 @checked_arguments
@@ -152,6 +154,11 @@ def fit_vortices_to_lines(
         lidar = lidar_of(one, pulse_length, gate_length)
         scans, more = plane_scans(at_the_echo(one, lidar), noise)
         remarks += more
+        if max(lidar.pulse_length, lidar.gate_length) > _LONGEST:
+            remarks.append(
+                f"pulses of {lidar.pulse_length:.4g} m and gates of {lidar.gate_length:.4g} m: "
+                f"stated errors were compared with true ones for {_LONGEST:g} m at most"
+            )
         tilt = unapplied_tilt(one)
         if tilt > 0:
             remarks.append(

@@ -260,3 +260,9 @@ def test_overlapping_gates_are_named_as_a_cause_of_misfit(monkeypatch, gate_leng
     found = lm.fit_vortices_to_lines(lines, gate_length=gate_length)
     assert int(found["flag"][0]) & VortexFlag.MISFIT.value
     assert ("noise that neighbours have in common" in found.attrs["remarks"]) == remarked
+
+
+@pytest.mark.parametrize(("gate_length", "remarked"), [(90.0, False), (120.0, True)])
+def test_gates_whose_errors_were_not_tested_are_said(some_lines, gate_length, remarked):
+    found = lm.fit_vortices_to_lines(some_lines, gate_length=gate_length, pulse_length=30.0)
+    assert ("compared with true ones" in found.attrs["remarks"]) == remarked
