@@ -19,19 +19,10 @@ def eigenvalues(
 
 
 def largest_eigenvalue(matrices: torch.Tensor) -> torch.Tensor:
-    """The largest eigenvalue of symmetric matrices.
+    """The largest eigenvalue (...) of finite symmetric matrices (..., n, n).
 
     Of 2 x 2 in closed form, see `eigenvalues`; of others by `torch.linalg.eigvalsh`, some at a
     time.
-
-    Parameters
-    ----------
-    matrices : torch.Tensor, shape (..., n, n)
-        Finite.
-
-    Returns
-    -------
-    torch.Tensor, shape (...)
     """
     if matrices.shape[-1] == 2:
         return eigenvalues(matrices[..., 0, 0], matrices[..., 1, 0], matrices[..., 1, 1])[1]

@@ -163,16 +163,7 @@ class Observation:
 def observation(
     one: Basis, statistics: Statistics, vectors: SlabVectors, extra: np.ndarray | float = 0.0
 ) -> Observation:
-    """Of the vectors over the lattice.
-
-    Parameters
-    ----------
-    one : Basis
-    statistics : Statistics
-    vectors : SlabVectors
-    extra : ndarray, shape (nz, ny), or float
-        Variance of each vector beyond its stated one, m^2/s^2.
-    """
+    """Of the vectors over the lattice, their variances larger by ``extra`` (nz, ny), m^2/s^2."""
     number = ACROSS.index(one.component)
     y, z = np.meshgrid(vectors.y, vectors.z)
     reach = [np.abs(axis).max() + vectors.window / 4 for axis in one.axes]
@@ -211,8 +202,6 @@ class PathField:
 
     Attributes
     ----------
-    basis : Basis
-    statistics : Statistics
     x, time : ndarray, shape (slabs,)
         m, ascending, and s.
     mean : ndarray, shape (slabs, states)
@@ -322,17 +311,8 @@ def smoothed(
 ) -> PathField:
     """The field from the vectors of slabs: Kalman filter, and smoother of Rauch et al. 1965.
 
-    Parameters
-    ----------
-    one : Basis
-    statistics : Statistics
-    x, time : sequence of float
-        Of the slabs, m, ascending, and s.
-    observations : sequence of Observation
-    winds : sequence of ndarray, shape (nz, ny)
-        The component of each slab's vectors, m/s.
-    swept_speed : float
-        As `PathField` has it.
+    ``x`` (m) ascends, with a ``time`` (s) each; ``winds`` (nz, ny) are the component of each slab's
+    vectors (m/s).
 
     Notes
     -----

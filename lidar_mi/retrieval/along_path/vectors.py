@@ -56,17 +56,8 @@ def counting(wind: xr.Dataset) -> xr.Dataset:
     """The vectors of an estimate that count, as a data set of the same variables.
 
     Windows that lie side by side see all pixels once: vectors between them have nearly no
-    information of their own, and errors that are not independent.
-
-    Parameters
-    ----------
-    wind : Dataset, dims (z, y)
-        v, w with v_stderr, w_stderr and flag, from `retrieve_wind` or `combine`.
-
-    Returns
-    -------
-    Dataset
-        With the attribute `window`, m.
+    information of their own, and errors that are not independent. The estimate is of
+    `retrieve_wind` or `combine`; the result has an attribute `window` (m).
 
     Raises
     ------

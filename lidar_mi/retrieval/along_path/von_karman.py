@@ -66,14 +66,7 @@ def mean_of(resolution: float, shape: Shape, times: int) -> Mean:
     """A mean that is taken once, or twice in a row: of one wind, or of both of a covariance.
 
     The second shape is a gamma mixture: (1 + a)^-q is the mean of exp(-t a) over t with the gamma
-    distribution of shape q.
-
-    Parameters
-    ----------
-    resolution : float
-        s: its standard deviation, m.
-    shape : {"gaussian", "falling"}
-    times : {1, 2}
+    distribution of shape q. ``resolution`` (m) is the standard deviation s.
     """
     if shape == "gaussian":
         return Mean(np.array([times * resolution**2]), np.ones(1))
@@ -144,19 +137,8 @@ def lattice_covariance(
 ) -> np.ndarray:
     """`covariance` of v or w at places of one plane with the nodes of a lattice in it.
 
-    In time of the axes' lengths, not of their product: every eddy is a product.
-
-    Parameters
-    ----------
-    component : {"v", "w"}
-    y, z : ndarray, shapes (n, ny) and (n, nz)
-        From the places to the nodes, m.
-    length, mean, swept
-        As in `covariance`.
-
-    Returns
-    -------
-    ndarray, shape (n, nz, ny)
+    In time of the axes' lengths, not of their product: every eddy is a product. From the places to
+    the nodes are y (n, ny) and z (n, nz), m; the covariance is (n, nz, ny).
     """
     along, plane, weights = _averaged(length, mean, swept)
     bells = [np.exp(-(a[..., None] ** 2) / (2 * plane)) for a in (y, z)]

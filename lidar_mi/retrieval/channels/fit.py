@@ -73,7 +73,6 @@ def fit_channels(
     ----------
     counts : torch.Tensor, shape (images, channels) or (channels,)
         Electrons, background included.
-    model : ChannelModel
     noise : PixelNoise
         Poisson alone if not given.
     free : names out of `lidar_mi.retrieval.channels.model.PARAMETERS`

@@ -145,18 +145,7 @@ class ChannelModel:
 def mean_and_jacobian(
     model: ChannelModel, parameters: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean electrons of every channel, and their derivatives.
-
-    Parameters
-    ----------
-    parameters : torch.Tensor, shape (images, 4)
-        In the order of `PARAMETERS`.
-
-    Returns
-    -------
-    mean : torch.Tensor, shape (images, channels)
-    jacobian : torch.Tensor, shape (images, 4, channels)
-    """
+    """Mean electrons (images, channels), and derivatives (images, 4, channels) by `PARAMETERS`."""
     v, level, temperature, aerosol = parameters.T[..., None]
     n = torch.arange(model.aerosol.shape[1], dtype=torch.float64)
     rate = 2 * math.pi / model.period * n

@@ -189,16 +189,8 @@ def _tridiagonal(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Diagonals T of symmetric matrices A = Q T Q^T, by Householder's reflections, and Q^T vectors.
 
-    It takes a third of the time of eigenvectors, which the evidence does not need.
-
-    Parameters
-    ----------
-    matrices : array (number, n, n)
-    vectors : array (number, n)
-
-    Returns
-    -------
-    middle, side, turned : arrays (number, n), (number, n - 1) and (number, n)
+    It takes a third of the time of eigenvectors, which the evidence does not need. Of matrices
+    (number, n, n) and vectors (number, n): the diagonal, the one beside it, and Q^T vectors.
     """
     if matrices.shape[1] == 1:
         return matrices[:, 0], matrices[:, 0, :0], vectors

@@ -108,7 +108,6 @@ def bootstrap_covariance(
         The two images.
     found : Displacement
         Retrieved from them.
-    windows : Windows
     retrieve : callable
         (image1, image2, stride=...) -> Displacement, the method with its options.
     centred : bool

@@ -92,7 +92,6 @@ def first_pass(
         Through the images, band-limited.
     windows : Windows
         Of the last pass.
-    grid : Grid
     """
     if windows.dims > 2:
         d, centres = _of_volumes(images, spline, windows)

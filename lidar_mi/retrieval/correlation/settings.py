@@ -33,7 +33,6 @@ class MultipassSettings:
     rebalanced : bool
         Whether brightness is fitted again in every pass, from what is valid in both images. Air
         that enters and leaves a volume changes the mean of its gates by 10 % of the texture.
-    filter : FilterSettings
     """
 
     widths: tuple[float, ...] = (1.8, 1.4, 1.0)

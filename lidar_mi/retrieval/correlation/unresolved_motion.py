@@ -100,8 +100,6 @@ def unresolved(
 
     Parameters
     ----------
-    residuals : Residuals
-    motion : Motion
     windows : Windows
         Of the vectors.
     valid : torch.Tensor of bool, shape windows.count

@@ -101,22 +101,16 @@ def differences(
 
     Parameters
     ----------
-    images : Images
     linear : Linear
         Of the images, about the flow.
     mesh : Mesh
         Of the pixels.
     coefficients : torch.Tensor
         Of the flow.
-    prior : Prior
     template : int
         px; half of it is the width over which amplitudes vary with the images.
     response : callable, optional
         See `Response`. Without it nothing counts as absorbed: in volumes it is 2 to 10 %.
-
-    Returns
-    -------
-    Differences
     """
     valid, spline = linear.valid, images.spline
     width = 0.5 * template
@@ -264,10 +258,6 @@ def without_texture(images: Images, template: int) -> torch.Tensor:
         rounding may be as large as the texture.
     template : int
         px, twice the standard deviation of the Gaussian mean of the tensor.
-
-    Returns
-    -------
-    torch.Tensor of bool, shape (z, y)
     """
     valid = images.usable.all(0)
     slopes = torch.gradient(finite(working(images.stack)), dim=(1, 2))

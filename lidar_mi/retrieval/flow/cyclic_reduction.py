@@ -37,10 +37,8 @@ class CyclicFactor(NamedTuple):
 
     Attributes
     ----------
-    rounds : list of Round
     last : torch.Tensor, shape (1, m, m)
         Lower Cholesky factor of the block that is left.
-    band : Band
     """
 
     rounds: list[Round]

@@ -49,7 +49,6 @@ class Posterior(NamedTuple):
         That precision, and the prior's part of it: bands.
     root, before : Root
         Of both.
-    prior : Prior
     """
 
     coefficients: torch.Tensor

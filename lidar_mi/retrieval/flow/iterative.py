@@ -24,13 +24,10 @@ class Posterior(NamedTuple):
 
     Attributes
     ----------
-    coefficients : torch.Tensor
     curvature : torch.Tensor, shape (components, components, *prior.mesh.shape)
         The information of the volumes, lumped to the prior's mesh.
-    prior : Prior
     single : Prior
         The same in the precision of the voxels, which is enough for draws.
-    settings : VariationalSettings
     iteration : int
         Seeds the draws.
     informed : callable

@@ -105,7 +105,6 @@ def line_offsets(
         Of the pixels.
     coefficients : torch.Tensor
         Of the flow.
-    settings : VariationalSettings
     response : callable
         See `components.Response`.
     before : LineOffsets, optional

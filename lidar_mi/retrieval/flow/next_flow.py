@@ -69,8 +69,6 @@ class Flow:
         Weight of each pixel by its misfit, over that by its noise as given.
     misfit : float
         Mean square of the residuals then, over that of the noise.
-    windows : Windows
-    settings : VariationalSettings
     offset : (float, float)
         Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
         `additional`, `factor`, `local`) has moved since.
@@ -173,7 +171,6 @@ class ExpectedFlow:
         Of the air at the pixels at mid-time in both images, px.
     first : tuple of torch.Tensor, shape (1, z, y)
         Value and slopes of the first image there.
-    prior_term : PriorTerm
     root : Root
         Factor of the precision of the flow, by the information that the first image shows.
     covariance : torch.Tensor, shape (2, 2, *windows.count)

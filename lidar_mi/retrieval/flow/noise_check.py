@@ -41,10 +41,8 @@ def variance_by_coloured_noise(
     ----------
     linear : Linear
         About the flow that was found.
-    images : Images
     mesh : Mesh
         Of the pixels.
-    windows : Windows
     response : callable
         See `components.Response`.
 

@@ -188,7 +188,6 @@ class Prior(NamedTuple):
         ----------
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
             Variance of each kind of motion removed by the images, and its square in the flow.
-        settings : VariationalSettings
         """
         known, square = (self.local * self.cell * part for part in (informed, energy))
         around = self._number_around()

@@ -76,13 +76,7 @@ def prior_check(fit: Fit, linear: Linear, mesh: Mesh) -> PriorCheck:
 
         ratio = <(|u_w - u|^2 - e_noise) / e> / <e_prior / e>,    e = e_noise + e_prior.
 
-    Parameters
-    ----------
-    fit : Fit
-    linear : Linear
-        The likelihood that it is of.
-    mesh : Mesh
-        Of the pixels.
+    The likelihood ``linear`` is that of the fit.
     """
     prior, flow = fit.prior, fit.coefficients
     by_noise = torch.cat([_score(linear, mesh, seed).to(flow) for seed in range(_DRAWS)])

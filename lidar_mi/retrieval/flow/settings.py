@@ -125,7 +125,6 @@ class VariationalSettings:
         Standard deviation over the template within which the prior's strength varies little.
     largest_change, relaxation : float
         Factor by which a strength may change per round, and the power of that of the fixed point.
-    filter : FilterSettings
     solver : IterativeSettings
         Of volumes.
     strips : StripSettings

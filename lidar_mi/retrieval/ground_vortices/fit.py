@@ -108,7 +108,6 @@ class Fit:
 
     Attributes
     ----------
-    state : State
     covariance : (numbers, numbers) array
     time, reference : float
         s after the scan's start, and height (m) that the wind's polynomial is about.
@@ -118,7 +117,6 @@ class Fit:
         Normalised square of the residuals and of the departures from the prior.
     dof : int
         Cells less numbers that the scan alone determines.
-    converged : bool
     log_likelihood : float
         Restricted, of the likeliest turbulence.
     """
@@ -190,8 +188,6 @@ class Problem:
 
     Attributes
     ----------
-    window : Window
-    given : Assumptions
     time, reference : float
         At which the vortices are where the state says, s, and height (m) of the wind's polynomial.
     uneven : (n, n) array or 0

@@ -25,8 +25,6 @@ def by_radial_velocities(
 
     Parameters
     ----------
-    scan : PlaneScan
-    lidar : CoherentLidar
     given : Assumptions
         Profile and core radius.
     guess : (n, 4) array

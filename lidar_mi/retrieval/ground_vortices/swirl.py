@@ -149,7 +149,6 @@ def seen(
 
     Parameters
     ----------
-    lines : Lines
     places : (lines, nodes, 2) array
         y and z of the vortex at the times of the lines' nodes, m.
     strengths : (2,) array

@@ -26,14 +26,12 @@ class Window:
 
     Attributes
     ----------
-    lines : Lines
     line, gate : (n,) arrays of int
         Of the cells that are used.
     velocity : (n,) array
         m/s.
     noise : (n, n) array
         Covariance of the noise, (m/s)^2.
-    lidar : CoherentLidar
     """
 
     lines: Lines

@@ -19,14 +19,8 @@ def residuals(design: np.ndarray, velocity: np.ndarray, seed: int = 0) -> np.nda
     """Residuals (n,) of the wind of three lines that has the least median of them (n >= 4).
 
     Least median of squares (Rousseeuw, J. Am. Stat. Assoc. 79, 871-880, 1984), over all subsets of
-    three lines or 200 random ones: half of the lines may be outliers.
-
-    Parameters
-    ----------
-    design : (n, 3) array
-        Unit vectors.
-    velocity : (n,) array
-        m/s.
+    three lines or 200 random ones: half of the lines may be outliers. The ``design`` (n, 3) are
+    unit vectors, the ``velocity`` (n,) is in m/s.
     """
     count = len(velocity)
     if count <= 11:

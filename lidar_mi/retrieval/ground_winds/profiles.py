@@ -54,7 +54,6 @@ class Profile:
 
     Attributes
     ----------
-    time : datetime64
     heights : (levels,) array
         m above the lidar.
     wind : (levels, 3) array

@@ -87,15 +87,8 @@ def power_spectrum(
 ) -> PowerSpectrum:
     """The power spectrum of finite images (images, ...) that `best_filter` takes.
 
-    Parameters
-    ----------
-    images : torch.Tensor, shape (images, ...)
-        Finite.
-    sizes : sequence of int
-        Odd lengths of the Fourier transforms.
-    settings : FilterSettings
-    weight, known
-        See `spline.band_limited`.
+    Fourier transforms have odd ``sizes``; weight and known pixels are those of
+    `spline.band_limited`.
     """
     shape = tuple(images.shape[1:])
     _, shell = radii(tuple(sizes), shape, images.dtype, images.device)
@@ -117,14 +110,7 @@ def best_filter(
     all filters applied to both images of a pair before their differences are squared, the one
     with the least variance of the displacement (a wave k informs it by k^2 S at a variance of
     4 S N + 2 N^2, so its weight S / (2 S + N) is the square of this filter but for a factor).
-
-    Parameters
-    ----------
-    spectrum : PowerSpectrum
-        Of the images.
-    settings : FilterSettings
-    noise, mismatch, blur
-        See `spline.band_limited`.
+    Noise, mismatch and blur are those of `spline.band_limited`.
     """
     density, uncertainty, shape, sizes = spectrum
     radius, shell = radii(sizes, shape, density.dtype, density.device)
@@ -367,7 +353,6 @@ def faded(
     images : torch.Tensor, shape (number, ...)
     sizes : sequence of int
         Of the result along all axes but the first; `margin` pixels of it come before the image.
-    margin : int
     antisymmetric : bool
         Mirrored about the edge's value as well, which keeps the slope.
     """

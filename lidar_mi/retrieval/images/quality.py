@@ -106,7 +106,6 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
     ----------
     image : torch.Tensor, shape (z, y)
         Positive on the whole, as extinction and backscatter are: the contrast is relative.
-    windows : Windows
     """
     image = working(image)
     gradient = spatial_gradient(image[None, None], mode="sobel")[0, 0]
@@ -140,7 +139,6 @@ def low_texture(
     Parameters
     ----------
     image : torch.Tensor, shape (z, y)
-    windows : Windows
     min_texture : float
         px^-1, relative to the local mean; >= 0.
     min_isotropy : float

@@ -40,7 +40,6 @@ class Spline(NamedTuple):
         Of the images, (z, y), or (x, z, y) of volumes.
     passed, excess, gain, efficiency, noisy_slopes
         As in `band_limit.Filter`.
-    settings : FilterSettings
     """
 
     coefficients: torch.Tensor
@@ -86,17 +85,9 @@ class Spline(NamedTuple):
         return inside
 
     def sample(self, *place: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Value and slopes along every axis of every image at its own places.
+        """Value and slopes along every axis of every image at its own places (images, ...).
 
-        Parameters
-        ----------
-        *place : torch.Tensor, shape (images, ...)
-            Pixels from the first one along each axis; places beyond the image take the edge's
-            value.
-
-        Returns
-        -------
-        value, *slopes : torch.Tensor, shape (images, ...)
+        Places are pixels from the first one; those beyond the image take the edge's value.
         """
         at = self._in_nodes(place)
         if len(at) == 2:
@@ -278,11 +269,6 @@ def likeliest(image: torch.Tensor, settings: FilterSettings) -> Spline:
     Of texture of spectral density S with noise N, S / (S + N) of the image is the mean of the
     texture given the image. The filter of `band_limited` is g = sqrt(S / (S + N / 2)), so that this
     one is g^2 / (2 - g^2).
-
-    Parameters
-    ----------
-    image : torch.Tensor, shape (z, y), or (x, z, y) of a volume
-    settings : FilterSettings
     """
     chosen = filter_of([image], settings=settings)
     square = chosen.gain.square()

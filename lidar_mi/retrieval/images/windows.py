@@ -190,14 +190,10 @@ def box_sum(values: torch.Tensor, size: int, axis: int) -> torch.Tensor:
 def window_sums(
     fields: torch.Tensor, kernels: Sequence[torch.Tensor], step: int, axis: int
 ) -> torch.Tensor:
-    """Sums along an axis of fields (n, ...), weighted by each of several kernels.
+    """Sums (kernels, n, ...) along an axis of fields (n, ...), weighted by each of several kernels.
 
     Sums start every `step` values, where the kernel lies wholly inside. Blocks of values are
     multiplied with all kernels at once, which takes 10 % of the time of a convolution.
-
-    Returns
-    -------
-    torch.Tensor, shape (kernels, n, ...)
     """
     taps = len(kernels[0])
     fields = fields.movedim(axis, -1)

@@ -94,10 +94,6 @@ def calibrate_rings(
     max_chi_square : float
         Frames that fit worse are refused.
 
-    Returns
-    -------
-    Calibration
-
     Raises
     ------
     InputError

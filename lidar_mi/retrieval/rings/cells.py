@@ -178,11 +178,7 @@ def annular_average(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Mean r^2 (px^2), mean values and numbers of pixels of annuli of equal steps in r^2.
 
-    Parameters
-    ----------
-    images : torch.Tensor, shape (..., height, width)
-    centre, step
-        As `annular_sectors`.
+    Of images (..., height, width); centre and step as in `annular_sectors`.
     """
     height, width = images.shape[-2:]
     cells = annular_sectors((height, width), centre, step, 1, images.device)

@@ -124,14 +124,7 @@ def few_levels(image: np.ndarray) -> str:
 def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tensor:
     """Pixels far above or below all but two of their neighbours: hot and dead ones, dust.
 
-    Parameters
-    ----------
-    image : torch.Tensor, shape (height, width)
-        Electrons, the mean of ``count`` images.
-
-    Returns
-    -------
-    torch.Tensor of bool, shape (height, width)
+    In electrons of the mean of ``count`` images.
     """
     around = np.ones((5, 5), bool)
     around[2, 2] = False

@@ -159,7 +159,6 @@ def fit_rings(
     ----------
     images : torch.Tensor, shape (images, height, width) or (height, width)
         Electrons (background and read noise included, offset taken off).
-    model : RingModel
     noise : PixelNoise
         Poisson alone if not given.
     method : {"annular", "pixels"}
@@ -178,10 +177,6 @@ def fit_rings(
         Images that fit worse are refused; infinite accepts all. The default detects a wrong line
         or noise, not a small error: the standard deviation of chi_square is
         (2 / cells)^(1/2) = 1 to 2 %.
-
-    Returns
-    -------
-    RingFit
 
     Raises
     ------

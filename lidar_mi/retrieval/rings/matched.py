@@ -39,8 +39,6 @@ class MatchedScore:
 
     Attributes
     ----------
-    model : RingModel
-    noise : PixelNoise
     names : list of str
         Parameters that are fitted.
     waves, single : Waves
@@ -89,7 +87,6 @@ class MatchedRead:
     ----------
     values, std : torch.Tensor, shape (images, `PARAMETERS`)
         As of `RingFit`; infinite standard deviations where ``read`` is false.
-    chi_square : torch.Tensor
     read : torch.Tensor
         False where an image does not follow the model near the reference: fit it on its own.
     sensitivity, systematic : torch.Tensor
@@ -170,17 +167,7 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
 
     Frames are summed up over the cells once, which takes most of the time. They are not searched
     for hot pixels or saturated crests, as by `fit_rings`: an image that has some is not ``read``
-    once they show in chi-square.
-
-    Parameters
-    ----------
-    images : torch.Tensor, shape (images, height, width)
-        Electrons, as for `fit_rings`.
-    score : MatchedScore
-
-    Returns
-    -------
-    MatchedRead
+    once they show in chi-square. Images (images, height, width) are in electrons.
 
     Raises
     ------

@@ -43,7 +43,6 @@ class Waves(NamedTuple):
 
     Attributes
     ----------
-    cells : Cells
     waves : torch.Tensor, shape (2 K, cells)
         Real and imaginary parts of 2 exp(2 pi i n m), n from 1, averaged over the cells.
     by_blur : torch.Tensor, shape (2 K, cells)

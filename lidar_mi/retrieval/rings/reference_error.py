@@ -36,7 +36,6 @@ class Filling:
 
     Parameters
     ----------
-    radius : float
     shift : float
         Of the disc's middle, along the wedge. The disc is not cut where it exceeds the pupil.
     """
@@ -78,7 +77,6 @@ class ReferenceUncertainty:
         Of the gap's spacers, 1/K; fused silica if not given.
     bow, wedge : float
         Rms over the full pupil of a quadratic and of a linear deviation of the gap, m.
-    laser, air : Filling
     scrambling : float
         Of both before the etalon: 0 none, 1 perfect.
 

@@ -34,9 +34,6 @@ class CurveFit:
 
     Attributes
     ----------
-    geometry : RingCurves
-    pattern : Pattern
-    sectors : Sectors
     order, line : arrays (rings,) of int
     square : array (rings,)
         Squared mean radius, px^2.

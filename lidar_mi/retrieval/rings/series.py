@@ -90,17 +90,8 @@ def analyse_series(
 
     Lines at equal distances look like one line of a shorter spacing, so that a frame in which a
     moving line crosses the middle between two orders does not determine it. The spacing of
-    most of the frames, or the given one, is that of all.
-
-    Parameters
-    ----------
-    frames : iterable of arrays (height, width)
-    centre, saturation, spacing
-        As of `analyse_rings`.
-
-    Returns
-    -------
-    RingSeries
+    most of the frames, or the given one, is that of all. Centre, saturation and spacing are those
+    of `analyse_rings`.
     """
     stored = list(frames)
     rings: list[Rings | None] = []

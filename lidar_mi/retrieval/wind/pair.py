@@ -265,15 +265,7 @@ def _estimator(
 def _flags_among_neighbours(
     d: torch.Tensor, low: torch.Tensor, windows: Windows, validation: VectorValidation
 ) -> torch.Tensor:
-    """Flags of vectors of single windows: without texture there, outliers among their neighbours.
-
-    Parameters
-    ----------
-    d : torch.Tensor, shape (2, *windows.count)
-        px
-    low : torch.Tensor of bool, shape windows.count
-        Windows of low texture.
-    """
+    """Flags of vectors ``d`` (px) of single windows: of low texture, outliers among neighbours."""
     outlier = median_outliers(
         d,
         validation.median_size,

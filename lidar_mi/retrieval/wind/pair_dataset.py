@@ -32,7 +32,6 @@ class Vectors(NamedTuple):
         The faint pattern at rest whose bias was removed.
     copy : Copy
         Of one image in the other, at rest, that was removed.
-    times : VectorTimes
     """
 
     found: Displacement

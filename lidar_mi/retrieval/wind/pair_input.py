@@ -24,7 +24,6 @@ class PairInput(NamedTuple):
         On one grid.
     pixels : list of torch.Tensor, shape (z, y)
         Their values.
-    windows : Windows
     dt : float
         From reference time to reference time, s.
     noise : float or torch.Tensor, optional

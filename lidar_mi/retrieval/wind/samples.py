@@ -36,7 +36,6 @@ def wind_from_samples(
         `retrieve_wind` or `retrieve_wind_volume`, with `options`.
     images : sequence of xr.DataArray
         All of them, in the order of time.
-    structure : Sampling
     windows : WindowSizes
         Of the pixels.
     noise : float, xr.DataArray or None
