@@ -60,7 +60,6 @@ class Parameter(NamedTuple):
 
     Attributes
     ----------
-    name : str
     path : str or None
         The dotted key of the experiment that it would be, if it is no result.
     optional : bool
@@ -220,8 +219,6 @@ def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
 
     Parameters
     ----------
-    function : callable
-    experiment : Experiment
     **given
         Its other parameters: results, and what a run provides; by default a silent log, and the
         experiment's folder.
@@ -237,13 +234,7 @@ def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
 
 
 class Graph:
-    """The stages that an experiment has, in their order.
-
-    Parameters
-    ----------
-    stages : sequence of Stage
-        Those of all experiments.
-    experiment : Experiment
+    """The stages, out of those of all experiments, that an experiment has, in their order.
 
     Raises
     ------

@@ -74,8 +74,6 @@ class RunFolder:
 
     Parameters
     ----------
-    path : path
-    experiment : Experiment
     search_path : path
         Folder in which files named by the experiment are looked for first.
     shared : Store, optional
@@ -267,7 +265,6 @@ def write_result(folder: Path, name: str, value: Any, experiment: str, signature
 
     Parameters
     ----------
-    folder : Path
     name : str
         Of the stage.
     value : Dataset or VortexFits or None

@@ -62,7 +62,6 @@ def sections(
 
     Parameters
     ----------
-    asked : Experiment
     search_path : path
         Folder in which files named by the experiment are searched first.
     notice : callable

@@ -91,7 +91,6 @@ def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> 
 
     Parameters
     ----------
-    experiment : Experiment
     results : mapping
         Results of the stages that `lidar_mi.experiment.run.prepare` has computed.
     preparation : float

@@ -62,7 +62,6 @@ def drifts(
     ----------
     averaged : int
         Pulses of an average.
-    seed : sequence of int
     numbers : sequence of int
         Of the averages, counted from the first pulse of a series.
     key : str

@@ -155,14 +155,8 @@ def noise_map(error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]) 
 
     The variance is linear between beams. Splines between the beams take noise from short waves
     alone: their values add to the same constant everywhere. In waves as long as texture the noise
-    has the spectral density of that of the beams, and this is what retrievals take.
-
-    Parameters
-    ----------
-    error : array, shape (gates, z, y)
-        Of the attenuated backscatter of every beam.
-    plan : ScanPlan
-    nodes : x, z, y of the grid, m
+    has the spectral density of that of the beams, and this is what retrievals take. The error
+    (gates, z, y) is that of the attenuated backscatter of every beam; nodes are x, z, y (m).
     """
     _, z, y = nodes
     mesh = np.stack(np.meshgrid(z, y, indexing="ij"), -1)

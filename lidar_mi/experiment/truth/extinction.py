@@ -123,14 +123,7 @@ def true_air(
 ) -> Truth:
     """As `make_truth`.
 
-    Parameters
-    ----------
-    flows
-        From `read_flows`.
-    clear_air
-        At the site.
-    advected : callable, optional
-        From `advection_by` the same flows.
+    Flows come from `read_flows`, the clear air is that at the site.
     """
     first, second = flows
     mapping, molecules = wake.extinction, clear_air.extinction

@@ -66,7 +66,6 @@ def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir
 
     Parameters
     ----------
-    air : lidar_mi.schema.air.Air
     path : lidar_mi.schema.encounter.Path
         Heights are above its ground; turbulence and gusts are those at its start.
     seed : int

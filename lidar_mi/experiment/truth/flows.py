@@ -263,14 +263,7 @@ def _turbine(
 
 
 def analytic_axes(wake: Wake, key: str, most: int) -> list[np.ndarray]:
-    """y and z of the nodes of an analytic wake, m, about the scan's axis.
-
-    Parameters
-    ----------
-    wake : Wake
-    key : "vortex_pair" or "turbine"
-    most : int
-        Nodes that are allowed.
+    """y and z of at most ``most`` nodes of an analytic wake, m, about the scan's axis.
 
     Raises
     ------

@@ -53,7 +53,6 @@ class PassingWake:
     Attributes
     ----------
     wake : PairAboveGround, VolumeAlongPath or None
-    mean : MeanWind
     gusts : Turbulence or None
         Frozen in the mean wind at ``height`` unless it evolves.
     height : float

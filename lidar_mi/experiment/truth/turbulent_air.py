@@ -11,7 +11,6 @@ def turbulent_air(given: schema.Turbulence, height: float, seed: int, section: s
 
     Parameters
     ----------
-    given : schema.Turbulence
     height : float
         At which a standard is read, m.
     seed : int
