@@ -90,7 +90,6 @@ def sections(
 
     Parameters
     ----------
-    experiment : Experiment
     notice : callable
         Called with the name of the running step.
     timed : bool

@@ -96,7 +96,6 @@ def simulate_flights(
 
     Parameters
     ----------
-    experiment : Experiment
     notice : callable
         Called with the name of the flight and its progress.
     lidar : Lidar, optional
@@ -195,10 +194,6 @@ def simulate_flight(
     ----------
     aircraft : AircraftModel
         At the start.
-    controller : callable
-    wake : WakeAlongPath
-    encounter : Encounter
-    notice : callable
     observe : callable
         A scan, if one is due in a state, and what was delivered since the last.
     preview_at : callable

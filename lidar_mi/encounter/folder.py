@@ -33,13 +33,7 @@ ANIMATION, VIDEO, SCANS = "approach.gif", "approach.mp4", "scans"
 
 
 class EncounterFolder:
-    """The files of an encounter, each written under a temporary name.
-
-    Parameters
-    ----------
-    path : path
-    experiment : Experiment
-    """
+    """The files of an encounter, each written under a temporary name."""
 
     def __init__(self, path: str | Path, experiment: Experiment) -> None:
         self.path = Path(path)

@@ -58,13 +58,7 @@ class Integrity:
     ) -> Preview | None:
         """The preview, or that of no loads where it is withdrawn.
 
-        Parameters
-        ----------
-        preview : callable or None
-        state : AircraftState
-            Now.
-        control : float
-            Rolling moment of the controls now, N m.
+        ``state`` and ``control``, the rolling moment of the controls (N m), are those of now.
         """
         before, self._before = self._before, (state.time, state.roll_rate, control)
         predicted = float(preview(state.time).moment[..., 0]) if preview else 0.0

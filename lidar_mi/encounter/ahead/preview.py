@@ -56,7 +56,6 @@ class WakeTracker:
 
     Attributes
     ----------
-    lidar : Lidar
     period : float
         From scan to scan, s.
     stride : float
@@ -254,13 +253,5 @@ def _nearest(tracks: Sequence[Track], x: np.ndarray) -> np.ndarray:
 
 
 def preview_in(wind: Wind, aircraft: AircraftModel, state: AircraftState) -> Preview:
-    """The loads of a wind on an aircraft that goes on from a state.
-
-    Parameters
-    ----------
-    wind : callable
-        Known anywhere at any time.
-    aircraft : AircraftModel
-    state : AircraftState
-    """
+    """The loads of a wind, known anywhere at any time, on an aircraft that goes on from a state."""
     return partial(loads_in_wind, aircraft.strips, state, wind, aircraft.density)

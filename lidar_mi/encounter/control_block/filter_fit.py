@@ -43,7 +43,6 @@ class FilterFit:
         a.
     innovations : ndarray, shape (n,)
         e; NaN where input or output are missing.
-    innovation_variance : float
     count : int
         Innovations.
     """
@@ -239,11 +238,7 @@ def _fitted(output: np.ndarray, value: np.ndarray, after: int, lags: int) -> Fil
 def burg(values: np.ndarray, lags: int) -> np.ndarray:
     """Coefficients a of n_k = sum a_i n_{k-i} + e_k by Burg's method; (lags,).
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        NaN between records, whose sums are added.
-    lags : int
+    Values are NaN between records, whose sums are added.
     """
     forward = backward = values
     a = np.zeros(0)

@@ -78,12 +78,10 @@ class DopplerScans:
     ----------
     experiment : Experiment
         Its `doppler.lidar.range` is that of the slabs.
-    sensor : Sensor
     doppler : Doppler
         Those of the experiment.
     rings : Rings
         The true instrument.
-    images : LineImages
     """
 
     experiment: Experiment
@@ -105,14 +103,12 @@ class DopplerScans:
 
         Parameters
         ----------
-        wake : WakeAlongPath
         number : int
             Of the scan that completes the slab.
         x : float
             Plane of the slab, m.
         time : float
             Half way between both scans, s.
-        midway : Midway
         misalignment : Rotation, optional
             True attitude of the lidar relative to the one by which its beams are aimed.
         """

@@ -32,7 +32,6 @@ class ScanWindow:
 
     Attributes
     ----------
-    encounter : Encounter
     size : (float, float)
         Of the image along y and z, m.
     """

@@ -59,7 +59,6 @@ class SlabWind(NamedTuple):
 
     Attributes
     ----------
-    wind : Dataset
     flags : tuple of str
         What limits the images' wind (`limits`), and those of its completion.
     seconds : dict
@@ -89,17 +88,11 @@ def limits(wind: xr.Dataset) -> tuple[str, ...]:
 
 
 class SlabWinds:
-    """The winds of successive slabs by one method.
+    """The winds of successive slabs by one method; ``windows`` are options of `retrieve_wind`.
 
     By "variational" a wind starts from the last one, moved with the expected pair and changed by
     the difference of the winds of both pairs; without a pair from the last one as it is. It does
     not depend on this slab's vortices. Other methods start from nothing.
-
-    Parameters
-    ----------
-    method : ImageMethod
-    windows : mapping
-        Options of `retrieve_wind`.
     """
 
     def __init__(self, method: ImageMethod, windows: dict[str, Any]) -> None:
@@ -118,18 +111,9 @@ class SlabWinds:
     # no derivatives are recorded, as in `Estimator.pair_of`
     @torch.inference_mode()
     def prepare(self, slab: FirstImage, before: VortexPairFit | None) -> float:
-        """Do the part of the next wind that does not need the second image.
+        """Do the part of the next wind that needs no second image; its duration, s.
 
-        Parameters
-        ----------
-        slab : FirstImage
-        before : VortexPairFit, optional
-            Found in the last slab.
-
-        Returns
-        -------
-        float
-            Duration, s.
+        ``before`` is the pair found in the last slab.
         """
         began = self._clock()
         self._slab, start = slab, self._start(slab, before)

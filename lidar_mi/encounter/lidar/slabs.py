@@ -169,11 +169,8 @@ class Air:
 
     Attributes
     ----------
-    wake : WakeAlongPath
-    texture : PeriodicTexture
     background, molecules : float
         Extinction coefficients, m^-1: mean of the aerosol, and of the air itself.
-    gates : Gates
     margin : (float, float)
         Reach of the beams beyond the nodes, along y and z, m.
     """
