@@ -87,7 +87,6 @@ def draw_all(
 
     Parameters
     ----------
-    truth : lidar_mi.experiment.truth.extinction.Truth
     scans : two xr.Dataset
         The rendered scans.
     found : xr.Dataset, dims (source, algorithm, z, y)

@@ -38,7 +38,6 @@ class Points(NamedTuple):
         0, 1, ...
     failed : xr.DataArray
         Whether no member of it is done.
-    link : xr.DataArray
     """
 
     number: xr.DataArray

@@ -20,13 +20,7 @@ _SIDES = (("v", "nearer vortex"), ("^", "farther vortex"))
 def draw_slices(
     folder: Path, lines: xr.Dataset, vortices: xr.Dataset, log: Progress
 ) -> list[Drawn]:
-    """Figures of vertical slices.
-
-    Parameters
-    ----------
-    lines, vortices : xr.Dataset
-        From `coherent_lines` and `line_vortices`.
-    """
+    """Figures of vertical slices, from `coherent_lines` and `line_vortices`."""
     plates = [
         ("fig30_slices", "Vertical slices", _slices(lines, vortices)),
         ("fig31_vortex_track", "The vortices by age", _track(vortices)),

@@ -61,7 +61,6 @@ def draw_all(
 
     Parameters
     ----------
-    doppler : lidar_mi.schema.doppler.Doppler
     exposure : lidar_mi.experiment.stages.ring_images.Exposure
         Images of the laser and of the air at the first speed, without and with noise.
     samples : xr.Dataset or None

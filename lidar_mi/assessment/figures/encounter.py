@@ -44,18 +44,9 @@ def draw_all(
     span: float,
     log: Progress,
 ) -> list[Drawn]:
-    """Draw all figures of a flight.
+    """Draw all figures of a flight of an aircraft of this span (m).
 
-    Parameters
-    ----------
-    folder : Path
-    series : xr.Dataset, dims (flight, time)
-    track : xr.Dataset or None, dims (source, slab)
-    slabs : xr.Dataset or None
-        Images and vectors of the slabs.
-    span : float
-        Of the aircraft, m.
-    log : callable
+    The series has dims (flight, time), the track (source, slab); slabs are images and vectors.
     """
     plates = [("fig30_roll", "Roll angle and roll rate", _roll(series))]
     if track is not None and track.sizes["slab"]:

@@ -53,12 +53,7 @@ def film(
 ) -> Iterator[Frame]:
     """Frames from the first slab delivered to the end of the flight; none without images.
 
-    Parameters
-    ----------
-    series, track, slabs : xr.Dataset
-        As of `lidar_mi.assessment.figures.encounter.draw_all`.
-    span : float
-        Of the aircraft, m.
+    Arguments are those of `lidar_mi.assessment.figures.encounter.draw_all`.
     """
     times = frame_times(series, track, slabs)
     if track is None or slabs is None or not times:

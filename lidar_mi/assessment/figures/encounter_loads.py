@@ -14,13 +14,7 @@ Lines = Callable[[Axes, xr.Dataset, str, float], None]
 
 
 def load_factor(series: xr.Dataset, lines: Lines) -> Plate:
-    """Load factor, bending of the wing root, pitch rate and deflections over time.
-
-    Parameters
-    ----------
-    series : xr.Dataset, dims (flight, time)
-    lines : callable
-    """
+    """Load factor, bending of the wing root, pitch rate and deflections over time."""
     figure = Figure(figsize=(10.5, 9.0), layout="compressed")
     load, bending, rate, controls = figure.subplots(4, 1, sharex=True, height_ratios=(3, 2, 2, 2))
     port, starboard = series["port_bending"], series["starboard_bending"]

@@ -21,10 +21,7 @@ from lidar_mi.assessment.metrics.error_budget import (
 def draw_all(folder: Path, budgets: Budgets, log: Progress) -> list[Drawn]:
     """Draw the fractions of all causes as a PNG into ``folder``; nothing if none is known.
 
-    Parameters
-    ----------
-    budgets : mapping of str to mapping
-        From `lidar_mi.assessment.metrics.error_budget.error_budget`, by method.
+    Budgets are those of `lidar_mi.assessment.metrics.error_budget.error_budget`, by method.
     """
     known = {method: budget for method, budget in budgets.items() if causes_of(budget)}
     if not known:

@@ -26,8 +26,6 @@ class Mark(NamedTuple):
         Ends of the cell, in data; equal ends: a dot.
     text : str
         What it shows, as text.
-    colour : str
-    link : str
     """
 
     point: int

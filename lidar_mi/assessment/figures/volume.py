@@ -38,12 +38,8 @@ def draw_all(
 ) -> list[Drawn]:
     """Draw the figures of a run with volumes as PNG into ``folder``.
 
-    Parameters
-    ----------
-    found : xr.Dataset
-        From `lidar_mi.experiment.stages.volume.volume_winds`.
-    volumes : sequence of xr.DataArray, dims (x, z, y)
-        Attenuated backscatter at both times.
+    Winds are those of `lidar_mi.experiment.stages.volume.volume_winds`; volumes (x, z, y) are
+    attenuated backscatter.
     """
     source = found["source"].values[-1]
     best = found.sel(source=source).isel(algorithm=-1)

@@ -12,10 +12,7 @@ _MOST_CURVES = 6
 def draw_wind_profiles(winds: xr.Dataset, title: str = "") -> Figure:
     """Valid winds over height: of up to six profiles as points with 95 % intervals, else as maps.
 
-    Parameters
-    ----------
-    winds : xr.Dataset
-        As of `fit_winds_to_lines`.
+    Winds are those of `fit_winds_to_lines`.
     """
     figure = Figure(figsize=(11, 6), layout="constrained")
     if title:

@@ -220,7 +220,6 @@ def boundaries(margin: Interval, logarithmic: bool) -> list[Boundary]:
     ----------
     margin : Interval
         On one dimension with a coordinate in ascending or descending order.
-    logarithmic : bool
     """
     (knob,) = margin.mean.dims
     order = np.argsort(margin.mean[knob].values)

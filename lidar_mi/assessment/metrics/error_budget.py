@@ -307,7 +307,6 @@ def error_budget(
         The same from `images_without`, by cause, and from `moved_rigidly` as `shear`.
     truth : xr.Dataset
         v, w on (z, y).
-    cores : sequence of Core
     perfect : xr.Dataset, optional
         The same from the air without noise or blur: the cause `method` is its deviation from the
         truth.

@@ -121,7 +121,6 @@ def judge(
 
     Parameters
     ----------
-    table : RequirementTable
     measured : mapping
         The sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known. Names
         without a row in the table are ignored.

@@ -17,7 +17,6 @@ class RingBudget:
         Of a pulse on the whole image: of the laser, of the sun; photoelectrons of the laser's.
     line_width, free_spectral_range : float
         Hz.
-    finesse : float
     velocity_range : float
         Unambiguous range of line-of-sight velocities, m s^-1.
     speckle_modes : float

@@ -110,7 +110,6 @@ def sobol_indices(
         The metric. NaN: no value. The mean over the members of a point is analysed.
     logarithmic : sequence of str
         Knobs that were sampled in their logarithm.
-    seed : int
 
     Raises
     ------

@@ -20,12 +20,10 @@ class LidarCost:
 
     Attributes
     ----------
-    pulses_per_second : float
     average_power : float
         W.
     beams : int
         Directions that must be measured simultaneously, because of the time of flight.
-    photons_per_direction : float, optional
     permissible_exposure : float, optional
         J m^-2, of each pulse; None: its pulses have no duration, hence no limit.
     hazard_distance, aided_hazard_distance : float, optional
@@ -178,19 +176,10 @@ def cost_metrics(costs: Mapping[str, LidarCost]) -> dict[str, float]:
 def margin_metrics(
     judged: Sequence[tuple[RequirementTable, Sequence[Finding]]], speed: float
 ) -> dict[str, float]:
-    """Margins to the requirements of the phase that is flown.
+    """Margins to the requirements of the phase that is flown at a speed (m/s).
 
-    Parameters
-    ----------
-    judged : sequence of (RequirementTable, sequence of Finding)
-    speed : float
-        Of the aircraft, m/s.
-
-    Returns
-    -------
-    dict of str to float
-        ``sensor.APPLICATION.PHASE.applies``, 1 or 0, of every table; of those that apply
-        ``sensor.APPLICATION.PHASE.QUANTITY.margin``.
+    They are ``sensor.APPLICATION.PHASE.applies``, 1 or 0, of every table; of those that apply
+    ``sensor.APPLICATION.PHASE.QUANTITY.margin``.
     """
     applying = {
         f"sensor.{table.application}.{table.phase}.applies": float(table.applies_at(speed))

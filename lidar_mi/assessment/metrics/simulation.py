@@ -77,7 +77,6 @@ class SimulationPart(NamedTuple):
 
     Attributes
     ----------
-    method : str
     fraction : float
         Of the mean square error that is noise of the simulation, 1 at most.
     place : str

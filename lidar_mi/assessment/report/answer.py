@@ -42,7 +42,6 @@ def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged 
 
     Parameters
     ----------
-    experiment : lidar_mi.schema.experiment.Experiment
     metrics : mapping of str to float
         Of a run.
     judged : sequence of (RequirementTable, list of Finding)

@@ -44,7 +44,6 @@ def backscatter_chapter(
 
     Parameters
     ----------
-    experiment : lidar_mi.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     judged : sequence of (RequirementTable, list of Finding)

@@ -90,16 +90,8 @@ def page(
 ) -> str:
     """Settings, metrics and figures of the variants of a study, as self-contained HTML.
 
-    Parameters
-    ----------
-    name : str
-        Of the study.
-    settings : mapping of variant to experiment
-        As nested sections, with all defaults.
-    metrics : mapping of variant to metrics
-    drawn : sequence of Drawn
-    answers : mapping of variant to list of str
-        From `lidar_mi.assessment.report.answer.answer`.
+    Settings are nested sections with all defaults, by variant; answers are those of
+    `lidar_mi.assessment.report.answer.answer`.
     """
     from lidar_mi.assessment.report.page import picture, script, template
 

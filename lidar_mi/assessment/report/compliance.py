@@ -9,12 +9,7 @@ _VERDICTS = {True: "fulfilled", False: "not fulfilled", None: "not judged in all
 def compliance(judged: Judged, speed: float, legend: str) -> Tables | None:
     """Tables of the phases that are flown at an air speed (m/s), row by row; None: there are none.
 
-    Parameters
-    ----------
-    judged : sequence of (RequirementTable, list of Finding)
-    speed : float
-    legend : str
-        How the sensor's properties were measured.
+    The legend says how the sensor's properties were measured.
     """
     flown = [one for one in judged if one[0].applies_at(speed)]
     if not flown:

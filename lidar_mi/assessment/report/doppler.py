@@ -13,14 +13,7 @@ from lidar_mi.schema.doppler import Doppler, RingRetrieval
 def doppler_chapter(
     doppler: Doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn]
 ) -> Chapter:
-    """Rings and line-of-sight winds of the Doppler lidar.
-
-    Parameters
-    ----------
-    doppler : lidar_mi.schema.doppler.Doppler
-    metrics : mapping
-        From `lidar_mi.experiment.measure.measure`.
-    """
+    """Rings and line-of-sight winds of the Doppler lidar."""
     purpose = (
         "A Doppler lidar images its backscatter through an etalon onto a CCD; the wind along the "
         "line of sight follows from the radii of the rings."

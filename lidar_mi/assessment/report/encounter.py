@@ -136,8 +136,6 @@ def encounter_chapter(
         From `lidar_mi.assessment.metrics.encounter.encounter_metrics`.
     judged : sequence of (RequirementTable, findings)
         What was measured in flight against the requirements of flight control.
-    drawn : sequence of Drawn
-    film : Film, optional
     controller : str
         Name of a controller of one's own.
     met : {"wake", "air"}

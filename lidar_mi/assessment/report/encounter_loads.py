@@ -14,13 +14,7 @@ _ADVERBS = {
 
 
 def loads_answer(metrics: Mapping[str, float]) -> list[str]:
-    """Largest changes of the load factor.
-
-    Parameters
-    ----------
-    metrics : mapping
-        From `lidar_mi.assessment.metrics.encounter.encounter_metrics`.
-    """
+    """Largest changes of the load factor."""
     key = "encounter.{}.largest_load_increment"
     found = {mode: metrics[key.format(mode)] for mode in MODES if key.format(mode) in metrics}
     if not found:

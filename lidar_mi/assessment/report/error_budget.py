@@ -53,14 +53,7 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
 
 
 def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
-    """The error budget of the cross-flow wind.
-
-    Parameters
-    ----------
-    budgets : mapping
-        As `draw_all` takes it.
-    drawn : sequence of Drawn
-    """
+    """The error budget of the cross-flow wind."""
     numbers = Tables(
         heading="Errors without each cause in turn",
         legend="Rms errors in m/s of v and w, and the fraction of the mean square error of both "

@@ -45,7 +45,6 @@ class Film(NamedTuple):
 
     Attributes
     ----------
-    title, caption : str
     frames : sequence of (bytes, str)
         WebP images and what each shows; of a video, the one shown before it plays.
     seconds : float
@@ -79,11 +78,8 @@ class Chapter(NamedTuple):
 
     Attributes
     ----------
-    title : str
     lead : sequence of str
         Paragraphs before the figures.
-    drawn : sequence of Drawn
-    numbers : Tables
     verdict : Tables, optional
         Compliance with the requirements; placed on the first page.
     vectors : dict, optional
@@ -115,14 +111,12 @@ def page(
 
     Parameters
     ----------
-    experiment : lidar_mi.schema.experiment.Experiment
     resolved : str
         The experiment with all defaults, as YAML.
     versions : mapping
         Of lidar-mi and the libraries.
     metrics : mapping
         All numbers of the run.
-    chapters : sequence of Chapter
     warnings : sequence of str
         Those that matter for the results.
     answer : sequence of str

@@ -22,16 +22,7 @@ def sensor_chapter(
 ) -> Chapter:
     """Winds of both lidars together, and their compliance with requirements.
 
-    Parameters
-    ----------
-    experiment : lidar_mi.schema.experiment.Experiment
-    metrics : mapping
-        From `lidar_mi.experiment.measure.measure`.
-    judged : sequence of (RequirementTable, list of Finding)
-        Empty: no requirements.
-    drawn : sequence of Drawn
-    vectors : dict, optional
-        From `vector_map.map_data`.
+    Without requirements nothing is judged. Vectors are those of `vector_map.map_data`.
     """
     speed = experiment.platform.speed
     purpose = (

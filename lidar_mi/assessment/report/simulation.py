@@ -25,12 +25,6 @@ def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) ->
 
     Which part of the images' noise it is, of volumes, whose winds are not retrieved once more, and
     where no method has a vector that is valid with this noise and with as much again.
-
-    Parameters
-    ----------
-    experiment : lidar_mi.schema.experiment.Experiment
-    metrics : mapping of str to float
-        Of a run.
     """
     if _SAMPLES not in metrics:
         return ""

@@ -21,17 +21,7 @@ _METHODS = tuple(dict.fromkeys((*ImageMethod, *VolumeMethod)))
 def summary(metrics: Mapping[str, float], averaged: Sequence[int] = ()) -> list[Table]:
     """Errors of the line-of-sight velocities, of the winds, and of the wind from both lidars.
 
-    Parameters
-    ----------
-    metrics : mapping of str to float
-        Of a run.
-    averaged : sequence of int
-        Numbers of images of rings that the experiment averages, ``doppler.retrieval.averaged``.
-
-    Returns
-    -------
-    list of Table
-        Of the run's results.
+    The experiment averages ``averaged`` images of rings, its ``doppler.retrieval.averaged``.
     """
     tables = []
     if averaged:

@@ -23,7 +23,6 @@ def map_data(
         ``NAME`` and ``NAME_true`` of every component, m/s, v and w among them; ``NAME_stderr``
         where there are any; ``flag`` with its CF attributes. Vectors are at y_vector, z_vector
         or, where these are missing, at the nodes.
-    components : sequence of str
     cores : sequence of Core
         True vortices.
     colour : str

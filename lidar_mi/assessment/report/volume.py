@@ -15,14 +15,7 @@ from lidar_mi.schema.experiment import Experiment
 def volume_chapter(
     experiment: Experiment, metrics: Mapping[str, float], drawn: Sequence[Drawn]
 ) -> Chapter:
-    """Volumes of the backscatter lidar and the winds retrieved from them.
-
-    Parameters
-    ----------
-    experiment : lidar_mi.schema.experiment.Experiment
-    metrics : mapping
-        From `lidar_mi.experiment.measure.measure`.
-    """
+    """Volumes of the backscatter lidar and the winds retrieved from them."""
     scan = experiment.scan
     purpose = (
         f"A backscatter lidar scans {scan.gate_count} slabs of "
