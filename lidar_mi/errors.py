@@ -46,13 +46,7 @@ def _escaped(character: str) -> str:
 
 
 class Stopped(BaseException):
-    """A signal asks the program to end.
-
-    Attributes
-    ----------
-    number : int
-        Of the signal.
-    """
+    """A signal, of this number, asks the program to end."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)

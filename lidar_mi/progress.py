@@ -40,16 +40,6 @@ def progress(console: Console | None = None) -> AbstractContextManager[Notice]:
 
     A bar with a clock on a terminal and in a notebook, gone at the end; a line for every step where
     the output is a file or a pipe. Warnings, which are texts that begin so, stay.
-
-    Parameters
-    ----------
-    console : rich.console.Console, optional
-        Default: standard error.
-
-    Returns
-    -------
-    context manager
-        Gives the callable to which steps are reported.
     """
     console = console or Terminal(stderr=True)
     if console.is_jupyter:

@@ -74,16 +74,10 @@ def _fraction_of(preview: Preview, fraction: float) -> Preview:
 
 
 def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
-    """Levelling alone: the roll rate -roll / time is asked for.
+    """Levelling alone: the roll rate -roll / time (s) is asked for; without a time nothing steers.
 
     The aileron deflects by L_p / L_da roll / time. Without limits and slow against the roll mode,
     a bank angle decays with this time.
-
-    Parameters
-    ----------
-    aircraft : AircraftModel
-    time : float or None
-        s; None: nothing steers.
     """
     power = aircraft.control_moments[0, 0]
     gain = aircraft.roll_damping / (power * time) if time and power else 0.0
@@ -109,10 +103,6 @@ def feedforward(aircraft: AircraftModel) -> Controller:
 
     A preview of no loads makes it an autopilot that holds the wings level as well as the ailerons
     can, and the path.
-
-    Parameters
-    ----------
-    aircraft : AircraftModel
     """
     limits, moments = aircraft.limits, aircraft.control_moments
     rising = aircraft if isinstance(aircraft, RisingAircraft) else None
@@ -186,19 +176,13 @@ def _roll_plan(aircraft: AircraftModel) -> Callable[[AircraftState, np.ndarray, 
 
 
 def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Controller:
-    """Deflections whose moments cancel the predicted ones at every moment, and levelling.
+    """Deflections whose moments cancel the predicted ones at every moment; levels as `wings_level`.
 
     The moments -M(t) are distributed over the controls by least squares of `control_moments`,
     within the limits of deflection. A control that cannot follow fast enough starts early: of all
     deflections, the one nearest to today's need is taken from which the needs of the next seconds
     can be reached at the control's rate; where there is none, the middle between the two that
     contradict each other most. The horizon is the time from stop to stop.
-
-    Parameters
-    ----------
-    aircraft : AircraftModel
-    levelling_time : float or None
-        As in `wings_level`.
     """
     level = wings_level(aircraft, levelling_time)
     # an aircraft that only rolls has one control: the pseudo-inverse leaves the others at zero

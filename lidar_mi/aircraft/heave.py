@@ -150,15 +150,8 @@ def derivatives_of(aircraft: Aircraft, speed: float, density: float) -> np.ndarr
     the wing's normal with u_w = V alpha - q x_w, along the tail's with V alpha - q x_t less the
     downwash epsilon u_w, epsilon = 2 a / (pi A), that left the wing by (x_w - x_t) / V before. To
     first order in this delay the derivatives are those of Etkin and Reid 1996, chapter 5 (pitch
-    rate, rate of the angle of attack). Lift is quasi-steady.
-
-    Parameters
-    ----------
-    aircraft : lidar_mi.schema.encounter.Aircraft
-    speed : float
-        V, m/s.
-    density : float
-        Of the air, kg m^-3.
+    rate, rate of the angle of attack). Lift is quasi-steady. V is in m/s, the density of the air in
+    kg m^-3.
     """
     keys, pressure = aircraft.heave, 0.5 * density * speed**2
     wing, tail, downwash = _slopes(aircraft)

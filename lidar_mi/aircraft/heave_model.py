@@ -36,14 +36,7 @@ _Z, _HEAVE, _ROLL, _STATES = 0, slice(1, 4), slice(4, 6), 6
 
 
 class HeaveModel:
-    """An aircraft with three degrees of freedom; a model of `aircraft.RisingAircraft`.
-
-    Parameters
-    ----------
-    aircraft : lidar_mi.schema.encounter.Aircraft
-    path : lidar_mi.schema.encounter.Path
-        Speed and altitude.
-    """
+    """An aircraft with three degrees of freedom; a model of `aircraft.RisingAircraft`."""
 
     def __init__(self, aircraft: Aircraft, path: Path) -> None:
         keys, speed = aircraft.heave, path.speed

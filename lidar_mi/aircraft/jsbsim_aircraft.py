@@ -185,7 +185,6 @@ def state_in_path(
 
     Parameters
     ----------
-    fdm : jsbsim.FGFDMExec
     origin : ndarray, shape (3,)
         Of the path, as `neu_place`, m; the path goes north.
     climb : float

@@ -46,12 +46,6 @@ def check_aeroplane(name: str, path: Path) -> None:
     JSBSim computes its aerodynamic forces at the speed and altitude of the path, at angles of
     attack of 0 and 4 degrees, and at the latter with the ailerons deflected.
 
-    Parameters
-    ----------
-    name : str
-        Of an aircraft of JSBSim.
-    path : lidar_mi.schema.encounter.Path
-
     Raises
     ------
     InputError
@@ -92,7 +86,6 @@ def trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec
     ----------
     name : str
         Of an aircraft of JSBSim.
-    path : lidar_mi.schema.encounter.Path
     flap_settings : sequence of float
         0 to 1, in the order in which they are tried; see `LARGEST_INCIDENCE`.
 

@@ -45,13 +45,7 @@ now, shape (2,); the ailerons that roll, now and as planned (rad), shape (`KNOTS
 
 
 def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
-    """The plan of an aircraft. Roll has the first claim on the ailerons' travel and rate.
-
-    Parameters
-    ----------
-    heave : Heave
-    limits : Limits
-    """
+    """The plan of an aircraft. Roll has the first claim on the ailerons' travel and rate."""
     largest = np.array([limits.deflection[1], limits.symmetric_aileron])
     rate = np.array([limits.rate[1], limits.rate[0]])
     used = np.flatnonzero((largest > 0) & (rate > 0))

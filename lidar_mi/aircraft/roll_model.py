@@ -15,14 +15,7 @@ from lidar_mi.schema.encounter import Aircraft, Path
 
 
 class RollModel:
-    """An aircraft with one degree of freedom; a model of `aircraft.AircraftModel`.
-
-    Parameters
-    ----------
-    aircraft : lidar_mi.schema.encounter.Aircraft
-    path : lidar_mi.schema.encounter.Path
-        Speed and altitude.
-    """
+    """An aircraft with one degree of freedom; a model of `aircraft.AircraftModel`."""
 
     def __init__(self, aircraft: Aircraft, path: Path) -> None:
         self.state = AircraftState(airspeed=path.speed)

@@ -196,21 +196,7 @@ def deflected(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Controls that move to their commands at most at their rate, within their limits.
 
-    Parameters
-    ----------
-    deflection : ndarray, shape (3,)
-        Now, rad.
-    commands : Commands
-    dt : float
-        s.
-    limits : Limits
-
-    Returns
-    -------
-    after : ndarray, shape (3,)
-        Deflection after dt, rad.
-    moving : ndarray, shape (3,)
-        Time of dt in which each moves, s; it rests in the remainder.
+    The deflection (rad) after ``dt`` (s), and the time in it that each moves (s) before it rests.
     """
     target = np.clip(commands.array, -limits.deflection, limits.deflection)
     change = target - deflection
@@ -227,18 +213,7 @@ def ailerons_deflected(
     """Both ailerons, each within its limits and at most at its rate; roll has the first claim.
 
     Of the travel that a commanded roll leaves, the symmetric deflection gets what it asks for.
-
-    Parameters
-    ----------
-    aileron, symmetric : float
-        Antisymmetric and symmetric deflection now, rad.
-    commands, dt, limits
-        As in `deflected`.
-
-    Returns
-    -------
-    aileron, symmetric : float
-        After dt, rad.
+    Antisymmetric and symmetric deflection (rad) come and go in this order, as by `deflected`.
     """
     largest, way = limits.deflection[0], limits.rate[0] * dt
     rolling = float(np.clip(commands.aileron, -largest, largest))

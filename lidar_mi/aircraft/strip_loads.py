@@ -25,13 +25,7 @@ from lidar_mi.schema.aerodynamics import Aerodynamics
 
 @dataclass(frozen=True)
 class Indicial:
-    """A lift 1 - sum_i a_i exp(-b_i s) after a step, s in half chords.
-
-    Attributes
-    ----------
-    weights, rates : tuple of float
-        a and b.
-    """
+    """A lift 1 - sum_i a_i exp(-b_i s) after a step, s in half chords: weights a and rates b."""
 
     weights: tuple[float, ...]
     rates: tuple[float, ...]
@@ -51,7 +45,6 @@ class Memory:
 
     Parameters
     ----------
-    indicial : Indicial
     rate : ndarray, shape (n,)
         Half chords flown in a second, by strip.
     """
@@ -86,7 +79,6 @@ class StripLoads:
         At the start, in steady flight.
     wind : callable
         Of the path frame.
-    keys : Aerodynamics
     mass : float
         Of the aircraft, kg: its weight is the steady lift of its wing.
     """

@@ -152,13 +152,8 @@ def in_downwash(tail: Strips, section_slope: float, aspect_ratio: float) -> Stri
 
     Far behind an elliptic wing the induced angle is twice that at the wing: the tail keeps the
     fraction 1 - 2 n a_n / (pi A) of the n-th mode, with the wing's slope a_n. The downwash is
-    there at once, and that of the wind's linear parts is taken for all of it.
-
-    Parameters
-    ----------
-    tail : Strips
-    section_slope, aspect_ratio : float
-        Of the wing, as in `finite_span_slope`.
+    there at once, and that of the wind's linear parts is taken for all of it. Slope and aspect
+    ratio are the wing's, as in `finite_span_slope`.
     """
     fractions = [
         1 - 2 * n * finite_span_slope(section_slope, aspect_ratio, n) / (np.pi * aspect_ratio)
@@ -189,7 +184,6 @@ def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float)
 
     Parameters
     ----------
-    strips : Strips
     wind : array_like, shape (..., n, 3)
         Wind at the strips, in the body frame, m/s.
     airspeed : float

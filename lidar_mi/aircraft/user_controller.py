@@ -26,13 +26,7 @@ def name_of(maker: Callable[..., Any]) -> str:
 
 
 def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Controller:
-    """The controller that a function makes for an aircraft, checked at every call.
-
-    Parameters
-    ----------
-    maker : callable
-        Gives the controller of an aircraft.
-    aircraft : AircraftModel
+    """The controller that a function ``maker`` makes for an aircraft, checked at every call.
 
     Raises
     ------

@@ -159,17 +159,8 @@ def advect_to(
 
     Trajectories go on from one time to the next, in midpoint steps no longer than the shortest
     interval between times: the departure point in solid rotation is off by
-    r (omega t)^3/(6 n^2) after n steps.
-
-    Parameters
-    ----------
-    times : sequence of float
-        s, ascending; 0 is the time of ``field``.
-
-    Returns
-    -------
-    xarray.DataArray
-        float64, dims (time, ...).
+    r (omega t)^3/(6 n^2) after n steps. Times (s) ascend, 0 is that of ``field``; the result has
+    dims (time, ...) and is float64.
 
     Raises
     ------

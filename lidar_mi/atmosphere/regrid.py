@@ -20,18 +20,11 @@ def is_even(nodes: np.ndarray) -> bool:
 
 
 def even_axis(nodes: np.ndarray, low: float, high: float) -> np.ndarray:
-    """An even axis within the ends that all variables have.
+    """An even axis (m) within the ends that all variables have.
 
     An axis that is even keeps its nodes. A stretched one gets the largest step of 1, 2 or 5 times a
     power of ten that is not above its smallest step, but not more than four times the nodes, on
     whole multiples of it, and on whole metres where it is longer than 20 m.
-
-    Parameters
-    ----------
-    nodes : (n,) array
-        m, ascending.
-    low, high : float
-        m.
     """
     if is_even(nodes):
         exact = np.linspace(nodes[0], nodes[-1], nodes.size)

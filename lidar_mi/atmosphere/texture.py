@@ -48,7 +48,6 @@ def gaussian_field(
         m.
     outer_scale : float
         L, m.
-    seed : int
     slope : float
         Of the line spectra.
 

@@ -57,7 +57,6 @@ class State(Status):
         Clock at the start.
     finished_before : int
         Points that were finished before this start.
-    workers : int
     dashboard : str
         Address; empty: there is none.
     """

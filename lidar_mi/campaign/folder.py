@@ -50,19 +50,7 @@ class Row(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The outcome of a point.
-
-    Attributes
-    ----------
-    status : str
-        "done" or "failed".
-    message : str
-        Why it failed.
-    seconds : dict of str to float
-        Duration by step.
-    rendered, reused : int
-        Images.
-    """
+    """The outcome of a point: "done" or "failed", why, seconds by step, and how many images."""
 
     status: str
     message: str
@@ -73,13 +61,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class CampaignFolder:
-    """A campaign's folder, with the points that its record describes.
-
-    Attributes
-    ----------
-    path : Path
-    points : Points
-    """
+    """A campaign's folder, with the points that its record describes."""
 
     path: Path
     points: Points

@@ -50,7 +50,6 @@ class Points:
 
     Parameters
     ----------
-    campaign : Campaign
     base : dict
         Keys of the base experiment.
     search_path : path

@@ -19,7 +19,6 @@ def write_report(folder: str | Path, metrics: Sequence[str] | None = None) -> Pa
 
     Parameters
     ----------
-    folder : path
     metrics : sequence of str, optional
         Names of those to show. Default: errors, requirements and vortices.
 

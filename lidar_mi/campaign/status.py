@@ -14,7 +14,6 @@ class Status(Tabular):
 
     Attributes
     ----------
-    name : str
     total, done, failed, running : int
         Points; ``running`` ones have started and not ended, or were killed.
     rendered, reused : int

@@ -97,7 +97,6 @@ def carry_out(
     ----------
     folder : str
         Of the campaign.
-    number : int
     session : str
         A name for this start of the campaign: workers killed by a point are counted within it.
     ready : sequence of int
@@ -206,11 +205,7 @@ def run_point(folder: CampaignFolder, number: int) -> Outcome:
 class PointStore:
     """Storage of a point's results: images shared by content, estimates with ``keep: estimates``.
 
-    Attributes
-    ----------
-    images : ImageStore
-    rendered, reused : int
-        Images.
+    ``rendered`` and ``reused`` count images.
     """
 
     def __init__(self, campaign: CampaignFolder, number: int, experiment: Experiment) -> None:

@@ -63,7 +63,6 @@ def end_without_result(reason: str, found: "xr.DataArray") -> NoReturn:
 
     Parameters
     ----------
-    reason : str
     found : xr.DataArray
         Flags with the CF attributes ``flag_masks`` and ``flag_meanings``; none is 0.
     """

@@ -82,17 +82,7 @@ def photons_per_energy(wavelength: float) -> float:
 def signal_photoelectrons(
     s0: ArrayLike, pulse_energy: float, wavelength: float, detector: Detector
 ) -> np.ndarray:
-    """Mean photoelectrons of an echo.
-
-    Parameters
-    ----------
-    s0 : array
-        Received energy over emitted pulse energy.
-    pulse_energy : float
-        J.
-    wavelength : float
-        m.
-    """
+    """Mean photoelectrons of an echo with ``s0`` of the emitted ``pulse_energy`` (J)."""
     return np.asarray(s0, float) * (
         pulse_energy * photons_per_energy(wavelength) * efficiency(detector)
     )

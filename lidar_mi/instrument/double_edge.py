@@ -99,19 +99,7 @@ def _both_sides(amplitudes: np.ndarray) -> np.ndarray:
 
 
 def transmission(receiver: DoubleEdge, wavelength: float, offset: ArrayLike) -> np.ndarray:
-    """Fraction of monochromatic light that passes each filter.
-
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser.
-    offset : array (N,)
-        Frequency less that of the laser, Hz.
-
-    Returns
-    -------
-    array (2, N)
-    """
+    """Fraction (2, N) of light ``offset`` Hz (N,) from the laser's that passes each filter."""
     series = harmonics(receiver, wavelength)
     n = np.arange(series.shape[1])[:, None]
     turns = np.exp(2j * math.pi * n * np.asarray(offset, float) * receiver.delay(wavelength))

@@ -211,10 +211,6 @@ def harmonics(
         Default: monochromatic light.
     count : int, optional
         Highest harmonic; default: beyond it all others together are below 1e-12 of A_0.
-
-    Returns
-    -------
-    complex array (count + 1,)
     """
     reflectance, transmittance, _ = mirrors(etalon, wavelength)
     if count is None:

@@ -62,7 +62,6 @@ class EyeSafety:
 
     Attributes
     ----------
-    limit : PulseLimit
     exposure_at_exit : float
         J m^-2 a pulse where the beam leaves the instrument; safe from there on if not above
         ``limit.exposure``.

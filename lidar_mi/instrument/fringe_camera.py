@@ -241,15 +241,7 @@ def doppler_shift(v_los: ArrayLike, wavelength: float) -> np.ndarray:
 def ring_radii(
     camera: FringeCamera, etalon: Etalon, wavelength: float, v_los: float = 0.0
 ) -> np.ndarray:
-    """Radii of the fringes' peaks that fit into the half diagonal of the image, pixels, rising.
-
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser.
-    v_los : float
-        m/s.
-    """
+    """Radii of the fringes' peaks that fit into the half diagonal of the image, pixels, rising."""
     corner = math.hypot(camera.width, camera.height) / 2 * camera.pixel
     cosines = cosine_inside(etalon, camera.cosine(np.array([0, corner**2])))
     offset = doppler_shift(v_los, wavelength)

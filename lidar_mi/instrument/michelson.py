@@ -67,12 +67,7 @@ def harmonics(michelson: Michelson) -> np.ndarray:
     """C_0 and C_1 of every element: fraction of the light C_0 + 2 Re C_1 exp(2 pi i nu delay).
 
     nu is the frequency less that of the laser. Averaged over an element, so that the contrast falls
-    by sinc(fringes / elements).
-
-    Returns
-    -------
-    complex array (outputs x elements, 2)
-        Output A first.
+    by sinc(fringes / elements). Shape (outputs x elements, 2), output A first.
     """
     reflected = michelson.splitter_reflectance
     both = reflected * (1 - reflected)
@@ -89,17 +84,7 @@ def harmonics(michelson: Michelson) -> np.ndarray:
 
 
 def transmission(michelson: Michelson, offset: ArrayLike) -> np.ndarray:
-    """Fraction of monochromatic light that every element receives.
-
-    Parameters
-    ----------
-    offset : array (N,)
-        Frequency less that of the laser, Hz.
-
-    Returns
-    -------
-    array (outputs x elements, N)
-    """
+    """Fraction (elements, N) of light ``offset`` (N,) Hz from the laser's that they receive."""
     constant, cosine = harmonics(michelson).T[..., None]
     phasor = np.exp(2j * math.pi * np.asarray(offset, float) * michelson.delay)
     return constant.real + 2 * (cosine * phasor).real

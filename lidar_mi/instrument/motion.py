@@ -225,19 +225,7 @@ def random_process(
 def true_pose(
     motion: Motion, time: np.ndarray, speed: float, seed: int, path: Trajectory | None = None
 ) -> Pose:
-    """The true pose at times since the first scan.
-
-    Parameters
-    ----------
-    motion : Motion
-    time : (n,) array
-        s.
-    speed : float
-        Of straight flight, m/s.
-    seed : int
-        Of the experiment.
-    path : Trajectory
-        Of ``motion.trajectory``.
+    """The true pose at times (s) since the first scan, at a speed (m/s) or along a path.
 
     Raises
     ------

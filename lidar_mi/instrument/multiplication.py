@@ -15,14 +15,7 @@ def register_excess(gain: float, stages: int) -> float:
 
     F^2 = 1 + (1 - p) / (1 + p) (G - 1) / G, with G = (1 + p)^N, which is
     2 (G - 1) G^(-(N + 1) / N) + 1 / G (Robbins and Hadwen 2003, IEEE Trans. Electron Devices 50,
-    1227): 1 without gain, 2 at a high one.
-
-    Parameters
-    ----------
-    gain : float
-        G, 1 or more.
-    stages : int
-        N.
+    1227): 1 without gain, 2 at a high one. G is the gain, N the number of stages.
     """
     p = gain ** (1 / stages) - 1
     return 1 + (1 - p) / (1 + p) * (gain - 1) / gain

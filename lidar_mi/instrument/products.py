@@ -31,7 +31,6 @@ def depolarization_stderr(
 
     Parameters
     ----------
-    s0, s1 : array
     s0_stderr, s1_stderr : array
         Standard errors of S0 and S1.
     correlation : array

@@ -87,7 +87,6 @@ def reported_pose(
 
     Parameters
     ----------
-    reported : Reported
     pose_at : callable
         The true pose at times, (n,), s.
     time : (n,) array

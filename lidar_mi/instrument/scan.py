@@ -107,7 +107,6 @@ class ScanPlan:
     gate_start, gate_stop : float
         The gates together: distances along x (planar) or ranges (spherical).
     gate_kind : "planar" or "spherical"
-    gate_count : int
     position : float
         Distance of the telescope along x from the first scan, in the frame of the air, in which the
         gates are fixed.
@@ -182,7 +181,6 @@ def plan_scans(
 
     Parameters
     ----------
-    scan : Scan
     y, z : arrays
         Nodes of the wake's grid (used with ``aim: grid``), m, ascending.
     travelled : sequence of float

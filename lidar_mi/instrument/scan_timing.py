@@ -65,7 +65,6 @@ class Schedule:
         s, from the begin of the first beam to the end of the last.
     beam_rate : float
         Beams a second between turns, Hz; infinite if all are sent at once.
-    load : Load
     """
 
     time: np.ndarray

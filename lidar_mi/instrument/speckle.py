@@ -53,18 +53,8 @@ def spatial_modes(
     Gaussian footprint of incoherent scatterers makes (van Cittert-Zernike; Goodman, Speckle
     Phenomena in Optics, 2007, section 4.7). For a circular aperture that is
     a / 2 / (1 - e^-a (I_0(a) + I_1(a))) with a = 2 (pi w R / (lambda r))^2; for large a it is the
-    etendue in units of lambda^2, with A = pi R^2 and Omega = pi w^2 / r^2.
-
-    Parameters
-    ----------
-    aperture_radius : float
-        R, m.
-    wavelength : float
-        m.
-    footprint : array
-        1/e^2 radius w of the beam there, m.
-    distance : array
-        r, m.
+    etendue in units of lambda^2, with A = pi R^2 and Omega = pi w^2 / r^2. All are in m; the
+    footprint is the 1/e^2 radius w of the beam at the distance r.
     """
     footprint, distance = np.asarray(footprint, float), np.asarray(distance, float)
     a = 2 * (np.pi * footprint * aperture_radius / (wavelength * distance)) ** 2

@@ -100,8 +100,6 @@ def invert_extinction(
         As detected, with background; rows and columns ascending in z and y.
     plan : ScanPlan
         With spherical gates.
-    lidar : BackscatterLidar
-    air : LayeredAir
     counts_per_signal : float
         Counts of all pulses per S0, see `instrument.detector.signal_photoelectrons`.
     settings : RenderSettings
@@ -115,7 +113,6 @@ def invert_extinction(
         Extinction of the farthest layer, m^-1, and its relative standard error, as Klett's
         inversion needs it. Without it the error grows as exp(2 depth): at depths of 2 and more, or
         with an error of the calibration, stated errors hold with a reference alone.
-    seed : int
     start : (layers,) array, optional
         Extinction to start with, m^-1, such as that of an inversion that was stopped.
     progress : callable, optional

@@ -46,18 +46,9 @@ class Layers:
         self._depths = along / np.broadcast_to(cosines, shape)[..., None]
 
     def signal(self, extinction: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-        """The integral a of all gates and beams, and its derivative by the logarithm of every node.
+        """The integral a (gates, beams), and its derivative by the logarithm of every node.
 
-        Parameters
-        ----------
-        extinction : (nodes,) array
-            m^-1, above 0.
-        factor : float
-            q, of attenuation.
-
-        Returns
-        -------
-        (gates, beams), (gates, beams, nodes) arrays
+        The extinction (m^-1) is above 0; the factor q is that of attenuation.
         """
         weights = self._weights * np.exp(-2 * factor * (self._depths @ extinction))
         here = self._values @ extinction

@@ -79,7 +79,6 @@ def fit(
         Variance of the rendered mean counts, in addition to that of the counts.
     factor : float
         Of attenuation.
-    known : Known
     start : (nodes,) array
         m^-1.
     """

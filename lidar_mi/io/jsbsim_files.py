@@ -24,15 +24,8 @@ def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
 
     They are the properties ``external_reactions/wake-force-AXIS/magnitude`` (lbf) and
     ``external_reactions/wake-moment-AXIS/magnitude-lbsft``, in JSBSim's axes: x forward, y to
-    starboard, z down. Sockets and files that the original opens are omitted.
-
-    Parameters
-    ----------
-    root : Path
-        As in `shipped_aircraft`.
-    name : str
-    folder : Path
-        An existing folder.
+    starboard, z down. Sockets and files that the original opens are omitted. The root is that of
+    `shipped_aircraft`; the folder exists.
     """
     shutil.copytree(root / "aircraft" / name, folder / name)
     path = folder / name / f"{name}.xml"

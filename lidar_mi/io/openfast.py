@@ -20,12 +20,6 @@ def write_openfast(path: str | Path, lines: xr.Dataset) -> None:
     for air that approaches: the wind along the horizontal direction of the beam, as if there were
     none across it. Gates with a flag are NaN.
 
-    Parameters
-    ----------
-    path : path
-    lines : xr.Dataset, dims (time, range)
-        As of `read_lines_of_sight`.
-
     Raises
     ------
     InputError

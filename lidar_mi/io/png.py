@@ -18,7 +18,6 @@ def write_png(figure: "Figure", path: str | Path, *, cropped: bool = False) -> N
 
     Parameters
     ----------
-    figure : matplotlib.figure.Figure
     path : str or Path
     cropped : bool
         Without the space around the panels except 0.1 inch, which is large with equal scales.
@@ -33,22 +32,11 @@ def png_bytes(figure: "Figure") -> bytes:
 
 
 def write_preview(path: str | Path, pixels: np.ndarray) -> tuple[float, float]:
-    """Write an image of light as 8-bit grey, for viewers that know no EXR.
+    """Write an image of light (top row first) as 8-bit grey, for viewers that know no EXR.
 
     Grey is linear between black, the value below which 0.5 % of the pixels are, and white, which
     0.5 % exceed: what is there is seen, however faint its contrast. An image of one value is grey.
-    What is not finite is black.
-
-    Parameters
-    ----------
-    path : str or Path
-    pixels : (rows, columns) array
-        Top row first.
-
-    Returns
-    -------
-    black, white : float
-        Values of the image, in its units.
+    What is not finite is black. Black and white, in the image's units, are returned.
     """
     from PIL import Image
 

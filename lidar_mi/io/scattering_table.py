@@ -114,16 +114,7 @@ def is_complete(path: Path) -> bool:
 def aerosol_table(
     name: str, wavelength: float, notice: Notice = lambda text, fraction: None
 ) -> ScatteringTable:
-    """The table of a named aerosol: the shipped one, or else a new one from `make_table`.
-
-    Parameters
-    ----------
-    name : str
-        A name in `AEROSOLS`.
-    wavelength : float
-        m, in vacuum.
-    notice : callable, optional
-        As in `make_table`.
+    """The table of one of `AEROSOLS` at a wavelength (m): the shipped one, or one of `make_table`.
 
     Raises
     ------

@@ -22,7 +22,6 @@ def check_size(path: str | Path, size: int, what: str = "it") -> None:
 
     Parameters
     ----------
-    path : path
     size : int
         Bytes, unpacked.
     what : str

@@ -25,7 +25,6 @@ def check_target(
 
     Parameters
     ----------
-    path : path
     inputs : iterable of path
         Input files, which are never replaced, under any name.
     overwrite : bool

@@ -53,11 +53,6 @@ def tolerances(times: np.ndarray, rounding: np.ndarray) -> np.ndarray:
 
     1e-3 of the way to the nearest other time or, up to 1e-2 of it, the axis' own rounding; 1 ms at
     most.
-
-    Parameters
-    ----------
-    times, rounding : (n,) arrays
-        s.
     """
     order = np.argsort(times)
     steps = np.diff(times[order])

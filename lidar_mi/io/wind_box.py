@@ -25,10 +25,6 @@ def read_bts(path: str | Path) -> xr.Dataset:
     A grid of the field at the time t is the plane x = -U t, with U the mean wind at the hub
     (Jonkman, TurbSim user's guide v2.00, annex D). Points of the tower below the grid are omitted.
 
-    Parameters
-    ----------
-    path : str or Path
-
     Returns
     -------
     xarray.Dataset

@@ -87,7 +87,6 @@ def parse_yaml(text: str, origin: str) -> Any:
 
     Parameters
     ----------
-    text : str
     origin : str
         Where it comes from, for the message: a path.
 

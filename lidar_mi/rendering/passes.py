@@ -19,12 +19,6 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
     The integrator keeps the smaller passes, for the images that follow. Images do not depend on
     them but for rounding.
 
-    Parameters
-    ----------
-    integrator : mi.Integrator
-        With ``samples_per_pass``, `gated_volpath` or `fringes`.
-    render : callable
-
     Raises
     ------
     InputError

@@ -30,7 +30,6 @@ class Samples(NamedTuple):
 
     Attributes
     ----------
-    number : int
     needed : int
         With which the fraction asked for is reached; above ``number`` where it is too many.
     fraction, median, upper : float

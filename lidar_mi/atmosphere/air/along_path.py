@@ -63,9 +63,6 @@ class AirAlongPath:
 
     Parameters
     ----------
-    wake : WakeAlongPath or None
-    parts : sequence of MovingAir
-    frame : LevelFrame
     drift : (float, float, float)
         Of the wake, m/s, path frame.
     t_c : float

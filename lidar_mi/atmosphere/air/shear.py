@@ -17,12 +17,7 @@ from lidar_mi.errors import InputError
 class LinearShear:
     """A horizontal wind that grows linearly with the height; 0 at the height of the start.
 
-    Parameters
-    ----------
-    du_dz, dv_dz : float
-        1/s.
-    height : float
-        Of the start, m.
+    ``du_dz`` and ``dv_dz`` are in 1/s, the height of the start in m.
     """
 
     du_dz: float

@@ -121,14 +121,7 @@ def flight_profile_alleviation(
 def design_gust_speed(altitude: float, gradient: float, alleviation: float = 1.0) -> float:
     """U_ds = U_ref F_g (H / 350 ft)^(1/6) of CS 25.341(a)(4), as true airspeed, m/s.
 
-    Parameters
-    ----------
-    altitude : float
-        m, in the standard atmosphere.
-    gradient : float
-        H, m.
-    alleviation : float
-        F_g.
+    The altitude (m) is in the standard atmosphere; the gradient H is in m, F_g is the alleviation.
 
     Raises
     ------

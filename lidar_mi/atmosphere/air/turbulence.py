@@ -118,7 +118,6 @@ def turbulence(
         Rms of one component, m/s, >= 0, of the whole spectrum.
     length : float
         Length scale, m, of `energy_spectrum`.
-    seed : int
     spectrum : {"von_karman", "kolmogorov"}
     shortest : float
         Shortest wavelength, m, at most a tenth of the length. Finer turbulence is missing.

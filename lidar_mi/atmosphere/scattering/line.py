@@ -167,18 +167,13 @@ def viscosity(temperature: float) -> float:
 
 
 def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -> Line:
-    """Backscattered line of air, with Brillouin scattering by thermal sound waves.
+    """Backscattered line of air (m, K, Pa), with Brillouin scattering by thermal sound waves.
 
     Three Gaussians fitted to the Tenti S6 model (Witschas 2011, Appl. Opt. 50, 267, with the
     coefficients of the erratum, Appl. Opt. 50, 5758): in the units x of 2^(1/2) 2 v0 / wavelength
     their widths and places depend on y = p / (2^(1/2) k v0 eta) alone, k = 4 pi / wavelength. Good
     to 0.85 % of the peak; the missing wings leave an rms 0.4 % (y = 0.17) to 1.5 % (y = 1) below
     that of molecules without collisions, which it should equal.
-
-    Parameters
-    ----------
-    wavelength, temperature, pressure : float
-        m, K, Pa.
 
     Raises
     ------

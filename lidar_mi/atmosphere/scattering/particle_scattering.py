@@ -64,10 +64,6 @@ def make_table(
     notice : callable, optional
         Called with a text that names the work and the fraction of it that is done.
 
-    Returns
-    -------
-    ScatteringTable
-
     Raises
     ------
     InputError

@@ -33,7 +33,6 @@ class ScatteringTable:
 
     Parameters
     ----------
-    name : str
     wavelength : float
         m, in vacuum.
     angle : array (N,)
@@ -274,7 +273,6 @@ def mix(
         All of one wavelength.
     extinctions : sequence of float
         Extinction coefficient of each in m^-1, >= 0, not all zero. Their sum is the mixture's.
-    name : str
 
     Returns
     -------

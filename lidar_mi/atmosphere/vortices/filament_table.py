@@ -63,14 +63,7 @@ class FilamentTable:
     Cubic splines of nodes 0.4 core radii apart about the lines, and 1.6 core radii apart
     farther away; beyond that, the flow of the straight pair. Both grids are computed for a quarter
     of a period: the filaments are symmetric to the plane between both vortices, and about their
-    crests.
-
-    Parameters
-    ----------
-    filaments : Filaments
-        Of `lidar_mi.atmosphere.vortices.crow.crow_filaments`.
-    crest : float
-        s of a crest, m.
+    crests. ``crest`` is the s of one (m).
 
     Raises
     ------

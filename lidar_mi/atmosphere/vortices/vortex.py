@@ -111,20 +111,9 @@ def tangential_speed(
 def velocity(
     vortices: Sequence[Vortex], y: ArrayLike, z: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cross-flow velocity of a set of vortices, by superposition.
+    """Cross-flow velocity v, w (m/s) of a set of vortices at places y, z (m), by superposition.
 
     A vortex at (y0, z0) gives v = -v_t (z - z0)/r and w = +v_t (y - y0)/r.
-
-    Parameters
-    ----------
-    vortices : sequence of Vortex
-    y, z : array_like
-        Positions, m; they broadcast.
-
-    Returns
-    -------
-    v, w : ndarray
-        m s^-1, the broadcast shape of `y` and `z`.
     """
     y, z = np.broadcast_arrays(np.asarray(y, dtype=float), np.asarray(z, dtype=float))
     v, w = np.zeros(y.shape), np.zeros(y.shape)

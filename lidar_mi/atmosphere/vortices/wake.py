@@ -54,10 +54,6 @@ def resample(
     most : int
         Nodes.
 
-    Returns
-    -------
-    xarray.Dataset
-
     Raises
     ------
     InputError
@@ -125,7 +121,6 @@ def centre(
 
     Parameters
     ----------
-    wake : xarray.Dataset
     y, z : float, optional
         m, in the wake's own frame and inside it; default: the middle of the domain.
     about : (float, float)

@@ -46,7 +46,6 @@ def measured_lines(
         Of a gate times pulses of a line.
     bandwidth : float
         Of the receiver as a range of velocities, m/s.
-    seed : int
 
     Returns
     -------

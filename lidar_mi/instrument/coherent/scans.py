@@ -105,7 +105,6 @@ def dbs_scan(
         Of the slanted beams, rad.
     accumulation, move : float
         Time of a beam, and from one to the next, s.
-    vertical : bool
     count : int
         Cycles.
     """

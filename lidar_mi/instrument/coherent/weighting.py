@@ -33,7 +33,6 @@ class CoherentLidar:
         Of the time window of an estimate, m; gates closer than this overlap.
     first_gate, gate_step : float
         Middle of the first gate, distance of the next, m.
-    gates : int
     """
 
     wavelength: float = 1.543e-6
@@ -96,7 +95,6 @@ def echo_shift(ranges: np.ndarray, ratio: np.ndarray, lidar: CoherentLidar) -> n
     ----------
     ranges, ratio : (gates,) arrays
         Middles of the gates, m, and signal-to-noise ratio there, above 0.
-    lidar : CoherentLidar
     """
     variance = lidar.pulse_length**2 / (8 * math.log(2)) + lidar.gate_length**2 / 12
     return variance * np.gradient(np.log(ratio), ranges)
@@ -142,7 +140,6 @@ def gate_moments(
         `WindField`.
     scan : LineScan
         Every line at its own time; a moving beam averages over the angle that it moves through.
-    lidar : CoherentLidar
     origin : (float, float, float)
         Place of the lidar, m.
     resolution : float

@@ -40,7 +40,6 @@ def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
 
     Parameters
     ----------
-    path : Path
     names : mapping
         Ours to those of the head, without unit; a minus sign before that of radial_velocity turns
         its sign, a plus sign retains it, whatever comments say of it. Rows of the same time and

@@ -85,7 +85,6 @@ def read_netcdf_lines(path: Path, names: Mapping[str, str]) -> list[Scan]:
 
     Parameters
     ----------
-    path : Path
     names : mapping
         Ours to the file's, before those known; a minus sign before the name of radial_velocity
         turns its sign, a plus sign retains it, whatever the file says of it.

@@ -19,7 +19,6 @@ class Frames:
 
     Attributes
     ----------
-    count : int
     read : callable
         Images of the given numbers, (n, height, width), top row first, in the file's type.
     channels : bool
