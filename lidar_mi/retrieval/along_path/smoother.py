@@ -81,14 +81,8 @@ class Basis:
 class Lattice:
     """Nodes in a plane about the path; as they are hashable, bases on them can be stored.
 
-    Attributes
-    ----------
-    half_width, half_height : float
-        The least reach of the nodes, m.
-    spacing : float
-        m.
-    y, z : float
-        Place of one of the nodes, m.
+    ``half_width`` and ``half_height`` are the least reach of the nodes, (y, z) the place of one;
+    all in m.
     """
 
     half_width: float

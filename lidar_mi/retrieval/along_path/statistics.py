@@ -127,18 +127,13 @@ def _expected(shape: tuple[int, int], window: float, stride: float) -> _Expected
 
 @dataclass(eq=False)
 class StatisticsEstimator:
-    """Learns `Statistics` from slab to slab by their likelihood.
+    """Learns `Statistics` from slab to slab, a stride (m) apart, by their likelihood.
 
     Cosines of a slab are nearly independent (Whittle 1954), and each depends on the same cosine of
     the slab before (Vecchia 1988, J. R. Stat. Soc. B 50): the likelihood is that of the Gaussian
     conditional distributions, for every combination of `LENGTHS`, `MEANS` and `RATIOS`, each with
     the variance that is most likely. The prior probability of all is the same but for the scale of
     the errors; the most probable combination is taken.
-
-    Attributes
-    ----------
-    stride : float
-        From slab to slab, m.
     """
 
     stride: float

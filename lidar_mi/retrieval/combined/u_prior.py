@@ -151,16 +151,8 @@ def evidence_of(
     """Evidence of standard deviations of u for several shapes of its covariance.
 
     Where ``fixed`` is white, one rotation makes S = fixed + std^2 shape tridiagonal for all
-    standard deviations.
-
-    Parameters
-    ----------
-    fixed : array (lines, lines)
-        Covariance of the lines' velocities without u's, positive definite.
-    residual : array (lines,)
-        Velocities less their expectation.
-    shapes : array (shapes, lines, lines)
-    stds : array (stds,)
+    standard deviations. ``fixed`` (lines, lines) is the covariance of the lines' velocities without
+    u's, positive definite; the ``residual`` (lines,) is theirs from what is expected.
 
     Returns
     -------

@@ -48,22 +48,8 @@ def cross_correlation(
     correlation lengths in a window the peak is no Gaussian: expect 0.1 px rms without any noise
     for an 8 px template on texture of 3 px correlation length. A displacement beyond
     (search - template) // 2 - 1/2 px is out of range; its peak lies on the rim and is flagged.
-
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y)
-        On one device, where the result stays too.
-    template, search, stride : int
-        Pixels, see `windows.Windows`.
-    min_correlation : float
-        Peaks below are flagged; -1 to 1.
-    algorithm : {"auto", "dense", "fft"}
-        See `correlate`.
-
-    Returns
-    -------
-    Displacement
-        `score` is the correlation at the integer peak.
+    Pixels are those of `windows.Windows`. Peaks below ``min_correlation`` are flagged; the
+    algorithms are those of `correlate`. The `score` is the correlation at the integer peak.
 
     Raises
     ------

@@ -82,16 +82,8 @@ def first_pass(
     neighbours' median.
     Images are also correlated by windows of half and of a quarter of the size. These count where
     the images, warped by what they find, correlate better by 0.1: in a rotation of 0.3 px per px
-    the texture at the rim of a window of 32 px moves 5 px away from that in the middle.
-
-    Parameters
-    ----------
-    images : sequence of torch.Tensor
-        The first two of them count.
-    spline : Spline
-        Through the images, band-limited.
-    windows : Windows
-        Of the last pass.
+    the texture at the rim of a window of 32 px moves 5 px away from that in the middle. Of the
+    first two images, whose spline is band-limited; the windows are those of the last pass.
     """
     if windows.dims > 2:
         d, centres = _of_volumes(images, spline, windows)

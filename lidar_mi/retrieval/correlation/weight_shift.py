@@ -32,19 +32,9 @@ def weight_shift(
 
     Most of its errors are candidates confused, of up to the size of the search region, and not
     normally distributed. Of a known motion (`bootstrap`) it then finds few vectors again, so that
-    `retrieve_wind` flags all of them on random textures: their errors are unknown.
-
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y)
-        Not negative on the whole: templates need a positive weight. On one device.
-    template, search, stride : int
-        Pixels, see `windows.Windows`.
-
-    Returns
-    -------
-    Displacement
-        `score` is the mismatch sqrt(J) of the best candidate.
+    `retrieve_wind` flags all of them on random textures: their errors are unknown. Templates need a
+    positive weight; pixels are those of `windows.Windows`. The `score` is the mismatch sqrt(J) of
+    the best candidate.
 
     Raises
     ------

@@ -95,12 +95,8 @@ class Band:
 
     A form is held as its band: (component, component, shift z, knot z, shift y, knot y),
     the coefficient at a knot against that at knot + shift, shifts from -3 to 3 in z and from 0 to
-    3 in y. Couplings with knots beyond the first or last row do not count.
-
-    Attributes
-    ----------
-    rows, columns : int
-        Knots along z and y.
+    3 in y. Couplings with knots beyond the first or last row do not count. There are ``rows`` and
+    ``columns`` of knots along z and y.
     """
 
     rows: int

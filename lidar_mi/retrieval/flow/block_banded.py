@@ -46,12 +46,9 @@ class Factor(NamedTuple):
 
 
 def factor(columns: torch.Tensor) -> Factor:
-    """Factor matrices with the blocks A[k + j, k], j = 0 to reach.
+    """Factor matrices with the blocks A[k + j, k], j = 0 to reach, (blocks, ..., (1 + reach) n, n).
 
-    Parameters
-    ----------
-    columns : torch.Tensor, shape (blocks, ..., (1 + reach) n, n)
-        Blocks beyond the last one must be 0.
+    Blocks beyond the last one must be 0.
 
     Raises
     ------

@@ -93,22 +93,7 @@ def line_offsets(
     not linear, flow and offsets are estimated in turn, from images without the offsets before.
     Other structure that is taken for offsets remains, or grows from fit to fit. The first ones are
     those of R = 1: a flow that has taken offsets for motion has a prior so weak that it would keep
-    them.
-
-    Parameters
-    ----------
-    images : Images
-        Two.
-    linear : Linear
-        About the flow.
-    mesh : Mesh
-        Of the pixels.
-    coefficients : torch.Tensor
-        Of the flow.
-    response : callable
-        See `components.Response`.
-    before : LineOffsets, optional
-        That the images are already without.
+    them. Images are already without the offsets ``before``; all else is of the flow.
     """
     time = images.time / images.time.square().sum()
     slope, weight = working(linear.slope), working(linear.weight)
@@ -152,22 +137,11 @@ def line_offsets(
 def most_probable(
     information: torch.Tensor, gradient: torch.Tensor
 ) -> tuple[float, torch.Tensor, torch.Tensor]:
-    """Normal numbers of the most likely common variance, and a root of their covariance.
+    """Normal numbers (n,) of the most likely common variance, and a root of their covariance.
 
-    Parameters
-    ----------
-    information : torch.Tensor, shape (n, n)
-        Of the data on them.
-    gradient : torch.Tensor, shape (n,)
-        Of the log-likelihood where all are 0.
-
-    Returns
-    -------
-    ratio : float
-        Twice the logarithm of the likelihood over that of the variance 0.
-    values : torch.Tensor, shape (n,)
-    root : torch.Tensor, shape (n, n)
-        The covariance is root root^T.
+    From the data's information (n, n) on them, and the gradient (n,) of the log-likelihood where
+    all are 0. First is twice the logarithm of the likelihood over that of the variance 0; the
+    covariance is root root^T.
     """
     precision, waves = torch.linalg.eigh(information)
     precision, along = precision.clamp(min=0.0), waves.T @ gradient

@@ -36,22 +36,8 @@ def variance_by_coloured_noise(
     and along lines. Random fields of this covariance and of that of the likelihood are sent
     through the fit, as in a sandwich covariance (White 1982, Econometrica 50, 1-25): the
     difference of their variances is added where the first is larger by more than `_LEAST`.
-
-    Parameters
-    ----------
-    linear : Linear
-        About the flow that was found.
-    mesh : Mesh
-        Of the pixels.
-    response : callable
-        See `components.Response`.
-
-    Returns
-    -------
-    variance : torch.Tensor, shape windows.count
-        px^2.
-    lines : str
-        Which lines have an offset each: "columns", "rows", both or none.
+    ``linear`` is about the flow that was found. The variance is in px^2; the lines that have an
+    offset each are "columns", "rows", both or none.
     """
     slope, weight, valid = working(linear.slope), working(linear.weight), linear.valid
     time = images.time.to(linear.warped).reshape(-1, 1, 1)

@@ -107,15 +107,8 @@ def motion(
     """Velocity (..., vortices, 2) of vortices along y and z, m/s.
 
     Of the wind at their height and of each other's induction, and of the images below the ground:
-    vortices of opposite circulation as far below it.
-
-    Parameters
-    ----------
-    vortices : (..., vortices, 4) array
-    wind : (..., terms) array
-        Polynomial of the height above the reference, m/s, m/s per m, ...
-    reference, ground : float
-        m.
+    vortices of opposite circulation as far below it. The wind is a polynomial of the height above
+    the reference (m): m/s, m/s per m, ...
     """
     y, z, circulation, core = np.moveaxis(vortices, -1, 0)
     above = z - reference

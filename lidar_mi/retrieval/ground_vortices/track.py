@@ -30,14 +30,8 @@ _CIRCULATION = 0.003  # of the circulation, per root of second: it differs along
 def tracked(found: xr.Dataset, ground: float | None) -> xr.Dataset:
     """The data set with the smoothed numbers of every scan between the first and last valid one.
 
-    A fit with a flag, or beyond the gate, is not used; the vortices are predicted there.
-
-    Parameters
-    ----------
-    found : xr.Dataset
-        As of `vortex_dataset`, in the order of time.
-    ground : float, optional
-        m.
+    A fit with a flag, or beyond the gate, is not used; the vortices are predicted there. The data
+    set is that of `vortex_dataset`, in the order of time; the ground's height is in m.
     """
     model = found.attrs["profile"]
     number = found.sizes["vortex"]

@@ -24,14 +24,8 @@ _LEAST_NOISE = 0.005  # m/s: rounding of the velocities
 class Window:
     """Averages of lines in the cells of a part of a scan.
 
-    Attributes
-    ----------
-    line, gate : (n,) arrays of int
-        Of the cells that are used.
-    velocity : (n,) array
-        m/s.
-    noise : (n, n) array
-        Covariance of the noise, (m/s)^2.
+    ``line`` and ``gate`` are of the n cells used, with their velocity (m/s) and its noise (n, n),
+    (m/s)^2.
     """
 
     lines: Lines

@@ -50,17 +50,8 @@ def unfolded(
     with the interval, which begins as the range of all velocities. They fold if residuals of the
     cells beyond half an interval cluster at its multiples: among m uniform ones the count within 5
     standard deviations s is binomial with p = 10 s / interval; false alarms 1e-6 a scan.
-
-    Parameters
-    ----------
-    members : sequence of (k,) arrays of int
-        Cells of each level.
-    design : (n, 3) array
-        Unit vectors.
-    velocity : (n,) array
-        m/s.
-    nyquist : float, optional
-        m/s.
+    ``members`` are the cells of each level, the ``design`` (n, 3) unit vectors; velocities are in
+    m/s.
     """
     interval = 2 * nyquist if nyquist else float(np.ptp(velocity)) if velocity.size else 0.0
     if not interval > (0 if nyquist else _LEAST_INTERVAL):

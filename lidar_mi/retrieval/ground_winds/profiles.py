@@ -50,17 +50,7 @@ class WindFlag(enum.IntFlag):
 
 @dataclass(eq=False)
 class Profile:
-    """Winds of one scan.
-
-    Attributes
-    ----------
-    heights : (levels,) array
-        m above the lidar.
-    wind : (levels, 3) array
-    covariance : (levels, 3, 3) array
-    residual, condition : (levels,) arrays
-    dof, lines, outliers, flag : (levels,) arrays of int
-    """
+    """Winds of one scan, (levels, ...); heights are in m above the lidar."""
 
     time: np.datetime64
     heights: np.ndarray

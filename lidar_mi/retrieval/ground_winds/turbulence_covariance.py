@@ -17,14 +17,7 @@ def correlations(distance: np.ndarray, length: float) -> tuple[np.ndarray, np.nd
 
     f = 2^(2/3) / Gamma(1/3) q^(1/3) K_1/3(q), g = f + r f' / 2 with q = r / (a L), for turbulence
     without divergence (von Karman, Proc. Natl. Acad. Sci. 34, 530-539, 1948; Batchelor, The Theory
-    of Homogeneous Turbulence, 1953, eq. 3.4.6).
-
-    Parameters
-    ----------
-    distance : ndarray
-        r, m.
-    length : float
-        L, integral scale along the wind, m.
+    of Homogeneous Turbulence, 1953, eq. 3.4.6). L is the integral scale along the wind, m.
     """
     along, across = _table()
     q = np.minimum(distance / (LENGTH_TO_SCALE * length), _NODES[-1])
@@ -55,12 +48,7 @@ def _parts(
 def of_lines(places: np.ndarray, directions: np.ndarray, length: float) -> np.ndarray:
     """Covariance (n, n) of the wind along n directions at n places, of unit variance a component.
 
-    Parameters
-    ----------
-    places, directions : (n, 3) arrays
-        m, and unit vectors.
-    length : float
-        m, as of `correlations`.
+    Places are in m, as is the length of `correlations`; directions are unit vectors.
     """
     across, more, unit = _parts(places, places, length)
     seen = np.einsum("ia,ija->ij", directions, unit)

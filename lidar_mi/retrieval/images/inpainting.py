@@ -23,12 +23,7 @@ def inpainted(values: np.ndarray) -> np.ndarray:
     These minimise the sum of the squared second differences along the axes and, so that slopes do
     not go on for long, of a tenth of the squared first ones: a thin plate under tension (Smith &
     Wessel 1990, Geophysics 55, 293-305). Steps to any constant would be structure at rest. Beyond
-    8 px from the known ones they are constant.
-
-    Parameters
-    ----------
-    values : ndarray
-        Of any number of axes; somewhere finite.
+    8 px from the known ones they are constant. Some value must be finite.
     """
     missing = ~np.isfinite(values)
     distance, nearest = distance_transform_edt(missing, return_indices=True)

@@ -134,22 +134,8 @@ def low_texture(
     Too low is: slope not above `min_texture`; isotropy below `min_isotropy`; or a squared slope
     below twice what the noise alone would give (3/16 of its variance after the Sobel filter),
     i.e. the image's own structure is weaker than the noise. At that limit an 8 x 8 template
-    cannot do better than 0.4 px.
-
-    Parameters
-    ----------
-    image : torch.Tensor, shape (z, y)
-    min_texture : float
-        px^-1, relative to the local mean; >= 0.
-    min_isotropy : float
-        0 to 1.
-    noise : float or torch.Tensor of the image's shape
-        Standard deviation of the noise of each pixel, in the image's unit.
-
-    Returns
-    -------
-    texture : Texture
-    low : torch.Tensor of bool, shape windows.count
+    cannot do better than 0.4 px. The texture `min_texture` (px^-1) is relative to the local mean,
+    the isotropy 0 to 1; the noise is the standard deviation of each pixel.
 
     Raises
     ------

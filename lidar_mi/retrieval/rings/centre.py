@@ -23,19 +23,8 @@ def gradient_centre(
     detected or complete: least squares of the distances between the point and the lines, weighted
     by the squared gradient (Parthasarathy 2012, Nature Methods 9, 724), here of the smoothed
     image. White noise biases the point toward the image's middle by its fraction of the squared
-    gradient: below 0.1 % for the paper's 1.3e7 photons.
-
-    Parameters
-    ----------
-    image : array or tensor, shape (height, width)
-        Finite.
-    response : tensor, shape (height, width), optional
-        Of the pixels; those of 0 are masked.
-
-    Returns
-    -------
-    (float, float)
-        (x, y); may lie outside.
+    gradient: below 0.1 % for the paper's 1.3e7 photons. Pixels of no ``response`` are masked. The
+    point (x, y) may lie outside.
 
     Raises
     ------
@@ -172,13 +161,7 @@ def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[floa
 
     The contrast, the variance of the averages over all pixels, decreases with the square of the
     distance to the centre, as averages about another point blur the rings. Its maximum is found
-    by Newton's method, from differences over 1 px.
-
-    Parameters
-    ----------
-    image : array, shape (height, width)
-    start : (float, float)
-        Within about 1/3 of a ring's width.
+    by Newton's method, from differences over 1 px. The start is within about 1/3 of a ring's width.
 
     Raises
     ------

@@ -52,14 +52,7 @@ class Light:
 
 
 def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
-    """Profile and cells of sectors.
-
-    Parameters
-    ----------
-    r2 : array (annuli,)
-    value, count : arrays (sectors, annuli)
-        Mean and number of pixels of each cell.
-    """
+    """Profile and cells of sectors (sectors, annuli): mean and number of pixels of each cell."""
     q = r2 / r2[-1]
     some = count > 0
     smooth = np.broadcast_to(np.column_stack([np.ones_like(q), np.sqrt(q), q]), (*value.shape, 3))
