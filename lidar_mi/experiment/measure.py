@@ -44,15 +44,7 @@ _NO_SKILL = "{} has no skill: its error equals the spread of the wind"
 def measure(
     experiment: Experiment, results: Results, seconds: Mapping[str, float]
 ) -> dict[str, float]:
-    """All metrics of a run, flat.
-
-    Parameters
-    ----------
-    results : mapping
-        Of the stages of the experiment, by name.
-    seconds : mapping of str to float
-        Duration of the steps.
-    """
+    """All metrics of a run, flat, from the results and the duration (s) of its stages by name."""
     metrics: dict[str, float] = {}
     if experiment.imaged_wake and "images" in results:
         taken = {"truth": results["truth"], "air": results["air"]}

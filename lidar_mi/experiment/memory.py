@@ -77,11 +77,6 @@ class Footprint:
     def check_size(self, columns: int, rows: int) -> None:
         """Refuse images that would take more memory than a run may, or more layers than files hold.
 
-        Parameters
-        ----------
-        columns, rows : int
-            Of beams in an image.
-
         Raises
         ------
         InputError

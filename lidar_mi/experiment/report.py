@@ -40,19 +40,8 @@ def chapters(
 ) -> tuple[list[Chapter], dict[str, float]]:
     """Draw all figures into a folder and assemble the chapters of the report.
 
-    Parameters
-    ----------
-    results : mapping
-        Of the stages of the experiment, by name.
-    metrics : mapping
-        From `lidar_mi.experiment.measure.measure`.
-
-    Returns
-    -------
-    chapters : list of Chapter
-        One per instrument, in their order in the report.
-    seconds : dict
-        Duration of the drawing, by step.
+    There is one chapter for each instrument; the drawing's duration (s) is by step. Metrics are
+    those of `lidar_mi.experiment.measure.measure`.
     """
     found: list[Chapter] = []
     seconds: dict[str, float] = defaultdict(float)

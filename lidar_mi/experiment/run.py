@@ -143,14 +143,7 @@ def complete(
 ) -> Run:
     """Run the rest of a prepared experiment.
 
-    Parameters
-    ----------
-    prepared : Run
-        From `prepare`.
-    folder, overwrite
-        As of `run`; errors, too.
-    shared : Store, optional
-        Images that are shared with other runs.
+    Folder and errors are those of `run`; images are ``shared`` with other runs.
     """
     if folder is None:
         finish(prepared)

@@ -115,11 +115,7 @@ def budgets(
 ) -> dict[str, dict[str, float]]:
     """`error_budget` of every method of an experiment, by method.
 
-    Parameters
-    ----------
-    scans : the two rendered scans
-    cores, flagged : optional
-        See `error_budget`; without cores: those of the true wind.
+    Without cores: those of the true wind.
     """
     flows = None
     if experiment.scan.air == "moving":

@@ -207,22 +207,9 @@ def with_speeds(
 ) -> xr.Dataset:
     """Lines with the speeds that were read, the drifts behind the laser's frames and their errors.
 
-    Parameters
-    ----------
-    lines : xr.Dataset
-        From `scan_wind`.
-    v_los, std, systematic, laser_std : arrays, shape (lines,)
-        From `speeds_to_laser`, m/s.
-    pulses : int
-        Of a line.
-    seed, scan : int
-        The seed and the number of the scan select the drifts.
-
-    Returns
-    -------
-    xr.Dataset, dim (line)
-        With ``v_los_covariance`` (line, other_line), m^2 s^-2, where one frame of the
-        laser serves several lines.
+    Lines are of `scan_wind`, v_los and its errors (m/s) of `speeds_to_laser`; pulses are those of a
+    line. Where one frame of the laser serves several lines there is a ``v_los_covariance`` (line,
+    other_line), m^2 s^-2. The seed and the number of the scan select the drifts.
     """
     streams = [seed, _DRIFTS + scan]
     drift, drift_std = drifts(doppler, pulses, streams, range(len(v_los)), PULSES)

@@ -90,20 +90,8 @@ def shared_covariance(
     """Covariance of the errors of averages of pulses, beyond each one's own, (m/s)^2.
 
     Averages behind one frame of the laser share its noise, and the drifts before the earlier one.
-
-    Parameters
-    ----------
-    averaged : int
-        Pulses of an average.
-    laser_std : array (averages,)
-        Standard error of the laser's frame of each, m/s.
-    key : str
-        As of `reference_frames`.
-
-    Returns
-    -------
-    array (averages, averages) or None
-        0 on the diagonal; None where every average has frames of its own.
+    Each average has ``averaged`` pulses, and ``laser_std`` (m/s) of its laser's frame; the key is
+    that of `reference_frames`. 0 on the diagonal; None where every average has frames of its own.
     """
     every = doppler.reference.every
     _, sharing = reference_frames(averaged, every, key)

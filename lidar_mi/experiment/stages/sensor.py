@@ -49,18 +49,8 @@ def combined_wind(
 ) -> xr.Dataset | None:
     """The wind from the lines of sight and from the images' wind, with the truth.
 
-    Parameters
-    ----------
-    slab_wind : xr.Dataset
-        True u, v, w on (z, y).
-    wind : xr.Dataset
-        From `winds.cross_flow_winds`.
-
-    Returns
-    -------
-    xr.Dataset or None
-        From `combine`, with ``u_true``, ``v_true``, ``w_true`` (m s^-1); None where there is none,
-        which is logged as a warning.
+    The true u, v, w of the slab are added to what `combine` gives, as ``u_true``, ``v_true``,
+    ``w_true`` (m s^-1). Where there is no wind, a warning is logged.
     """
     log("combining both lidars")
     try:
