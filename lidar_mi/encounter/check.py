@@ -37,12 +37,7 @@ _UNITS = {"speed": "m/s", "dt": "s", "range": "m"}
 def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> list[str]:
     """Check the geometry of a flight before anything is rendered; warnings, a line each.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        With an encounter.
-    aircraft : AircraftModel, optional
-        In place of that of the experiment.
+    An aircraft may take the place of that of the experiment, which has an encounter.
 
     Raises
     ------

@@ -47,15 +47,7 @@ class _Seen:
 
 @dataclass(eq=False)
 class WindAhead:
-    """Learns the wind ahead from slab to slab.
-
-    Attributes
-    ----------
-    stride : float
-        From slab to slab, m.
-    span : float
-        Of the wing, m.
-    """
+    """Learns the wind ahead of a wing of a span (m) from slab to slab, a stride (m) apart."""
 
     stride: float
     span: float

@@ -80,12 +80,7 @@ def gust_dependence(lost: Sequence[np.ndarray], gusts: Sequence[np.ndarray]) -> 
     """Mean square of the gust in lost slabs over that in all, and its two-sided p value.
 
     The ratio is 1 where losses do not depend on the gust; (NaN, 1) where all or none are lost.
-
-    Parameters
-    ----------
-    lost : sequence of ndarray of bool, shape (n,)
-    gusts : sequence of ndarray, shape (n,)
-        True gusts of the same slabs.
+    Gusts are the true ones of the same slabs.
     """
     where = np.concatenate(lost).astype(float)
     if where.all() or not where.any():
