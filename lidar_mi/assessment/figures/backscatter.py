@@ -85,14 +85,8 @@ def draw_all(
 ) -> list[Drawn]:
     """Draw every figure of a backscatter run as PNG into ``folder``.
 
-    Parameters
-    ----------
-    scans : two xr.Dataset
-        The rendered scans.
-    found : xr.Dataset, dims (source, algorithm, z, y)
-        Winds from `lidar_mi.experiment.stages.winds.cross_flow_winds`.
-    sweep : xr.Dataset
-        Errors by texture, from `lidar_mi.experiment.stages.texture.texture_sweep`.
+    Winds are those of `lidar_mi.experiment.stages.winds.cross_flow_winds`, errors by texture those
+    of `lidar_mi.experiment.stages.texture.texture_sweep`.
     """
     scale, sources = _scale(truth), [str(name) for name in found["source"].values]
     # with measured images alone there are no winds from extinction to compare with

@@ -12,12 +12,7 @@ _BESIDE = 70.0  # m of the scan that is drawn around the vortices
 def draw_line_vortices(lines: xr.Dataset, vortices: xr.Dataset, title: str = "") -> Figure:
     """The scan that shows most, with its vortices; of several with valid ones, their course too.
 
-    Parameters
-    ----------
-    lines : xr.Dataset
-        As of `read_lines_of_sight`.
-    vortices : xr.Dataset
-        As of `fit_vortices_to_lines` of them.
+    Lines are those of `read_lines_of_sight`, vortices those of `fit_vortices_to_lines`.
     """
     # without a valid fit there is nothing to follow
     several = vortices.sizes["scan"] > 1 and bool((vortices["flag"] == 0).any())

@@ -24,13 +24,8 @@ def draw_all(
 ) -> list[Drawn]:
     """Draw the combined sensor's figures as PNG into ``folder``.
 
-    Parameters
-    ----------
-    found : xr.Dataset or None
-        From `combined.combine.combine`, with the truth as u_true, v_true, w_true. None: there is
-        no wind.
-    lines : xr.Dataset
-        From `lidar_mi.experiment.stages.lines.measure_lines`.
+    The wind is that of `combined.combine.combine`, with the truth as u_true, v_true, w_true, the
+    lines of `lidar_mi.experiment.stages.lines.measure_lines`.
     """
     plates = [("fig19_lines_of_sight", "The scan of the Doppler lidar", _scan(lines, cores))]
     if found is not None:

@@ -61,13 +61,7 @@ def flight_name(mode: str, controller: str = "") -> str:
 
 
 def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str, float]:
-    """All numbers of a flight, flat.
-
-    Parameters
-    ----------
-    series, track : xr.Dataset
-        `track` is None without a lidar.
-    """
+    """All numbers of a flight, flat; without a lidar there is no track."""
     found: dict[str, float] = {}
     for mode in series["flight"].values:
         one = series.sel(flight=mode)

@@ -23,19 +23,9 @@ ACCEPTED_BANK = math.radians(7)
 
 
 def roll_control_ratio(moment: ArrayLike, largest: float) -> float:
-    """Largest rolling moment of the wake in a flight over the largest that the controls have.
+    """Largest rolling moment of a wake over the largest of all controls at full deflection (N m).
 
-    Parameters
-    ----------
-    moment : array_like
-        Rolling moment of the wake over time, N m.
-    largest : float
-        Of all controls at full deflection, N m, > 0.
-
-    Returns
-    -------
-    float
-        NaN if any moment is.
+    NaN if any moment is.
     """
     return float(np.abs(np.asarray(moment, dtype=float)).max()) / largest
 

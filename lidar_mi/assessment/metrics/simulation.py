@@ -95,16 +95,8 @@ class SimulationPart(NamedTuple):
 def largest_parts(metrics: Mapping[str, xr.DataArray]) -> xr.DataArray | None:
     """Largest part of the simulation in any method's mean square error, at every point.
 
-    Parameters
-    ----------
-    metrics : mapping of str to xr.DataArray
-        Of a campaign. Points without `simulation_metrics`, at which the part is as small as asked
-        for, are NaN.
-
-    Returns
-    -------
-    xr.DataArray or None
-        1 at most. None: no point has any.
+    1 at most; None if no point has any. Points without `simulation_metrics`, at which the part is
+    as small as asked for, are NaN.
     """
     parts: list[xr.DataArray] = []
     for place, source in product((OUTSIDE_CORES, ""), RENDERED):

@@ -72,14 +72,7 @@ def vortex_metrics(
 
     ``vortex.ORIGIN.QUANTITY`` and ``..._stderr``; over the whole slab ``rmse_v``, ``rmse_w`` (m/s)
     and ``normalised_error_variance_*`` as of `errors.error_statistics`, ``outside_cores.rmse_*``
-    beyond two core radii.
-
-    Parameters
-    ----------
-    fits : mapping of str to VortexPairFit
-        By `Origin`.
-    truth : xr.Dataset
-        v, w (m s^-1) on (z, y).
+    beyond two core radii. Fits are by `Origin`; the truth is v, w (m s^-1) on (z, y).
     """
     metrics = {vortex_key("truth", key): x for key, x in true_pair(truth, cores).items()}
     for origin, fit in fits.items():

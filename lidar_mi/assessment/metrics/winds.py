@@ -13,13 +13,8 @@ from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
     """Errors and efficiencies of every method from every source, ``source.method.quantity``.
 
-    Parameters
-    ----------
-    found : xr.Dataset, dims (source, algorithm, z, y)
-        v, w, ``v_true``, ``w_true``, ``v_bound``, ``w_bound`` (m s^-1), flag and the vectors'
-        positions.
-    cores : sequence of Core
-        True vortices.
+    Of winds (source, algorithm, z, y) with ``v_true``, ``v_bound`` and likewise of w (m s^-1),
+    their flags and positions.
     """
     metrics: dict[str, float] = {}
     for source in found["source"].values:

@@ -48,16 +48,8 @@ def vortex_chapter(
 ) -> Chapter:
     """Parameters of the fitted vortices, and the truth.
 
-    Parameters
-    ----------
-    metrics : mapping
-        From `lidar_mi.experiment.measure.measure`.
-    fits : mapping of str to VortexPairFit
-        The accepted ones, by `Origin`.
-    refused : mapping of str to str
-        Reasons for which there is no other.
-    method : str, optional
-        That of the wind vectors.
+    Fits are the accepted ones, by `Origin`; for those ``refused`` there is a reason. The method is
+    that of the wind vectors.
     """
     vectors = f" of the {METHOD_NAMES[method]}" if method else ""
     purpose = (
