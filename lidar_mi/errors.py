@@ -24,7 +24,9 @@ def printable(text: str) -> str:
     """
     if text.isprintable():
         return text
-    return "".join(c if c == "\n" or c.isprintable() else _escaped(c) for c in text)
+    return "".join(
+        c if c == "\n" or c.isprintable() else c.encode("unicode_escape").decode() for c in text
+    )
 
 
 def one_line(message: object, longest: int = LONGEST) -> str:
@@ -39,10 +41,6 @@ def one_line(message: object, longest: int = LONGEST) -> str:
     # the beginning says where, the end what is allowed
     tail = longest // 3
     return f"{text[: longest - tail - 5].rstrip()} ... {text[-tail:].lstrip()}"
-
-
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape").decode()
 
 
 class Stopped(BaseException):

@@ -135,9 +135,8 @@ def carry_out(
         seconds = {"total": time.perf_counter() - start, **seconds}
         # rendered for this point by a task of its own, so that the store found them there
         shared = sum(ready[k] for k in first)
-        outcome = Outcome(
-            "done", "", _rounded(seconds), store.rendered + shared, store.reused - shared
-        )
+        rounded = {step: round(value, 4) for step, value in seconds.items()}
+        outcome = Outcome("done", "", rounded, store.rendered + shared, store.reused - shared)
         # metrics last: they say that the point is done
         write_outcome(place, outcome)
         write_text(place / records.METRICS, to_json(metrics))
@@ -304,10 +303,6 @@ def _count_attempt(place: Path, session: str) -> None:
             "libraries of the machine can hold"
         )
     append_line(path, session)
-
-
-def _rounded(seconds: dict[str, float]) -> dict[str, float]:
-    return {step: round(value, 4) for step, value in seconds.items()}
 
 
 @lru_cache(1)

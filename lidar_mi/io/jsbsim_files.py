@@ -16,7 +16,8 @@ def shipped_aircraft(root: Path) -> tuple[str, ...]:
     root : Path
         With the folders ``aircraft``, ``engine`` and ``systems``.
     """
-    return tuple(sorted(path.parent.name for path in root.glob("aircraft/*/*.xml") if _main(path)))
+    files = root.glob("aircraft/*/*.xml")
+    return tuple(sorted(path.stem for path in files if path.stem == path.parent.name))
 
 
 def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
@@ -44,10 +45,6 @@ def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
                 _vector(one, "location", "000", unit="IN")
             _vector(one, "direction", ["1" if axis == other else "0" for other in AXES])
     tree.write(path)
-
-
-def _main(path: Path) -> bool:
-    return path.stem == path.parent.name
 
 
 def _vector(

@@ -44,7 +44,7 @@ cuda_ad_spectral
     try:
         mi.set_variant(name)
     except ImportError as error:
-        reason = NO_CUDA if name.startswith("cuda") else _first_line(error)
+        reason = NO_CUDA if name.startswith("cuda") else str(error).strip().splitlines()[0]
         raise InputError(f"variant: {name} cannot run here: {reason}") from None
     # Mitsuba's hint that a monochrome film is monochrome is of no use to anyone here
     mi.set_log_level(mi.LogLevel.Error)
@@ -93,7 +93,3 @@ def _check_name(name: str) -> None:
         raise InputError(
             f"variant: {name!r} is not allowed{reason}; expected one of {', '.join(VARIANTS)}"
         )
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0]

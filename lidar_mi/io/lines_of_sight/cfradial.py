@@ -78,7 +78,8 @@ def write_cfradial(lines: xr.Dataset, path: str | Path) -> None:
     ends = [str(lines["time"].values[k].astype("datetime64[s]")) + "Z" for k in (0, -1)]
     data = xr.Dataset(fields, {"time": lines["time"], "range": lines["range"]})
     data["time"].encoding = {"units": f"seconds since {start}Z", "dtype": "float64"}
-    data["range"].attrs |= {"units": "meters", "meters_to_center_of_first_gate": _first(lines)}
+    first = float(lines["range"].values[0])
+    data["range"].attrs |= {"units": "meters", "meters_to_center_of_first_gate": first}
     for name in ("azimuth", "elevation"):
         about = {
             "units": "degrees",
@@ -128,7 +129,3 @@ def _mode(sweep: xr.Dataset) -> tuple[str, float]:
     if kind != "stare" and np.ptp(np.mod(azimuth, 360)) < _FULL_CIRCLE:
         return "sector", float(np.median(elevation))
     return _MODES.get(kind, "sector"), float(np.median(elevation))
-
-
-def _first(lines: xr.Dataset) -> float:
-    return float(lines["range"].values[0])

@@ -47,7 +47,8 @@ def checked(path: str | Path, pixels: np.ndarray) -> np.ndarray:
     if pixels.dtype.kind not in "biuf" or pixels.dtype.itemsize > 8:
         raise InputError(f"{path}: pixels of type {pixels.dtype}; expected real numbers of 64 bits")
     if not pixels.size:
-        raise InputError(f"{path}: no pixels ({_by(pixels.shape)}); expected an image")
+        shape = " x ".join(map(str, pixels.shape))
+        raise InputError(f"{path}: no pixels ({shape}); expected an image")
     if pixels.dtype.kind in "iu" and pixels.dtype.itemsize == 8:
         low, high = int(pixels.min()), int(pixels.max())
         if max(high, -low) > _EXACT:
@@ -97,7 +98,3 @@ def damaged(path: str | Path, kind: str, error: object) -> InputError:
     """What is said of a file that its library does not read."""
     reason = " ".join(str(error).split())[:120]
     return InputError(f"{path}: no readable image, as {kind} ({reason})")
-
-
-def _by(shape: Sequence[int]) -> str:
-    return " x ".join(map(str, shape))
