@@ -100,13 +100,3 @@ def test_rows_that_miss_are_bold():
     missed = row((0.60, 0.02), (0.85, 0.02), (1.60, 0.20))
     assert "| **60 ± 2** | **85 ± 2** | **1.60 ± 0.20** |" in coverage._line(missed)
     assert coverage._line(row(*[(np.nan, np.nan)] * 3, valid=0.0)).endswith("| all flagged |")
-
-
-@pytest.mark.slow
-def test_noise_beside_smoke_is_no_information():
-    """Standard errors hold within three of their own errors, where most slopes are of noise."""
-    found = coverage.measured("advected, texture 5 %, noise 1 %", "variational", [1])
-    variance, error = found.variance
-    assert found.valid > 0.3
-    assert variance - 3 * error < coverage.VARIANCE[1]
-    assert found.rmse < 0.5 * found.wind
