@@ -28,20 +28,9 @@ def assumption_error(
 ) -> float:
     """Error of the speed, m/s, where a parameter is assumed ``by`` too large.
 
-    By the fit of signals without noise: not only to first order.
-
-    Parameters
-    ----------
-    level : float
-        Electrons of the light in front of the receiver.
-    assumed : {"temperature", "aerosol"}
-        Not free.
-    by : float
-        K, or a fraction.
-    v_los, temperature, aerosol : float
-        Of the light; the model's middle temperature if none is given.
-    free : names out of `lidar_mi.retrieval.channels.model.PARAMETERS`
-        Fitted parameters.
+    By the fit of signals without noise: not only to first order. The light has ``level`` electrons
+    in front of the receiver and, by default, the model's middle temperature; ``by`` is in K, or a
+    fraction. The ``free`` ones of `lidar_mi.retrieval.channels.model.PARAMETERS` are fitted.
 
     Raises
     ------

@@ -21,12 +21,7 @@ _CELLS, _CELLS_OF_DEVICE = 12, 64
 class Axis:
     """Cubic B-splines along one direction, from pixel 0 to size - 1.
 
-    Attributes
-    ----------
-    size : int
-        Pixels.
-    spacing : float
-        Between knots, px; stretched so that knots are at both ends.
+    The spacing of the knots (px) is stretched so that knots are at both ends.
     """
 
     size: int
@@ -78,12 +73,7 @@ def _pieces(t: torch.Tensor, order: int) -> torch.Tensor:
 class Mesh:
     """The splines along all axes at the nodes of a rectangular mesh.
 
-    Parameters
-    ----------
-    axes : sequence of Axis
-        (z, y), or (x, z, y).
-    places : sequence of torch.Tensor
-        Of the nodes along each axis, px.
+    Axes are (z, y), or (x, z, y), with the places (px) of the nodes along each.
     """
 
     def __init__(self, axes: Sequence[Axis], places: Sequence[torch.Tensor]):

@@ -237,24 +237,9 @@ def information_of_first(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Information of images in a plane on a flow, as far as the first of them shows it.
 
-    Parameters
-    ----------
-    images : Images
-        The first one, with the noise that is known of all.
-    mesh : Mesh
-        Of the pixels.
-    places : torch.Tensor, shape (2, number, z, y)
-        Of `path`, to all of the images.
-    sampled : sequence of torch.Tensor, shape (1, z, y)
-        Value and slopes of the first one there.
-    number : int
-        Of images.
-
-    Returns
-    -------
-    slope : torch.Tensor, shape (2, z, y)
-    information : torch.Tensor, shape (z, y)
-        As in `Linear`, of texture that all images show alike. Outliers are not known.
+    Of the pixels' mesh, and ``number`` images; ``sampled`` are value and slopes (1, z, y) of the
+    first one at its ``places`` by `path`. Slope and information are those of `Linear`, of texture
+    that all images show alike. Outliers are not known.
     """
     _, _, *slopes = sampled
     # as of the image warped to mid-time: the means of all images' own slopes need no turning

@@ -126,12 +126,8 @@ def difference(received: SpeedsOfRings, emitted: SpeedsOfRings) -> tuple[torch.T
     """v_LOS of received images less that of images of the laser itself, with standard deviations.
 
     An error of the order at the centre, by a drift of etalon or laser, cancels. So does an error of
-    the calibration, as far as both images respond equally.
-
-    Returns
-    -------
-    v_los, v_los_std, v_los_systematic : torch.Tensor, shape (images,)
-        m/s; random, and by the calibration.
+    the calibration, as far as both images respond equally. In m/s: v_los, its random standard
+    deviation, and that by the calibration.
     """
     std = torch.hypot(received.v_los_std, emitted.v_los_std)
     uncommon = received.sensitivity - emitted.sensitivity

@@ -16,14 +16,7 @@ SAME = 0.02  # relative difference of spacings that are one
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RingSeries(Tabular):
-    """Rings of every frame, None where a frame is refused, and why it is.
-
-    Attributes
-    ----------
-    rings : tuple of Rings or None
-    refused : tuple of str
-        Reason for each frame without rings; else empty.
-    """
+    """Rings of every frame, None where a frame is refused, and why it is."""
 
     rings: tuple[Rings | None, ...]
     refused: tuple[str, ...]

@@ -30,17 +30,8 @@ def wind_from_samples(
 ) -> xr.Dataset:
     """The wind from the samples of images or volumes that have more pixels than samples.
 
-    Parameters
-    ----------
-    retrieve : callable
-        `retrieve_wind` or `retrieve_wind_volume`, with `options`.
-    images : sequence of xr.DataArray
-        All of them, in the order of time.
-    windows : WindowSizes
-        Of the pixels.
-    noise : float, xr.DataArray or None
-    places : mapping
-        Centres of the windows of the pixels, by axis.
+    Images are in the order of time; ``windows``, and the places of their centres, are those of the
+    pixels.
     """
     one, two, *more = (samples_of(image, structure) for image in images)
     level = samples_of(noise, structure) if isinstance(noise, xr.DataArray) else noise
