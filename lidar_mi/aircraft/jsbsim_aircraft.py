@@ -183,14 +183,7 @@ def state_in_path(
 ) -> AircraftState | None:
     """The state of JSBSim in a path frame, without bending moments; None: it is not finite.
 
-    Parameters
-    ----------
-    origin : ndarray, shape (3,)
-        Of the path, as `neu_place`, m; the path goes north.
-    climb : float
-        Angle of the path, rad.
-    time : float
-        s.
+    The path goes north from an origin (m) as of `neu_place`, at an angle ``climb`` (rad).
     """
     north, east, up = neu_place(fdm) - origin
     northward, downward = (fdm[f"velocities/v-{to}-fps"] * foot for to in ("north", "down"))

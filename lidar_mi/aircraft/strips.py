@@ -129,14 +129,7 @@ def fin_strips(
 ) -> Strips:
     """A vertical tail: the upper half of an elliptic wing, mirrored at its root.
 
-    Parameters
-    ----------
-    height, area : float
-        m and m^2.
-    lift_slope, n
-        As in `wing_strips`.
-    place : array_like, shape (3,)
-        The root in the body frame, m.
+    Slope and number are those of `wing_strips`; ``place`` is the root in the body frame (m).
     """
     angle = _angles(2 * n)[:n]
     places = np.tile(np.asarray(place, dtype=float), (n, 1))
@@ -180,16 +173,9 @@ def joined(*surfaces: Strips) -> Strips:
 
 
 def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float) -> Loads:
-    """Force and moment of a wind on the strips.
+    """Force and moment of a wind (..., n, 3) at the strips, in the body frame, m/s.
 
-    Parameters
-    ----------
-    wind : array_like, shape (..., n, 3)
-        Wind at the strips, in the body frame, m/s.
-    airspeed : float
-        V, m/s.
-    density : float
-        Of the air, kg m^-3.
+    The airspeed is in m/s, the density in kg m^-3.
     """
     normal_wind = (np.asarray(wind, dtype=float) * strips.normals).sum(-1)
     pressure = (0.5 * density * airspeed) * strips.areas * normal_wind  # q S_i w_n / V

@@ -143,25 +143,12 @@ def extinction_from_speed(
     stretch: float = 1.0,
     reference: float | None = None,
 ) -> xr.DataArray:
-    """Extinction from the cross-flow speed (v^2 + w^2)^(1/2), the paper's alternative.
+    """Extinction (m^-1) from the cross-flow speed (v^2 + w^2)^(1/2), the paper's alternative.
 
     For data without a tracer. According to the paper, such structures may be physically incorrect:
     speed is not an aerosol. E = background + (maximum - background) (1 - (1 - x)^stretch),
-    x = speed/reference.
-
-    Parameters
-    ----------
-    wake : xarray.Dataset
-        Holds v and w, m s^-1.
-    background, maximum, stretch
-        As in `extinction_from_tracer`.
-    reference : float, optional
-        Speed that gets `maximum`, m s^-1; default the largest here.
-
-    Returns
-    -------
-    xarray.DataArray
-        m^-1, dims of v.
+    x = speed/reference. The reference (m/s) is by default the largest speed; all else is as in
+    `extinction_from_tracer`.
     """
     _check(background, maximum, stretch)
     for name in ("v", "w"):

@@ -38,23 +38,8 @@ def gaussian_field(
     (von Karman's form of the Corrsin-Obukhov spectrum; Monin and Yaglom, Statistical Fluid
     Mechanics 2, 1975, section 21). Waves up to the grid's shortest along each axis are filled;
     those it cannot hold are missing from a line spectrum, which for d = 2 (3) lies below the law by
-    5 (8) % at a quarter of the largest wavenumber, 15 (23) % at half, 35 (51) % at the end.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Nodes of the period.
-    spacing : tuple of float
-        m.
-    outer_scale : float
-        L, m.
-    slope : float
-        Of the line spectra.
-
-    Returns
-    -------
-    ndarray
-        Zero mean, not normalised.
+    5 (8) % at a quarter of the largest wavenumber, 15 (23) % at half, 35 (51) % at the end. Nodes
+    of the period have a spacing (m), as has L. The mean is zero; the field is not normalised.
     """
     d = len(shape)
     # the generator by its name: numpy may change the one of default_rng

@@ -51,14 +51,8 @@ _AT_ONCE = 4
 class State(Status):
     """Progress of a running campaign.
 
-    Attributes
-    ----------
-    started : float
-        Clock at the start.
-    finished_before : int
-        Points that were finished before this start.
-    dashboard : str
-        Address; empty: there is none.
+    ``started`` is the clock at the start, ``finished_before`` the number of points finished by then.
+    Without a dashboard its address is empty.
     """
 
     started: float = field(default_factory=time.monotonic)

@@ -155,20 +155,9 @@ def carry_out(
 def render_shared(folder: str, number: int, name: str, session: str) -> int:
     """Render the images of one stage, which several points share; present ones stay.
 
-    Parameters
-    ----------
-    folder, session
-        As of `carry_out`.
-    number : int
-        One of the points.
-    name : str
-        Of that stage.
-
-    Returns
-    -------
-    int
-        Number of images rendered. A fault that prevents it occurs in each of the points again,
-        which report it.
+    Folder and session are those of `carry_out`; the number is that of one of the points. It returns
+    how many were rendered. A fault that prevents it occurs in each of the points again, which
+    report it.
     """
     campaign = _opened(folder, (Path(folder) / RECORD).stat().st_mtime_ns)
     experiment = campaign.points.experiment(number)

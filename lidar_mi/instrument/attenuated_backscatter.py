@@ -16,16 +16,8 @@ def attenuated_backscatter(
     1 / km).
 
     Of beams with poses of their own the reported ranges are used (`ScanPlan.ranges`), as by an
-    instrument that knows no others.
-
-    Parameters
-    ----------
-    s0 : (gates, rows, columns) array
-        Received energy over emitted pulse energy.
-    aperture_area : float
-        m^2.
-    environment : float
-        Extinction coefficient up to the gate, m^-1.
+    instrument that knows no others. ``s0`` is received over emitted energy, the area in m^2,
+    ``environment`` the extinction coefficient up to the gate (m^-1).
     """
     r = plan.ranges()
     transmittance = np.exp(-2 * environment * r)

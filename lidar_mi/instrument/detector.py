@@ -98,18 +98,8 @@ def background_photoelectrons(
     """Mean photoelectrons of scattered sunlight: radiance x filter x area x solid angle x time.
 
     Their number is Poisson distributed: sunlight through a filter has far too many modes for
-    speckle (paper's telescope, 1 nm: 10^13).
-
-    Parameters
-    ----------
-    duration : array
-        Time in which the gate is recorded, s.
-    aperture_area : float
-        m^2.
-    fov_half : float
-        Field of view, half angle, rad.
-    wavelength : float
-        m.
+    speckle (paper's telescope, 1 nm: 10^13). The gate is recorded for a duration (s); the area is
+    in m^2, ``fov_half`` the half angle (rad).
     """
     # of a cone, 2 pi (1 - cos), without the cancellation at small angles
     solid_angle = 4 * np.pi * np.sin(fov_half / 2) ** 2

@@ -120,13 +120,8 @@ def sight_volumes(
 
     Range bin (even), pulse (Gaussian of ``pulse_duration``, which smears range by c t / 2), beam
     (Gaussian, ``beam_width`` its 1/e^2 diameter), each weighted with its signal,
-    exp(-2 alpha r) / r^2: the centroid of 10 m at 56 m is 0.3 m nearer than the middle.
-
-    Returns
-    -------
-    points : (lines, points, 3) array, m
-    weights : (lines, points) array
-        Of sum 1 for every line.
+    exp(-2 alpha r) / r^2: the centroid of 10 m at 56 m is 0.3 m nearer than the middle. Points
+    (lines, points, 3) are in m; weights (lines, points) have the sum 1 for every line.
 
     Raises
     ------

@@ -65,12 +65,7 @@ def harmonics(receiver: DoubleEdge, wavelength: float) -> np.ndarray:
 
     nu is the frequency less that of the laser (``wavelength``, m, in vacuum). The peaks are tuned
     to their places for light of the mean angle; a disc of directions of the half angle a spreads
-    the order evenly over m a^2 / 2.
-
-    Returns
-    -------
-    complex array (2, K)
-        The filter below the laser's frequency first.
+    the order evenly over m a^2 / 2. The filter below the laser's frequency is first.
     """
     etalon = receiver.etalon
     amplitudes = fabry_perot.harmonics(etalon, wavelength)

@@ -21,10 +21,7 @@ STOP_DISTANCE = 1 / 300
 def fused_silica_index(wavelength: float) -> float:
     """Refractive index of fused silica at 20 C (Malitson 1965, J. Opt. Soc. Am. 55, 1205).
 
-    Parameters
-    ----------
-    wavelength : float
-        m, 0.21 to 3.71 um.
+    The wavelength (m) is 0.21 to 3.71 um.
 
     Raises
     ------

@@ -93,14 +93,9 @@ class Motion(Description):
 
 @dataclass(frozen=True)
 class Pose:
-    """Departure from straight and level flight, at n times.
+    """Departure from straight and level flight, at n times: place (n, 3) in m, velocity in m/s.
 
-    Attributes
-    ----------
-    place, velocity : (n, 3) arrays
-        m, m/s.
-    attitude : Rotation
-        Of n rotations from the body to the lidar's frame.
+    The n rotations ``attitude`` are from the body to the lidar's frame.
     """
 
     place: np.ndarray

@@ -28,14 +28,7 @@ def temporal_modes(line_width: float, duration: ArrayLike) -> np.ndarray:
 
     M = [2/T int_0^T (1 - t/T) |g(t)|^2 dt]^-1 for a Gaussian line (Goodman, Statistical Optics,
     1985, section 6.1), whose coherence time int |g|^2 dt is sqrt(2 ln 2 / pi) / line_width =
-    0.66 / line_width.
-
-    Parameters
-    ----------
-    line_width : float
-        Full width at half maximum, Hz.
-    duration : array
-        T, s.
+    0.66 / line_width. ``line_width`` (Hz) is full width at half maximum, ``duration`` is T (s).
     """
     # the duration in coherence times
     x = np.asarray(duration, float) * line_width / np.sqrt(2 * np.log(2) / np.pi)

@@ -71,16 +71,8 @@ def fit(
 
     A common error of the calibration multiplies all means: with them as m, it adds e^2 m m^T to
     the covariance, whose inverse is that of Sherman and Morrison (1950, Ann. Math. Statist. 21,
-    124).
-
-    Parameters
-    ----------
-    counts, gain, variance : (gates, beams) arrays
-        Variance of the rendered mean counts, in addition to that of the counts.
-    factor : float
-        Of attenuation.
-    start : (nodes,) array
-        m^-1.
+    124). The variance is that of the rendered mean counts, in addition to that of the counts; the
+    factor is that of attenuation, the start in m^-1.
     """
     logs, counts = np.log(start), counts.ravel()
     nodes, added = len(start), variance.ravel()

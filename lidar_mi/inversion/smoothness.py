@@ -13,19 +13,8 @@ def strength(information: np.ndarray, score: np.ndarray) -> float:
     Gaussian estimates of the information I, the combinations of the walk that are independent a
     priori and in the data have squares of the expectation 1 + s^2 g, of which
     `retrieval.reml.most_likely` finds s^2. The level takes no part: it is fitted (Patterson and
-    Thompson 1971, Biometrika 58, 545).
-
-    Parameters
-    ----------
-    information : (nodes, nodes) array
-        I, of the logarithms.
-    score : (nodes,) array
-        I times the estimate without prior, which need not exist.
-
-    Returns
-    -------
-    float
-        s^2 per step.
+    Thompson 1971, Biometrika 58, 545). The estimate without prior, of which the score is I times,
+    need not exist.
     """
     count = len(score)
     walk = np.tril(np.ones((count, count - 1)), -1)

@@ -31,15 +31,9 @@ def frame_as_webp(frame: np.ndarray, quality: int = QUALITY) -> bytes:
 
 
 def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) -> None:
-    """An animation that repeats, in 128 colours.
+    """An animation of 8-bit frames (height, width, 3) that repeats, in 128 colours.
 
-    Parameters
-    ----------
-    path : str or Path
-    frames : sequence of ndarray, shape (height, width, 3)
-        8 bit, of one size.
-    seconds : float
-        For which each is shown; GIF knows hundredths.
+    Each is shown for so many seconds; GIF knows hundredths.
 
     Raises
     ------

@@ -15,15 +15,8 @@ def write_flo(path: str | Path, wind: xr.Dataset, pixel: tuple[float, float]) ->
     """Write displacements in pixels, to the right and downwards, float32, top row first.
 
     Standard errors, places, times and the reasons of flags are lost. Vectors that are flagged or
-    missing are unknown, 1e10.
-
-    Parameters
-    ----------
-    path : str or Path
-    wind : xr.Dataset, dims (z, y)
-        ``displacement_y``, ``displacement_z`` in m, ``flag``.
-    pixel : (float, float)
-        Size of the images' pixels along z and y, m.
+    missing are unknown, 1e10. ``displacement_y`` and ``displacement_z`` are in m, as are the pixels
+    along z and y.
 
     Raises
     ------

@@ -11,10 +11,7 @@ AXES = ("x", "y", "z")
 def shipped_aircraft(root: Path) -> tuple[str, ...]:
     """Names of the aircraft below a folder of JSBSim's, in alphabetical order.
 
-    Parameters
-    ----------
-    root : Path
-        With the folders ``aircraft``, ``engine`` and ``systems``.
+    It has the folders ``aircraft``, ``engine`` and ``systems``.
     """
     files = root.glob("aircraft/*/*.xml")
     return tuple(sorted(path.stem for path in files if path.stem == path.parent.name))

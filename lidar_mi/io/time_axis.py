@@ -23,14 +23,7 @@ def count_unit(text: str, where: str) -> str:
     """The unit in which a time counts: of "seconds since 1970-01-01", seconds.
 
     The date and the calendar do not matter to a count of seconds, minutes, hours or days, which all
-    calendars have of one length.
-
-    Parameters
-    ----------
-    text : str
-        The attribute ``units``.
-    where : str
-        File and variable, for the message.
+    calendars have of one length. ``where`` names file and variable, for the message.
 
     Raises
     ------

@@ -37,14 +37,7 @@ class Molecules(NamedTuple):
 def molecules(extinction: float, wavelength: float, band: str = "cabannes") -> Molecules | None:
     """Molecules of a given extinction coefficient; None without any.
 
-    Parameters
-    ----------
-    extinction : float
-        m^-1, of the whole Rayleigh band.
-    wavelength : float
-        m.
-    band : "cabannes" or "rayleigh"
-        Of the received light.
+    The coefficient (m^-1) is that of the whole Rayleigh band, whatever band is received.
     """
     if extinction == 0:
         return None

@@ -81,17 +81,10 @@ def version_of(library: str | os.PathLike[str]) -> int | None:
 
 
 def find_llvm(folders: Iterable[str | os.PathLike[str]] | None = None) -> list[tuple[Path, int]]:
-    """LLVM libraries on this machine.
+    """LLVM libraries on this machine and their major versions, newest first.
 
-    Parameters
-    ----------
-    folders : paths, optional
-        Where to look; by default :func:`library_folders`.
-
-    Returns
-    -------
-    list of (path, major version)
-        Newest first, each file once (links resolved), links to nowhere omitted.
+    By default in :func:`library_folders`; each file once (links resolved), without links to
+    nowhere.
     """
     found: dict[Path, int] = {}
     for folder in library_folders() if folders is None else folders:

@@ -25,12 +25,7 @@ class MovingAir(Protocol):
 class LevelFrame:
     """From the path frame, which climbs, to the level frame, whose z is the height.
 
-    Parameters
-    ----------
-    altitude : float
-        Of the path's start above the ground, m.
-    climb_angle : float
-        rad.
+    The path starts at an altitude above the ground (m) and climbs by an angle (rad).
     """
 
     altitude: float

@@ -62,13 +62,7 @@ def refractive_index(wavelength: float, co2: float = 360e-6) -> float:
     """Refractive index of standard dry air, 288.15 K and 1013.25 hPa.
 
     Peck & Reeder (1972) for 300 ppm CO2 (Bodhaine et al., eq. 18), other CO2 by their eq. 19.
-
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, 200 nm to 2 um.
-    co2 : float
-        Volume fraction.
+    Wavelengths (m) are those in vacuum, 200 nm to 2 um; ``co2`` is a volume fraction.
     """
     _check(wavelength, co2)
     # in um^-2, as the formula of Peck and Reeder

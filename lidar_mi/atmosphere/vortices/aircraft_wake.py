@@ -78,12 +78,7 @@ def wake_of(span: float, mass: float, speed: float, density: float) -> WakeOf:
     """The vortex pair of a wing with elliptic lift in level flight.
 
     b_0 = pi b / 4, Gamma = m g / (rho V b_0) (Gerz, Holzäpfel and Darracq, Prog. Aerosp. Sci. 38,
-    2002), and a core radius of 5 % of the span.
-
-    Parameters
-    ----------
-    span, mass, speed, density : float
-        m, kg, m/s (true airspeed), kg/m^3.
+    2002), and a core radius of 5 % of the span. In m, kg, m/s (true airspeed) and kg/m^3.
     """
     separation = math.pi / 4 * span
     return WakeOf(mass * STANDARD_GRAVITY / (density * speed * separation), separation, CORE * span)

@@ -84,24 +84,11 @@ def angular_velocity(
 def tangential_speed(
     r: ArrayLike, circulation: float, core_radius: float, model: Model = "lamb_oseen"
 ) -> np.ndarray:
-    """Swirl velocity of a single vortex.
+    """Swirl velocity of a single vortex, m/s, of the sign of its circulation (m^2/s); lengths in m.
 
     Lamb-Oseen: Gamma/(2 pi r) (1 - exp(-1.2564 r^2/r_c^2)).
     Burnham-Hallock: Gamma/(2 pi) r/(r^2 + r_c^2). Zero on the axis (Gerz, Holzäpfel and
     Darracq, Prog. Aerosp. Sci. 38, 2002).
-
-    Parameters
-    ----------
-    r : array_like
-        Distance from the axis, m, >= 0.
-    circulation, core_radius : float
-        m^2 s^-1 and m.
-    model : {"lamb_oseen", "burnham_hallock"}
-
-    Returns
-    -------
-    ndarray
-        m s^-1, the shape of `r`, the sign of the circulation.
     """
     _check_profile(core_radius, model)
     r = np.asarray(r, dtype=float)
@@ -138,19 +125,8 @@ def vortex_pair(
     """The counter-rotating pair behind an aircraft: port, starboard.
 
     Port (larger y) has +circulation, starboard -circulation, so the air between them moves
-    down. Separation and core radius default to the paper's 47.1 m and 3 m.
-
-    Parameters
-    ----------
-    circulation : float
-        Gamma_0 > 0, m^2 s^-1.
-    separation : float
-        b_0 > 0, m.
-    core_radius : float
-        m.
-    y, z : float
-        Centre of the pair, m.
-    model : {"lamb_oseen", "burnham_hallock"}
+    down. Separation and core radius default to the paper's 47.1 m and 3 m. Both are about (y, z);
+    lengths are in m, Gamma_0 > 0 in m^2 s^-1.
 
     Raises
     ------

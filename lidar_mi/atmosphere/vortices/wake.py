@@ -42,17 +42,7 @@ def resample(
     become 219 x 139 of 0.5 m. Elsewhere the nodes lie about the middle of the extent, within it,
     and the attribute ``interpolated`` states with which error. tracer and aerosol are clipped to
     the range of their data, which a spline exceeds at sharp edges (a tracer would go negative
-    there).
-
-    Parameters
-    ----------
-    wake : xarray.Dataset
-        Variables on (x, y, z), from `lidar_mi.io.wake_file.read_wake`.
-    spacing : float
-        m; at most the extent along each of the axes.
-    axes : "yz" or "xyz"
-    most : int
-        Nodes.
+    there). The spacing (m) is at most the extent; ``most`` nodes are allowed.
 
     Raises
     ------

@@ -33,12 +33,7 @@ def sarpkaya_time(dissipation: float) -> float:
 def sarpkaya_decay_time(circulation: float, separation: float, dissipation_rate: float) -> float:
     """Time in which the circulation of a pair falls to 1/e, s.
 
-    Parameters
-    ----------
-    circulation, separation : float
-        At age 0, m^2/s and m.
-    dissipation_rate : float
-        Of the turbulence, m^2/s^3, >= 0.
+    Circulation (m^2/s) and separation (m) are those at age 0, the dissipation rate is in m^2/s^3.
 
     Raises
     ------

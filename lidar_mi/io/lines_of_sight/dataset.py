@@ -31,12 +31,7 @@ def assembled(
 ) -> xr.Dataset:
     """One data set of all scans, lines in the order of time.
 
-    Parameters
-    ----------
-    scans : sequence of (str, Scan, (lines, gates) array)
-        The file's name, a scan and its flags.
-    thresholds : dict
-        Attributes.
+    Each scan has its file's name and its flags (lines, gates); thresholds become attributes.
 
     Raises
     ------
