@@ -51,7 +51,7 @@ _AT_ONCE = 4
 class State(Status):
     """Progress of a running campaign.
 
-    ``started`` is the clock at the start, ``finished_before`` the number of points finished by then.
+    ``started`` is the clock at the start, ``finished_before`` that of points finished before.
     Without a dashboard its address is empty.
     """
 

@@ -78,8 +78,8 @@ def write_cfradial(lines: xr.Dataset, path: str | Path) -> None:
     ends = [str(lines["time"].values[k].astype("datetime64[s]")) + "Z" for k in (0, -1)]
     data = xr.Dataset(fields, {"time": lines["time"], "range": lines["range"]})
     data["time"].encoding = {"units": f"seconds since {start}Z", "dtype": "float64"}
-    first = float(lines["range"].values[0])
-    data["range"].attrs |= {"units": "meters", "meters_to_center_of_first_gate": first}
+    nearest = float(lines["range"].values[0])
+    data["range"].attrs |= {"units": "meters", "meters_to_center_of_first_gate": nearest}
     for name in ("azimuth", "elevation"):
         about = {
             "units": "degrees",
