@@ -68,7 +68,7 @@ def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Contr
                     f"{called}: Commands.{control}: {_shown(value)} at {state.time:.2f} s of "
                     "flight; expected a finite number, rad"
                 )
-            if abs(value) > math.pi / 2:
+            if abs(float(value)) > math.pi / 2:
                 raise InputError(
                     f"{called}: Commands.{control}: {value:g} rad at {state.time:.2f} s of flight "
                     "is not allowed; expected at most 1.57 rad (are these degrees?)"

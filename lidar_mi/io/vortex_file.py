@@ -163,4 +163,6 @@ def _from_data(data: dict[str, Any], where: str) -> VortexPairFit:
         inclined=None,
         slopes=None,
         slope_covariance=None,
+        ambient=None,
+        shared=None,
     )

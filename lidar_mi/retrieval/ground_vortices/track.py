@@ -64,9 +64,10 @@ def tracked(found: xr.Dataset, ground: float | None) -> xr.Dataset:
                 covariance = transition @ covariance @ transition.T + noise
                 steps.append((transition, noise, state))
                 if found["flag"].values[k] == 0:
-                    square = kalman.innovation(state, covariance, measured[k], error)
+                    seen = measured[k], error, np.eye(measured.shape[1], len(state))
+                    square = kalman.innovation(state, covariance, *seen)
                     if square <= scipy.stats.chi2.ppf(GATE, measured.shape[1]):
-                        state, covariance = kalman.updated(state, covariance, measured[k], error)
+                        state, covariance = kalman.updated(state, covariance, *seen)
                         used[k] = True
             states.append((state, covariance))
         for k in range(len(scans) - 2, -1, -1):

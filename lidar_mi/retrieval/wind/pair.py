@@ -227,7 +227,10 @@ def _vectors(
     if method.local:
         flag = flag | _flags_among_neighbours(found.d, low, windows, validation)
     if checks and method.reach:
-        flag = flag | _flags_of_unrelated(clean, given, method)
+        different = _flags_of_unrelated(clean, given, method)
+        # of images that differ the errors are large, however strong the texture
+        named = (different > 0) & ~low.to(flag.device)
+        flag = torch.where(named, flag & ~Flag.LOW_TEXTURE.value, flag) | different
     if given.same:
         flag = flag | Flag.AT_REST.value
     times = None if method.timed else given.times
