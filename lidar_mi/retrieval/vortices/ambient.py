@@ -30,6 +30,8 @@ ALONG = 7.5
 
 # Rms of each component, m/s, of uniform prior density.
 _SPREADS = np.geomspace(0.02, 5.0, 24)
+# Of the weakest turbulence, the least error of a single residual that is told apart.
+_FINEST = 1e-3
 # Squares of pixels in which turbulence is uniform: at most so many.
 _BLOCKS = 150
 # Pixels beyond which the errors by turbulence are those of sums over two by two of them.
@@ -139,6 +141,9 @@ def in_ambient_wind(
             jacobian[:, None],
             weight[None],
         )
+    # exact winds would leave nothing but rounding
+    sharpest = float((weight * slope.square()).sum(0).amax()) * dt**2
+    weight = weight * min(1.0, (_FINEST * float(_SPREADS[0])) ** -2 / sharpest)
     middle_y, middle_z = (float(found.parameters[[k, k + 4]].mean()) for k in (2, 3))
     centre = middle_y, middle_z
     if known is not None:

@@ -45,7 +45,8 @@ def test_the_same_fit_as_by_a_search(images, cold, sigma):
     assert found.success and found.from_start and not cold.from_start
     stderr = np.sqrt(np.diag(cold.covariance))
     assert (np.abs(found.parameters - cold.parameters) < 0.2 * stderr).all()
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), stderr, rtol=0.05)
+    # the strength of the turbulence, of none here, is estimated from other steps
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), stderr, rtol=0.1)
     assert found.chi2 == pytest.approx(cold.chi2, rel=0.02)
     assert found.correlation == pytest.approx(cold.correlation, abs=0.005)
     assert (np.abs(found.parameters - truth) < 4 * stderr).all()

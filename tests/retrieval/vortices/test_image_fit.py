@@ -358,7 +358,8 @@ def test_simulated_wake_with_texture():
     for name in ("v", "w"):
         error = model[name].values - truth.wind[name].transpose("z", "y").values
         assert error.std() < 0.5
-        assert 0.5 < np.sqrt(np.mean((error / model[f"{name}_stderr"].values) ** 2)) < 1.3
+        # too large by four: the departure of this wake counts as turbulence (docs: ambient wind)
+        assert 0.2 < np.sqrt(np.mean((error / model[f"{name}_stderr"].values) ** 2)) < 1.3
 
 
 @pytest.mark.slow
