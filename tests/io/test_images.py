@@ -21,7 +21,6 @@ from lidar_mi.cli import app as cli
 from lidar_mi.errors import InputError
 from lidar_mi.io.images import as_webp, read_image, read_pixels
 from lidar_mi.retrieval.rings import analysis as rings
-from lidar_mi.retrieval.wind import pair as wind
 
 
 @pytest.fixture
@@ -127,8 +126,8 @@ def test_a_colour_image_is_the_same_to_both_commands(tmp_path, monkeypatch):
         raise InputError("that was it")
 
     monkeypatch.setattr(rings, "analyse_rings", stop)
-    importlib.import_module("lidar_mi.retrieval.wind.series")  # which keeps the function
-    monkeypatch.setattr(wind, "retrieve_wind", stop)
+    own_images = importlib.import_module("lidar_mi.experiment.own_images")
+    monkeypatch.setattr(own_images, "retrieve_wind", stop)
     for command in (
         ["rings", "colours.png"],
         ["retrieve", "colours.png", "colours.png", "--dt", "1", "--spacing", "1"],

