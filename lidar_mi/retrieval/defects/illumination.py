@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from scipy.stats import f as fisher
 
+from lidar_mi.retrieval.defects.faint_pattern import in_blocks
 from lidar_mi.retrieval.images.windows import working
 
 FALSE_ALARM = 1e-4
@@ -78,7 +79,8 @@ def described(gain: torch.Tensor) -> str:
 
 def _block_means(image: torch.Tensor) -> np.ndarray:
     """NaN where less than half of a block is finite."""
-    blocks = working(image).unfold(0, _BLOCK, _BLOCK).unfold(1, _BLOCK, _BLOCK).flatten(2)
+    blocks = in_blocks(working(image)[None], _BLOCK)[0]
     many = blocks.isfinite().sum(-1) > _BLOCK**2 / 2
     means = torch.where(blocks.isfinite(), blocks, torch.nan).nanmean(-1)
-    return torch.where(many, means, torch.nan).cpu().numpy()
+    shape = [n // _BLOCK for n in image.shape]
+    return torch.where(many, means, torch.nan).reshape(shape).cpu().numpy()
