@@ -67,7 +67,7 @@ def run(
             metrics[key], found[key] = done.metrics, done.answer
             # a variant without a wake has rings only, which the table compares
             if done.wind is not None:
-                rows[key] = _shown(done.scans[0], done.wind, done.cores)
+                rows[key] = _images_and_wind(done.scans[0], done.wind, done.cores)
         log = Log(notice, folder / LOG)
         log(f"comparing {', '.join(variants)}")
         drawn = draw_comparison(folder / FIGURES, rows, log) if rows else []
@@ -89,7 +89,7 @@ def _of(variant: str, notice: Notice) -> Notice:
     return named
 
 
-def _shown(
+def _images_and_wind(
     scan: xr.Dataset, wind: xr.Dataset, cores: Sequence[Core]
 ) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:
     """First image of the instrument, wind by the first method, positions of true cores.
