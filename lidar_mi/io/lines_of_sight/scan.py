@@ -105,16 +105,16 @@ LEVEL = 0.02
 
 
 def _level(scan: Scan) -> None:
-    """Directions of the beam by the platform's pitch and roll, where their axes are known.
+    """Directions of the beam with pitch and roll of the platform, where their axes are known.
 
-    In tables azimuth and elevation are those of the platform, whose front is at azimuth 0: positive
-    pitch lifts it, positive roll lowers the right side. Of CfRadial they are those above the
-    horizon already. Makers do not document the axes of their sensors: a tilt is an error of what is
-    retrieved, which says so.
+    In tables, azimuth and elevation are relative to the platform, whose front is at azimuth 0:
+    positive pitch raises it, positive roll lowers the right side. In CfRadial files they are
+    relative to the horizon. Other makers do not document the axes of their tilt sensors: their tilt
+    is not applied, and retrievals report it.
     """
     kind = str(scan.about.get("kind", ""))
-    tilted = {"pitch", "roll"} <= set(scan.angles)
-    if not tilted or kind.startswith("CfRadial") or "tilt" in scan.about:
+    measured = {"pitch", "roll"} <= set(scan.angles)
+    if not measured or kind.startswith("CfRadial") or "tilt" in scan.about:
         return
     pitch, roll = (np.deg2rad(np.nan_to_num(scan.angles[name])) for name in ("pitch", "roll"))
     tilt = float(np.rad2deg(np.hypot(pitch, roll).max()))
