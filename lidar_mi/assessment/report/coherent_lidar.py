@@ -55,7 +55,7 @@ def coherent_answer(metrics: Mapping[str, float]) -> Iterator[str]:
         )
 
 
-def coherent_described(lidar: CoherentDoppler, wake: Wake | None) -> list[tuple[str, str]]:
+def coherent_lidar_rows(lidar: CoherentDoppler, wake: Wake | None) -> list[tuple[str, str]]:
     """What was simulated, as (name, text)."""
     laser, scan = lidar.laser, lidar.scan
     rows = []

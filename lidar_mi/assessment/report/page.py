@@ -14,7 +14,7 @@ from lidar_mi.assessment.digits import percent, whole_percent
 from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
-from lidar_mi.assessment.report.coherent_lidar import coherent_described
+from lidar_mi.assessment.report.coherent_lidar import coherent_lidar_rows
 from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.schema.encounter import Encounter
@@ -244,7 +244,7 @@ def simulated(
         methods = ", ".join(METHOD_NAMES[name] for name in chosen.methods)
         rows.append(("winds by", methods))
     if experiment.coherent:
-        rows += coherent_described(experiment.coherent, experiment.wake)
+        rows += coherent_lidar_rows(experiment.coherent, experiment.wake)
     if experiment.fringes:
         doppler = experiment.fringes.lidar
         beam = (
