@@ -115,7 +115,7 @@ def _flows(observation: Observation, seed: int, most: int, search_path: Path) ->
     if wake.turbine:
         return _turbine(observation, wake.turbine, seed, most), None
     assert wake.file is not None  # of the three kinds of wake, the schema asks for one
-    needed, names = tracers_of(wake)
+    tracers, names = tracers_of(wake)
     path = find_file(wake.file, search_path, "wake.file")
     if wake.stored is not None and wake.time is not None:
         passed = wake.stored - wake.time
@@ -130,7 +130,7 @@ def _flows(observation: Observation, seed: int, most: int, search_path: Path) ->
 
     def state(when: float | None) -> xr.Dataset:
         plane = wake.x if wake.depth == "plane" and not along else None
-        flow = read_wake(path, when, names, plane, require=needed)
+        flow = read_wake(path, when, names, plane, require=tracers)
         places = flow["x"].values
         if wake.depth == "plane" and wake.x is None and len(places) > 1:
             raise InputError(
@@ -215,9 +215,9 @@ def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
     Tracers of the extinction have our names once they are read.
     """
     mapping = wake.extinction
-    named = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
-    needed = {n: t for n, t in named.items() if t and mapping.source == "tracer"}
-    return needed, wake.names | {n: t for n, t in needed.items() if t != n}
+    in_file = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
+    tracers = {n: t for n, t in in_file.items() if t and mapping.source == "tracer"}
+    return tracers, wake.names | {n: t for n, t in tracers.items() if t != n}
 
 
 def _turbine(observation: Observation, turbine: Turbine, seed: int, most: int) -> xr.Dataset:
