@@ -59,11 +59,11 @@ def interpolated(
         flow, the spline's error is smaller. 0: nothing was interpolated.
     """
     smooth, straight = values, values
-    for axis, (own, wanted) in enumerate(zip(nodes, targets, strict=True)):
-        if own.size == wanted.size and np.allclose(own, wanted, rtol=0, atol=1e-3 * _step(own)):
+    for axis, (old, new) in enumerate(zip(nodes, targets, strict=True)):
+        if old.size == new.size and np.allclose(old, new, rtol=0, atol=1e-3 * _step(old)):
             continue
-        smooth = scipy.interpolate.CubicSpline(own, smooth, axis=axis)(wanted)
-        straight = _linear(own, straight, wanted, axis)
+        smooth = scipy.interpolate.CubicSpline(old, smooth, axis=axis)(new)
+        straight = _linear(old, straight, new, axis)
     return smooth, float(np.sqrt(np.mean((smooth - straight) ** 2)))
 
 
@@ -79,9 +79,9 @@ def _step(nodes: np.ndarray) -> float:
     return float(np.diff(nodes).min()) if nodes.size > 1 else 1.0
 
 
-def _linear(nodes: np.ndarray, values: np.ndarray, wanted: np.ndarray, axis: int) -> np.ndarray:
-    index = np.clip(np.searchsorted(nodes, wanted) - 1, 0, nodes.size - 2)
-    fraction = (wanted - nodes[index]) / (nodes[index + 1] - nodes[index])
+def _linear(nodes: np.ndarray, values: np.ndarray, targets: np.ndarray, axis: int) -> np.ndarray:
+    index = np.clip(np.searchsorted(nodes, targets) - 1, 0, nodes.size - 2)
+    fraction = (targets - nodes[index]) / (nodes[index + 1] - nodes[index])
     shape = [-1 if k == axis else 1 for k in range(values.ndim)]
     fraction = fraction.reshape(shape)
     before, behind = np.take(values, index, axis), np.take(values, index + 1, axis)

@@ -148,8 +148,7 @@ def corrsin_obukhov(
     )
 
 
-# Of the spline through the nodes, as of advection.
-_ORDER = 5
+_ORDER = 5  # of the spline through the nodes, as in advection
 
 
 @dataclass(frozen=True, eq=False)

@@ -105,7 +105,7 @@ def _data_set(
 ) -> xr.Dataset:
     """The data set of arrays over all points, shape (points,)."""
     points, campaign = folder.points, folder.campaign
-    dims = [one.name for one in points.dimensions]
+    dims = [dimension.name for dimension in points.dimensions]
     shape = points.shape
     if campaign.members > 1:
         dims.append(MEMBER)
@@ -114,22 +114,22 @@ def _data_set(
         shape = shape[:-1]
     units = points.units()
     coords: dict[str, Any] = {}
-    scales = {one.name: one.scale for one in points.dimensions}
+    scales = {dimension.name: dimension.scale for dimension in points.dimensions}
     if campaign.sample:
         scales |= {tied(keys)[0]: span.scale for keys, span in campaign.sample.over.items()}
-    for name, (dim, found) in points.coordinates().items():
+    for name, (dim, along) in points.coordinates().items():
         about = {"long_name": knob_name(name)}
         if name in units:
             about["units"] = units[name]
         if scales.get(name):
             about["scale"] = scales[name]
         # objects: NetCDF then stores text of any length
-        coords[name] = (dim, np.array(found, object if isinstance(found[0], str) else None), about)
+        coords[name] = (dim, np.array(along, object if isinstance(along[0], str) else None), about)
     if MEMBER in dims:
         coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})
     # sorted: the file does not depend on which point has a metric first
     variables: dict[str, Any] = {
-        _beside(key, coords): (dims, values[key].reshape(shape), _about(key))
+        _metric_name(key, coords): (dims, values[key].reshape(shape), _about(key))
         for key in sorted(values)
     }
     variables["status"] = (
@@ -164,7 +164,7 @@ def knob_name(key: str) -> str:
     return words.replace(".", " ").replace("_", " ")
 
 
-def _beside(key: str, coords: Mapping[str, Any]) -> str:
+def _metric_name(key: str, coords: Mapping[str, Any]) -> str:
     """Name of a metric that is not that of a key of the campaign."""
     return f"{key}.metric" if key in coords else key
 

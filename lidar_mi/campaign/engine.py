@@ -156,12 +156,12 @@ def prepare_campaign(
         origin, points = campaign.campaign.name, campaign
     elif isinstance(campaign, Mapping):
         origin = "campaign"
-        described = checked_campaign(campaign, origin)
-        points = Points(described, *read_base(described, origin))
+        description = checked_campaign(campaign, origin)
+        points = Points(description, *read_base(description, origin))
     else:
         origin = str(campaign_file(campaign))
-        described = read_campaign(origin, overrides, quick=quick)
-        points = Points(described, *read_base(described, origin))
+        description = read_campaign(origin, overrides, quick=quick)
+        points = Points(description, *read_base(description, origin))
     if len(points) > MOST_UNASKED and not confirmed:
         raise InputError(
             f"{origin}: {len(points)} points are not allowed unasked; expected at most "
@@ -192,9 +192,9 @@ def connected(
         yield client
         return
     if client is not None:
-        with _client_of(client) as found:
-            _make_ready(found, threads, own_cache=True)
-            yield found
+        with _client_of(client) as cluster_client:
+            _make_ready(cluster_client, threads, own_cache=True)
+            yield cluster_client
         return
     count = workers or os.cpu_count() or 1
     if count < 1:
@@ -230,10 +230,10 @@ def connected(
             )
             open_until_the_end.enter_context(cluster)
             # the default client is that of the user's own code
-            found = open_until_the_end.enter_context(Client(cluster, set_as_default=False))
-            found.wait_for_workers(1, timeout=60)
-        _make_ready(found, threads, own_cache=False)
-        yield found
+            cluster_client = open_until_the_end.enter_context(Client(cluster, set_as_default=False))
+            cluster_client.wait_for_workers(1, timeout=60)
+        _make_ready(cluster_client, threads, own_cache=False)
+        yield cluster_client
 
 
 def execute(
@@ -344,7 +344,7 @@ class _Dispatch:
         """
         images = self.folder.index[number].images
         # most points share nothing: their experiment need not be made here
-        if all(self.needed[one] < 2 for one in images):
+        if all(self.needed[image] < 2 for image in images):
             return [], []
         stages = storing_stages(stages_of(self.folder.points.experiment(number)))
         first: list[int] = []

@@ -49,17 +49,17 @@ def check_spawning(count: int) -> None:
     with tempfile.TemporaryFile() as output:
         try:
             with _output_to(output.fileno()):
-                one = multiprocessing.get_context("spawn").Process(target=os.getpid)
+                process = multiprocessing.get_context("spawn").Process(target=os.getpid)
                 # the child inherits the output: this process has its own back at once
-                one.start()
-            one.join(PATIENCE)
+                process.start()
+            process.join(PATIENCE)
         except (OSError, RuntimeError, ValueError) as error:
             raise _not_started(error) from None
-        if one.exitcode == 0:
+        if process.exitcode == 0:
             return
-        if one.exitcode is None:
-            one.kill()
-            one.join()
+        if process.exitcode is None:
+            process.kill()
+            process.join()
             raise _refused(f"the first had not started after {PATIENCE:g} s")
         output.seek(0)
         text = output.read().decode(errors="replace").strip()
@@ -69,7 +69,7 @@ def check_spawning(count: int) -> None:
     if not os.access(interpreter, os.X_OK):
         raise _refused(f"{interpreter} may not be executed")
     # the last line of a traceback is the exception
-    raise _refused(text.splitlines()[-1] if text else f"exit code {one.exitcode}")
+    raise _refused(text.splitlines()[-1] if text else f"exit code {process.exitcode}")
 
 
 @contextmanager
@@ -87,14 +87,14 @@ def workers_started() -> Iterator[None]:
 def quiet_loggers() -> Iterator[None]:
     """Without the tracebacks that dask and what it builds on log of what they then raise."""
     loggers = [logging.getLogger(name) for name in ("asyncio", "tornado", "distributed")]
-    levels = [one.level for one in loggers]
+    levels = [logger.level for logger in loggers]
     try:
-        for one in loggers:
-            one.setLevel(logging.CRITICAL)
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
         yield
     finally:
-        for one, level in zip(loggers, levels, strict=True):
-            one.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _may_open(number: int) -> bool:
@@ -106,8 +106,8 @@ def _may_open(number: int) -> bool:
     except OSError:
         return False
     finally:
-        for one in opened:
-            os.close(one)
+        for descriptor in opened:
+            os.close(descriptor)
     return True
 
 
@@ -127,13 +127,13 @@ def _refused(reason: str) -> InputError:
 @contextmanager
 def _output_to(target: int) -> Iterator[None]:
     """Standard output and error of processes that start meanwhile, to a file descriptor."""
-    own = {}
+    saved = {}
     try:
         for number in (1, 2):
-            own[number] = os.dup(number)
+            saved[number] = os.dup(number)
             os.dup2(target, number)
         yield
     finally:
-        for number, before in own.items():
+        for number, before in saved.items():
             os.dup2(before, number)
             os.close(before)

@@ -112,8 +112,8 @@ def carry_out(
     campaign = _opened(folder, (Path(folder) / RECORD).stat().st_mtime_ns)
     place = campaign.place(number)
     # the outcome is written before the metrics, by which the point is done
-    if campaign.is_done(number) and (found := campaign.outcome(number)) is not None:
-        return found
+    if campaign.is_done(number) and (recorded := campaign.outcome(number)) is not None:
+        return recorded
     make_folder(place)
     log = Log(path=place / records.LOG)
     start = time.perf_counter()
@@ -163,7 +163,7 @@ def render_shared(folder: str, number: int, name: str, session: str) -> int:
     experiment = campaign.points.experiment(number)
     store, graph = PointStore(campaign, number, experiment), stages_of(experiment)
     pairs = zip(storing_stages(graph), campaign.index[number].images, strict=True)
-    stage, signature = next((stage, one) for stage, one in pairs if stage.name == name)
+    stage, signature = next((stage, image) for stage, image in pairs if stage.name == name)
     images = campaign.images(signature)
     make_folder(images)
     try:
@@ -183,9 +183,9 @@ def run_point(folder: CampaignFolder, number: int) -> Outcome:
     """
     use_threads(1)
     outcome = carry_out(str(folder.path.resolve()), number, uuid.uuid4().hex[:12])
-    needed = signatures(folder.index, range(len(folder.points)))
+    counts = signatures(folder.index, range(len(folder.points)))
     for signature in folder.index[number].images:
-        if needed[signature] == 1:
+        if counts[signature] == 1:
             folder.drop_images(signature)
     return outcome
 
@@ -201,15 +201,15 @@ class PointStore:
         self._experiment, self.signature = experiment.name, campaign.index[number].point
         graph = stages_of(experiment)
         pairs = zip(storing_stages(graph), campaign.index[number].images, strict=True)
-        of = {part: one for stage, one in pairs for part in graph.parts(stage)}
+        of = {part: signature for stage, signature in pairs for part in graph.parts(stage)}
         self.images = ImageStore(lambda part: campaign.images(of[part]), of.__getitem__)
         self.rendered = self.reused = 0
 
     def stored(self, part: str) -> xr.Dataset | None:
         """An image of this content, rendered by any point."""
-        found = self.images.stored(part)
-        self.reused += found is not None
-        return found
+        image = self.images.stored(part)
+        self.reused += image is not None
+        return image
 
     def unfinished(self, part: str) -> dict[str, Any] | None:
         """As of `ImageStore`."""
@@ -252,10 +252,10 @@ def _prepared(experiment: Experiment, search_path: Path) -> Run:
     global _last
     signatures = _signatures(experiment, search_path)
     last_signatures, results = _last
-    known = {
+    reusable = {
         name: results[name] for name in results if last_signatures[name] == signatures.get(name)
     }
-    run = prepare(experiment, search_path, known=known)
+    run = prepare(experiment, search_path, known=reusable)
     results = cast(dict[str, Any], run.results)
     shared = {name: results[name] for name in signatures if name in results}
     _last = ({name: signatures[name] for name in shared}, shared)

@@ -58,22 +58,22 @@ def exit_by(app: Callable[..., int | None]) -> None:
     sys.exit(code or 0)
 
 
-def end_without_result(reason: str, found: "xr.DataArray") -> NoReturn:
+def end_without_result(reason: str, flag: "xr.DataArray") -> NoReturn:
     """End a command whose result has no valid value, with the reasons that its flags give.
 
     Parameters
     ----------
-    found : xr.DataArray
+    flag : xr.DataArray
         Flags with the CF attributes ``flag_masks`` and ``flag_meanings``; none is 0.
     """
-    _fail(f"{reason} (flags: {flags_in_words(found)})", NOTHING_FOUND)
+    _fail(f"{reason} (flags: {flags_in_words(flag)})", NOTHING_FOUND)
 
 
-def flags_in_words(found: "xr.DataArray") -> str:
+def flags_in_words(flag: "xr.DataArray") -> str:
     """How many vectors have each flag, from the CF attributes; empty: all are valid."""
-    masks, names = found.attrs["flag_masks"], found.attrs["flag_meanings"].split()
+    masks, names = flag.attrs["flag_masks"], flag.attrs["flag_meanings"].split()
     counts = (
-        (name, int((found & int(mask) != 0).sum())) for name, mask in zip(names, masks, strict=True)
+        (name, int((flag & int(mask) != 0).sum())) for name, mask in zip(names, masks, strict=True)
     )
     return ", ".join(f"{name} {count}" for name, count in counts if count)
 

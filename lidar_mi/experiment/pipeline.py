@@ -130,9 +130,9 @@ def has_vortices(experiment: Experiment) -> bool:
     """Whether vortex pairs are fitted."""
     if experiment.wake is None or experiment.sensor is None:
         return has_image_vortices(experiment)
-    asked = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
+    fitted = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
     # the wake of a turbine has no pair
-    return asked or experiment.wake.turbine is None
+    return fitted or experiment.wake.turbine is None
 
 
 def has_samples_by_noise(experiment: Experiment) -> bool:

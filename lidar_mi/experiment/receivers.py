@@ -148,11 +148,11 @@ def ring_receiver(
     annulus -= annulus.min()
     pixels = np.bincount(annulus)
     used = pixels > 0
-    lit = np.bincount(annulus, light)[used]
-    middle = np.bincount(annulus, light * order)[used] / lit
+    annulus_light = np.bincount(annulus, light)[used]
+    middle = np.bincount(annulus, light * order)[used] / annulus_light
     # variance of the order over a pixel: r^2 varies by r^2 pixel^2 / 3
     slope = etalon.order_at_centre(lidar.wavelength) / 2 / (etalon.index * camera.focal_length) ** 2
-    spread = slope**2 * camera.pixel**2 / 3 * np.bincount(annulus, light * r2)[used] / lit
+    spread = slope**2 * camera.pixel**2 / 3 * np.bincount(annulus, light * r2)[used] / annulus_light
     amplitudes = fabry_perot.harmonics(etalon, lidar.wavelength)
     n = np.arange(len(amplitudes))
     # harmonics averaged over a pixel: by a Gaussian of the same variance of the order
@@ -160,7 +160,7 @@ def ring_receiver(
     return _receiver(
         lidar,
         detector or CCD(),
-        (lit / lit.sum())[:, None] * amplitudes * turns,
+        (annulus_light / annulus_light.sum())[:, None] * amplitudes * turns,
         1 / etalon.free_spectral_range(lidar.wavelength),
         modes=speckle_modes(lidar, camera, etalon, _line(lidar)),
         pixels=pixels[used].astype(float),
@@ -179,10 +179,10 @@ def standard_error(
     ``free`` and ``prior`` as in `lidar_mi.retrieval.channels.bound.cramer_rao`.
     """
     channels, noise, level, aerosol = receiver
-    found = cramer_rao(
+    bound = cramer_rao(
         channels, energy * level, noise, v_los=v_los, aerosol=aerosol, free=free, prior=prior
     )
-    return found["v_los"]
+    return bound["v_los"]
 
 
 def required_energy(receiver: Receiver, error: float, v_los: float = 0.0) -> float:
@@ -291,7 +291,7 @@ def _monotone(channels: ChannelModel, aerosol: float) -> tuple[float, float]:
     middle = _SPEEDS // 2
     if not steps[middle - 1] * steps[middle] > 0:
         raise InputError("double edge: the ratio of its signals does not depend on the speed at 0")
-    other = np.flatnonzero(steps * steps[middle] <= 0)
-    first = other[other < middle].max(initial=-1) + 1
-    last = other[other > middle].min(initial=_SPEEDS - 1)
+    falling = np.flatnonzero(steps * steps[middle] <= 0)
+    first = falling[falling < middle].max(initial=-1) + 1
+    last = falling[falling > middle].min(initial=_SPEEDS - 1)
     return float(speeds[first]), float(speeds[last])

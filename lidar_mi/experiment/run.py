@@ -222,7 +222,7 @@ def _report(run: Run, store: RunFolder) -> None:
     from lidar_mi.assessment.report.page import page
     from lidar_mi.experiment.report import chapters
 
-    made, seconds = chapters(run.experiment, run.results, run.metrics, store.figures, run.log)
+    drawn, seconds = chapters(run.experiment, run.results, run.metrics, store.figures, run.log)
     run.seconds |= seconds
     # figures are drawn from the metrics: their own duration comes last
     run.metrics |= {timing_key(step): round(value, 3) for step, value in seconds.items()}
@@ -233,7 +233,7 @@ def _report(run: Run, store: RunFolder) -> None:
         resolved,
         versions,
         run.metrics,
-        made,
+        drawn,
         run.warnings,
         run.answer,
         store.data_files(),

@@ -42,8 +42,8 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     write_text(path, table.rename(columns=heads).to_csv(index=False, na_rep="NaN"))
 
 
-def _equal(data: xr.Dataset, one: str, other: str) -> bool:
-    return other in data.coords and bool((data[one] == data[other]).all())
+def _equal(data: xr.Dataset, first: str, second: str) -> bool:
+    return second in data.coords and bool((data[first] == data[second]).all())
 
 
 def _in_words(flags: np.ndarray, attributes: dict[str, Any]) -> list[str]:

@@ -46,9 +46,9 @@ def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = 
     path = Path(path)
     frames = _frames(path, layer)
     if frame is None and frames.count > 1:
-        what = "channels" if frames.channels else "frames"
+        axis = "channels" if frames.channels else "frames"
         raise InputError(
-            f"{path}: {frames.count} {what}; expected --frame, 0 to {frames.count - 1}"
+            f"{path}: {frames.count} {axis}; expected --frame, 0 to {frames.count - 1}"
         )
     return _numbered(path, frames, [frame or 0])[0].astype(float)
 
@@ -128,9 +128,9 @@ def _exr(path: Path, layer: str | None) -> Frames:
         raise InputError(
             f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
         )
-    named = layer or default_layer(path)
-    if named:
-        return frames_of(path, layers[named][None])
+    chosen = layer or default_layer(path)
+    if chosen:
+        return frames_of(path, layers[chosen][None])
     colours = np.stack([layers[name] for name in "RGB"], -1)
     return frames_of(path, grey(path, colours, 3)[None])
 
@@ -235,7 +235,7 @@ def read_images(
 ) -> list[xr.DataArray]:
     """Some images of a file, each as `read_image` gives it; the file is read once."""
     images = read_frames(path, layer, numbers)
-    return [_on_axes(path, layer, spacing, one.astype(float)) for one in images]
+    return [_on_axes(path, layer, spacing, frame.astype(float)) for frame in images]
 
 
 def _on_axes(
@@ -299,8 +299,8 @@ def read_noise(
         return None
     layers, layer = read_layers(path)[1], layer or default_layer(path)
     # of random numbers that both images of a pair share: what the other does not have
-    own = "gate000.S0_pair_stderr"
-    error = own if own in layers else "gate000.S0_stderr"
+    unshared = "gate000.S0_pair_stderr"
+    error = unshared if unshared in layers else "gate000.S0_stderr"
     if layer in ("Y", "Y_noisy") and {"gate000.S0", error, "Y"} <= set(layers):
         signal, stderr, scaled = (
             read_image(path, name, spacing) for name in ("gate000.S0", error, "Y")
@@ -310,8 +310,8 @@ def read_noise(
             detector = read_image(path, "Y_noise_std", spacing)
             noise = noise.copy(data=np.hypot(noise.values, detector.values))
         return noise
-    known = f"{layer}_stderr"
-    return read_image(path, known, spacing) if known in layers else None
+    stderr_layer = f"{layer}_stderr"
+    return read_image(path, stderr_layer, spacing) if stderr_layer in layers else None
 
 
 def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | None:
@@ -335,8 +335,8 @@ def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | N
     if "beam_time" not in layers:
         return None
     names = [name for name in ("beam_time", "y_reported", "z_reported") if name in layers]
-    found = xr.Dataset({name: read_image(path, name, spacing) for name in names})
-    return found.assign_attrs(frozen_air=int(header.get("frozen_air", 0)))
+    beams = xr.Dataset({name: read_image(path, name, spacing) for name in names})
+    return beams.assign_attrs(frozen_air=int(header.get("frozen_air", 0)))
 
 
 def as_webp(path: str | Path) -> bytes:
@@ -389,10 +389,10 @@ def panel_cuts(path: str | Path) -> list[float]:
     # one panel is about as high as it is wide
     most = min(4, round(2 * pixels.shape[1] / max(pixels.shape[0], 1)))
     for columns in range(2, most + 1):
-        wanted = [k / columns for k in range(1, columns)]
-        near = [white[abs(white - cut) < 0.1 / columns] for cut in wanted]
+        expected = [k / columns for k in range(1, columns)]
+        near = [white[abs(white - cut) < 0.1 / columns] for cut in expected]
         if all(gap.size for gap in near):
             return [
-                float(gap[abs(gap - cut).argmin()]) for gap, cut in zip(near, wanted, strict=True)
+                float(gap[abs(gap - cut).argmin()]) for gap, cut in zip(near, expected, strict=True)
             ]
     return []

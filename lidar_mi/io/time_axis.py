@@ -58,8 +58,8 @@ def tolerances(times: np.ndarray, rounding: np.ndarray) -> np.ndarray:
 
 def listing(times: np.ndarray, tolerance: np.ndarray, most: int = 20) -> str:
     """Times as the shortest numbers that mean them: "40, 40.1 ..."."""
-    shown = [_shortest(float(t), float(d)) for t, d in zip(times[:most], tolerance, strict=False)]
-    return ", ".join(shown) + (" ..." if times.size > most else "")
+    numbers = [_shortest(float(t), float(d)) for t, d in zip(times[:most], tolerance, strict=False)]
+    return ", ".join(numbers) + (" ..." if times.size > most else "")
 
 
 def _shortest(time: float, tolerance: float) -> str:
@@ -89,8 +89,8 @@ def state_at(time: float, times: np.ndarray, rounding: np.ndarray, where: str) -
     fits = np.flatnonzero(np.abs(times - time) <= tolerance)
     if fits.size == 1:
         return int(fits[0])
-    asked = _shortest(time, 2 * float(np.spacing(abs(time))))
+    text = _shortest(time, 2 * float(np.spacing(abs(time))))
     allowed = f"allowed: {listing(times, tolerance)} s"
     if fits.size:
-        raise InputError(f"{where}: {fits.size} states have the time {asked} s; expected one each")
-    raise InputError(f"{where}: time {asked} s is not there; {allowed}")
+        raise InputError(f"{where}: {fits.size} states have the time {text} s; expected one each")
+    raise InputError(f"{where}: time {text} s is not there; {allowed}")

@@ -19,12 +19,12 @@ def check_scene_file(path: str | Path) -> None:
     InputError
         No XML, or tags nested deeper than `DEEPEST`.
     """
-    pending, seen = [Path(path)], set()
+    pending, checked = [Path(path)], set()
     while pending:
-        one = pending.pop().resolve()
-        if one not in seen and one.is_file():
-            seen.add(one)
-            pending += [one.parent / name for name in _included(one)]
+        file = pending.pop().resolve()
+        if file not in checked and file.is_file():
+            checked.add(file)
+            pending += [file.parent / name for name in _included(file)]
 
 
 def _included(path: Path) -> list[str]:

@@ -61,14 +61,14 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         raise _fault(f"{one_line(text, 60)} is not of the type {kind}", node.start_mark)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+        keys = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
         data = super().construct_mapping(node, deep)
-        seen = set()
-        for key in own:
+        names = set()
+        for key in keys:
             name = self.construct_object(key, deep=True)
-            if name in seen:
+            if name in names:
                 raise _fault(f"key {one_line(repr(name), 60)} is there twice", key.start_mark)
-            seen.add(name)
+            names.add(name)
         return data
 
 

@@ -28,11 +28,11 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     # a misspelt key also leaves one missing: report the misspelt one
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     where, word = _key(model, fault["loc"]), ""
-    others = [f for f in faults if f is not fault and _key(model, f["loc"]) == where]
-    if others and fault["type"] == "literal_error":
+    alternatives = [f for f in faults if f is not fault and _key(model, f["loc"]) == where]
+    if alternatives and fault["type"] == "literal_error":
         # a word or a number: report the number's fault
         word = fault["ctx"]["expected"] + " or "
-        fault = others[0]
+        fault = alternatives[0]
     field = ".".join(where)
     message = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
@@ -51,19 +51,19 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
         _metadata_at(model, fault["loc"], Within),
     )
     symbol = unit.symbol if unit else ""
-    shown = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
+    text = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
     if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
         if unit and not isinstance(value, float):
             # as it was understood, with its unit
-            shown = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
+            text = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
         expected = word + within.words(symbol)
         if symbol == "rad" and isinstance(value, str):
             # angles in the unit in which they were given
-            given = re.fullmatch(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*([a-zA-Z]+)\s*", value)
-            if given:
-                shown = " ".join(value.split())
-                size = to_si(f"1 {given[1]}", symbol, unit.example)
-                expected = word + within.words(given[1], 1 / size)
+            angle = re.fullmatch(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*([a-zA-Z]+)\s*", value)
+            if angle:
+                text = " ".join(value.split())
+                size = to_si(f"1 {angle[1]}", symbol, unit.example)
+                expected = word + within.words(angle[1], 1 / size)
     elif fault["type"].startswith("model_"):
         expected = f"a section with keys out of {', '.join(_keys_at(model, fault['loc']))}"
     elif fault["type"] == "string_pattern_mismatch":
@@ -80,7 +80,7 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
         expected = f"{fault['ctx']['min_length']} or more"
     else:
         expected = word + message.removeprefix("Input should be ")
-    return f"{field}: {shown} is not allowed; expected {expected}"
+    return f"{field}: {text} is not allowed; expected {expected}"
 
 
 def _steps(
@@ -125,9 +125,9 @@ def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:
     """How many values a list at a location has; 1: any number."""
     field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     annotation: Any = field.annotation if field else None
-    for one in (annotation, *get_args(annotation)):
-        if get_origin(one) is tuple and Ellipsis not in get_args(one):
-            return len(get_args(one))
+    for kind in (annotation, *get_args(annotation)):
+        if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
+            return len(get_args(kind))
     return 1
 
 
@@ -137,7 +137,7 @@ def _words_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[s
     members = get_args(field.annotation) if field else ()
     kind = members[0] if members else None
     words: tuple[Any, ...] = tuple(kind) if isinstance(kind, enum.EnumType) else ()
-    return [str(one) for one in words]
+    return [str(member) for member in words]
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

@@ -61,7 +61,7 @@ class Key:
         """The default; empty: those of a section's keys."""
         if self.value is PydanticUndefined:
             return "required"
-        return "" if isinstance(self.value, BaseModel) else _shown(self.value, self.unit)
+        return "" if isinstance(self.value, BaseModel) else _as_in_a_file(self.value, self.unit)
 
     @property
     def example(self) -> str:
@@ -82,8 +82,8 @@ def names() -> list[str]:
 
 def settable() -> list[str]:
     """Those that ``--set`` can change one at a time: no sections, nor keys of lists of sections."""
-    found = _fields()
-    return [name for name, (_, field, within) in found.items() if not within and _is_leaf(field)]
+    fields = _fields()
+    return [name for name, (_, field, within) in fields.items() if not within and _is_leaf(field)]
 
 
 def explain(name: str) -> Key:
@@ -172,11 +172,11 @@ def sections() -> tuple[str, ...]:
 @cache
 def _fields() -> Mapping[str, tuple[type[BaseModel], FieldInfo, str]]:
     """Of every key: the section that has it, its field, and the list of sections that it is in."""
-    found: dict[str, tuple[type[BaseModel], FieldInfo, str]] = {}
-    for name, one in _walk(Experiment, "", ""):
+    fields: dict[str, tuple[type[BaseModel], FieldInfo, str]] = {}
+    for name, entry in _walk(Experiment, "", ""):
         # of the kinds of a section, the first one describes the keys that they share
-        found.setdefault(name, one)
-    return found
+        fields.setdefault(name, entry)
+    return fields
 
 
 def _walk(
@@ -224,7 +224,7 @@ def _first(field: FieldInfo, kind: type) -> Any:
     return None
 
 
-def _shown(value: Any, symbol: str) -> str:
+def _as_in_a_file(value: Any, symbol: str) -> str:
     """A value as a file would have it, numbers in their usual unit."""
     if isinstance(value, Enum):
         return str(value.value)
@@ -232,7 +232,7 @@ def _shown(value: Any, symbol: str) -> str:
         plain = not symbol or value == 0 or not math.isfinite(value)
         return f"{value:.6g}" if plain else usual(value, symbol)
     if isinstance(value, tuple | list):
-        return f"[{', '.join(_shown(one, symbol) for one in value)}]"
+        return f"[{', '.join(_as_in_a_file(member, symbol) for member in value)}]"
     return value if isinstance(value, str) else to_yaml_line(value)
 
 

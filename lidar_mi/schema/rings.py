@@ -87,12 +87,14 @@ class Assumed(Section):
         None, description="taken by the retrieval in place of the true one; default: the true one"
     )
 
-    def of(self, described: _Part) -> _Part:
+    def of(self, part: _Part) -> _Part:
         """A part of the instrument with the assumed values in place of its own."""
-        given = self.model_dump(exclude_none=True)
+        assumed = self.model_dump(exclude_none=True)
         # etalon and camera each have some of the assumed values
-        own = {name: value for name, value in given.items() if name in type(described).model_fields}
-        return described.model_copy(update=own)
+        fitting = {
+            name: value for name, value in assumed.items() if name in type(part).model_fields
+        }
+        return part.model_copy(update=fitting)
 
 
 class RingCalibration(Section):

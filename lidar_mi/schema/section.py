@@ -32,8 +32,8 @@ def tagged_section(annotation: Any, tag: object) -> type[BaseModel] | None:
     """That of a kind, by its tag in a discriminated union; None: there is none."""
     if any(isinstance(part, Tag) and part.tag == tag for part in get_args(annotation)):
         return section_in(annotation)
-    found = (tagged_section(part, tag) for part in get_args(annotation))
-    return next(filter(None, found), None)
+    sections = (tagged_section(part, tag) for part in get_args(annotation))
+    return next(filter(None, sections), None)
 
 
 def each_once(key: str, values: tuple[object, ...]) -> None:

@@ -27,11 +27,13 @@ def gpu_memory() -> int:
 
     Where neither says it, `UNKNOWN_GPU`.
     """
-    asked = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0] or "0"
-    query = ["nvidia-smi", "-i", asked, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
+    device = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0] or "0"
+    query = ["nvidia-smi", "-i", device, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
     try:
-        said = subprocess.run(query, check=True, capture_output=True, text=True, timeout=20).stdout
-        return int(said.split()[0]) << 20
+        output = subprocess.run(
+            query, check=True, capture_output=True, text=True, timeout=20
+        ).stdout
+        return int(output.split()[0]) << 20
     except (OSError, subprocess.SubprocessError, ValueError, IndexError):
         import torch
 

@@ -68,9 +68,9 @@ def _explained(load: Callable[[Any], Any], name: str) -> Callable[[Any], Any]:
     It stays an ImportError, by which ``mitsuba.set_variant`` goes on to the next of several names.
     """
 
-    def load_or_explain(given: Any) -> Any:
+    def load_or_explain(argument: Any) -> Any:
         try:
-            return load(given)
+            return load(argument)
         except ImportError as error:
             variant = name.rpartition(".")[2]
             raise ImportError(f"variant: {variant} cannot run here: {NO_CUDA}") from error

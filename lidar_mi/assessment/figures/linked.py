@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.seen import seen
+from lidar_mi.assessment.figures.alt_text import alt_text
 
 
 class Mark(NamedTuple):
@@ -53,7 +53,7 @@ def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     """The axes' figure as an SVG element with marks below its lines; all text is escaped."""
     figure = axes.figure
     assert isinstance(figure, Figure)  # that of `panel`
-    spoken = ". ".join(part for part in (label.strip(" ,"), seen(figure)) if part)
+    spoken = ". ".join(part for part in (label.strip(" ,"), alt_text(figure)) if part)
     # cells and dots are behind the frame
     figure.patch.set_visible(False)
     axes.patch.set_visible(False)

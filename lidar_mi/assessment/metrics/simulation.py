@@ -37,7 +37,7 @@ def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:
 
 
 def simulation_metrics(
-    changes: xr.Dataset, found: xr.Dataset, cores: Sequence[Core]
+    changes: xr.Dataset, winds: xr.Dataset, cores: Sequence[Core]
 ) -> dict[str, float]:
     """Standard deviation that the simulation's noise has in the wind, by method.
 
@@ -45,7 +45,7 @@ def simulation_metrics(
     ----------
     changes : xr.Dataset, dims (algorithm, z, y)
         v, w (m s^-1) from `lidar_mi.experiment.stages.simulation_noise.simulation_noise`.
-    found : xr.Dataset, dims (source, algorithm, z, y)
+    winds : xr.Dataset, dims (source, algorithm, z, y)
         The winds; the last source is that of the changes.
     cores : sequence of Core
         True vortices.
@@ -57,9 +57,9 @@ def simulation_metrics(
         ``.outside_cores.monte_carlo_v`` beyond two core radii.
     """
     metrics: dict[str, float] = {}
-    source = found["source"].values[-1]
+    source = winds["source"].values[-1]
     for method in changes["algorithm"].values:
-        wind = found.sel(source=source, algorithm=method)
+        wind = winds.sel(source=source, algorithm=method)
         far = outside_cores(wind["y_vector"].values, wind["z_vector"].values, list(cores))
         places = {"": np.ones_like(far)} | ({OUTSIDE_CORES: far} if cores else {})
         for place, inside in places.items():
@@ -101,10 +101,10 @@ def largest_parts(metrics: Mapping[str, xr.DataArray]) -> xr.DataArray | None:
     parts: list[xr.DataArray] = []
     for place, source in product((OUTSIDE_CORES, ""), RENDERED):
         for key in metrics:
-            head, found, _ = key.partition(f".{place}monte_carlo_v")
-            if found and head.startswith(f"{source}.") and key == head + found:
-                both = [[f"{head}.{place}{n}_{c}" for c in "vw"] for n in ("monte_carlo", "rmse")]
-                noise, error = ([metrics[k] ** 2 for k in keys] for keys in both)
+            head, suffix, _ = key.partition(f".{place}monte_carlo_v")
+            if suffix and head.startswith(f"{source}.") and key == head + suffix:
+                pairs = [[f"{head}.{place}{n}_{c}" for c in "vw"] for n in ("monte_carlo", "rmse")]
+                noise, error = ([metrics[k] ** 2 for k in keys] for keys in pairs)
                 parts.append((noise[0] + noise[1]) / (error[0] + error[1]))
         if parts:
             break
@@ -122,7 +122,7 @@ def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> li
         Of a run, with those of `simulation_metrics`; empty without them.
     """
     place = far_from_cores(metrics, "true_wind.", "rms_")
-    found = []
+    parts = []
     # with the detector's noise, if there are such images
     for source in reversed(RENDERED):
         for method in methods:
@@ -134,7 +134,7 @@ def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> li
                 for name in ("monte_carlo", "rmse")
             )
             if error > 0 and noise >= 0:
-                found.append(SimulationPart(str(method), min(noise / error, 1.0), place))
-        if found:
+                parts.append(SimulationPart(str(method), min(noise / error, 1.0), place))
+        if parts:
             break
-    return found
+    return parts

@@ -56,7 +56,11 @@ def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged 
     """
     simulated = simulation_sentence(experiment, metrics)
     lines = [simulated] if simulated else []
-    lines += [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
+    lines += [
+        *_wind(experiment, metrics),
+        *_misstatements(experiment, metrics),
+        *_vortices(metrics),
+    ]
     lines += _scatterers(metrics)
     speed = experiment.platform.speed if experiment.imaged_wake else 0.0
     lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
@@ -126,9 +130,9 @@ def _images(experiment: Experiment, metrics: Mapping[str, float]) -> str:
         errors = _values(metrics, wind_key(source, method, f"{far}rmse_"), components)
         if valid is None:
             continue
-        found = f"{errors} m/s ({whole_percent(valid)} valid)" if errors else "no valid vector"
-        found = "no skill" if has_no_skill(metrics, source, method) else found
-        parts.append(f"{METHOD_NAMES[method]} {found}")
+        result = f"{errors} m/s ({whole_percent(valid)} valid)" if errors else "no valid vector"
+        result = "no skill" if has_no_skill(metrics, source, method) else result
+        parts.append(f"{METHOD_NAMES[method]} {result}")
     true = _values(metrics, f"true_wind.{far}rms_", components)
     return (
         f"Backscatter lidar, {_place(experiment)}{_without_noise(experiment)}: rms errors of "
@@ -160,7 +164,7 @@ def _rings(doppler: Doppler, metrics: Mapping[str, float]) -> Iterator[str]:
         )
 
 
-def _stated(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
+def _misstatements(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
     """Standard errors that do not hold here, of the winds that the answer names."""
     if "sensor.vectors" in metrics:
         yield from _misstated("both lidars", metrics, "sensor.", "uvw")
@@ -175,11 +179,11 @@ def _stated(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[st
 def _misstated(
     name: str, metrics: Mapping[str, float], head: str, components: str
 ) -> Iterator[str]:
-    known = [one for one in components if f"{head}coverage_95_{one}" in metrics]
-    if not known or metrics.get(f"{head}valid_fraction", 1.0) < _ENOUGH:
+    stated = [component for component in components if f"{head}coverage_95_{component}" in metrics]
+    if not stated or metrics.get(f"{head}valid_fraction", 1.0) < _ENOUGH:
         return
     inner, outer = (
-        sum(metrics[f"{head}coverage_{level}_{one}"] for one in known) / len(known)
+        sum(metrics[f"{head}coverage_{level}_{component}"] for component in stated) / len(stated)
         for level in (68, 95)
     )
     low, high = _HOLDS
@@ -198,20 +202,20 @@ def _misstated(
 def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:
     """The fit to the wind vectors, or else to the images, where there is a true pair."""
     sides = ("port", "starboard")
-    known = [vortex_key("truth", f"{side}_circulation_5_15") for side in sides]
+    truth = [vortex_key("truth", f"{side}_circulation_5_15") for side in sides]
     for origin in ("vectors", "images"):
         keys = [vortex_key(origin, f"{side}_circulation_5_15") for side in sides]
-        if any(metrics.get(key) is None for key in known) or any(k not in metrics for k in keys):
+        if any(metrics.get(key) is None for key in truth) or any(k not in metrics for k in keys):
             continue
-        true = [metrics[key] for key in known]
-        found = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
-        off = max(
-            abs(metrics[key] - one) / metrics.get(f"{key}_stderr", math.inf)
-            for key, one in zip(keys, true, strict=True)
+        true = [metrics[key] for key in truth]
+        fitted = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
+        departure = max(
+            abs(metrics[key] - expected) / metrics.get(f"{key}_stderr", math.inf)
+            for key, expected in zip(keys, true, strict=True)
         )
-        beyond = f", off by up to {off:.2g} standard errors" if off > _FAR_OFF else ""
+        beyond = f", off by up to {departure:.2g} standard errors" if departure > _FAR_OFF else ""
         yield (
-            f"Vortex pair: circulations {found[0]} and {found[1]} m²/s, true "
+            f"Vortex pair: circulations {fitted[0]} and {fitted[1]} m²/s, true "
             f"{true[0]:.0f} and {true[1]:.0f} m²/s{beyond}."
         )
         return

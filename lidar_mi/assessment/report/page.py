@@ -11,10 +11,10 @@ import jinja2
 from markupsafe import Markup
 
 from lidar_mi.assessment.digits import percent, whole_percent
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
-from lidar_mi.assessment.report.coherent_lidar import coherent_described
+from lidar_mi.assessment.report.coherent_lidar import coherent_lidar_rows
 from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.schema.encounter import Encounter
@@ -127,8 +127,8 @@ def page(
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
         images = dict(zip(drawn, pool.map(picture, drawn), strict=True))
-    shown = [[images[figure] for figure in chapter.drawn] for chapter in chapters]
-    first = next((figures for figures in shown if figures), [])
+    pictures = [[images[figure] for figure in chapter.drawn] for chapter in chapters]
+    first = next((figures for figures in pictures if figures), [])
     overview, first[:1] = first[:1], []
     return template("report.html").render(
         name=experiment.name,
@@ -145,7 +145,7 @@ def page(
         chapters=[
             chapter._asdict()
             | {"images": figures, "film": _packed(chapter.film) if chapter.film else None}
-            for chapter, figures in zip(chapters, shown, strict=True)
+            for chapter, figures in zip(chapters, pictures, strict=True)
         ],
     )
 
@@ -182,7 +182,7 @@ def picture(figure: Drawn) -> Picture:
     """A figure for a page: lossless WebP, two thirds of its PNG."""
     source = f"data:image/webp;base64,{base64.b64encode(as_webp(figure.path)).decode()}"
     cuts = " ".join(f"{cut:.4f}" for cut in panel_cuts(figure.path))
-    alt = f"{figure.title}. {figure.seen}".strip()
+    alt = f"{figure.title}. {figure.alt_text}".strip()
     return Picture(figure.title, figure.caption, source, cuts, alt)
 
 
@@ -244,23 +244,24 @@ def simulated(
         methods = ", ".join(METHOD_NAMES[name] for name in chosen.methods)
         rows.append(("winds by", methods))
     if experiment.coherent:
-        rows += coherent_described(experiment.coherent, experiment.wake)
+        rows += coherent_lidar_rows(experiment.coherent, experiment.wake)
     if experiment.fringes:
-        other = experiment.fringes.lidar
+        doppler = experiment.fringes.lidar
         beam = (
-            f"{shown(other.wavelength, 'nm')}, {shown(other.pulse_energy, 'mJ')}, "
-            f"{other.range_bin:g} m at {other.range:g} m, in air of {other.altitude:g} m altitude"
+            f"{shown(doppler.wavelength, 'nm')}, {shown(doppler.pulse_energy, 'mJ')}, "
+            f"{doppler.range_bin:g} m at {doppler.range:g} m, in air of {doppler.altitude:g} m "
+            "altitude"
         )
-        if other.pressure is not None and other.temperature is not None:
-            beam += f" ({other.pressure / 100:.4g} hPa, {other.temperature:.4g} K)"
+        if doppler.pressure is not None and doppler.temperature is not None:
+            beam += f" ({doppler.pressure / 100:.4g} hPa, {doppler.temperature:.4g} K)"
         rows.append(("Doppler lidar", beam))
     if experiment.sensor:
         lines = experiment.sensor.directions
-        both = (
+        combined = (
             f"{lines.columns} x {lines.rows} lines of sight of {experiment.sensor.pulses} pulses, "
             f"v and w by {METHOD_NAMES[experiment.sensor.method]}"
         )
-        rows.append(("both together", both))
+        rows.append(("both together", combined))
     rows.append(("seed", str(experiment.seed)))
     rows.append(("versions", ", ".join(f"{name} {version}" for name, version in versions.items())))
     return rows

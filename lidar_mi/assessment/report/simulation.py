@@ -49,7 +49,7 @@ def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) ->
     large = [part for part in parts if part.exceeds(allowed)]
     if not large:
         return ""
-    named = " and ".join(
+    methods = " and ".join(
         f"{whole_percent(part.fraction)} ({METHOD_NAMES[part.method]})" for part in large
     )
     beyond = " beyond two core radii" if large[0].place else ""
@@ -57,8 +57,8 @@ def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) ->
     if _FRACTION in metrics:
         ratio = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
     return (
-        f"Noise of the simulation, which a lidar does not have, causes {named} of the mean square "
-        f"error of v and w{beyond} ({number}{ratio})."
+        f"Noise of the simulation, which a lidar does not have, causes {methods} of the mean "
+        f"square error of v and w{beyond} ({number}{ratio})."
     )
 
 
@@ -68,14 +68,18 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
     if not sentence:
         return ""
     text = sentence[0].lower() + sentence[1:].removesuffix(".")
-    samples, needed = metrics[_SAMPLES], _needed(experiment, metrics)
+    samples, sufficient = metrics[_SAMPLES], _sufficient_samples(experiment, metrics)
     allowed = experiment.render.monte_carlo_fraction
     if experiment.render.samples_per_beam == "auto" and experiment.detector:
-        times = f"; expected {float(f'{needed / samples:.2g}'):g} times as many" if needed else ""
+        times = (
+            f"; expected {float(f'{sufficient / samples:.2g}'):g} times as many"
+            if sufficient
+            else ""
+        )
         return f"render.max_samples: {text}{times}"
     # two digits of it are known
-    expected = f"{float(f'{needed:.2g}'):.0f} or more" if needed else "more"
-    visible = 0.0 if needed else _texture_visible(experiment, metrics)
+    expected = f"{float(f'{sufficient:.2g}'):.0f} or more" if sufficient else "more"
+    visible = 0.0 if sufficient else _texture_visible(experiment, metrics)
     if visible > samples:
         expected += (
             f": with {visible:.2g} its variance is {whole_percent(allowed)} of that of the texture"
@@ -86,9 +90,9 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
 
 def samples_of(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     """The number of samples of a run's images, and whether it was chosen."""
-    asked = experiment.render.samples_per_beam
-    number = f"{metrics.get(_SAMPLES, asked):.4g}" if _SAMPLES in metrics else str(asked)
-    chosen = " chosen by the detector noise" if asked == "auto" and _SAMPLES in metrics else ""
+    samples = experiment.render.samples_per_beam
+    number = f"{metrics.get(_SAMPLES, samples):.4g}" if _SAMPLES in metrics else str(samples)
+    chosen = " chosen by the detector noise" if samples == "auto" and _SAMPLES in metrics else ""
     return f"{number} samples per beam{chosen if experiment.detector else ''}"
 
 
@@ -130,7 +134,7 @@ def _texture_visible(experiment: Experiment, metrics: Mapping[str, float]) -> fl
     return metrics[_SAMPLES] * ratio**2 / experiment.render.monte_carlo_fraction
 
 
-def _needed(experiment: Experiment, metrics: Mapping[str, float]) -> float:
+def _sufficient_samples(experiment: Experiment, metrics: Mapping[str, float]) -> float:
     """Samples per beam that are enough; 0: not known, as hardly any error is of something else."""
     samples, allowed = metrics[_SAMPLES], experiment.render.monte_carlo_fraction
     if _FRACTION in metrics:

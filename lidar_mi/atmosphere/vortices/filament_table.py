@@ -97,22 +97,22 @@ class FilamentTable:
     def velocity(self, places: np.ndarray) -> np.ndarray:
         """Velocity (3, ...), m/s, at places (3, ...), m, in the filaments' axes."""
         flat = np.reshape(places, (3, -1))
-        found = np.empty_like(flat)
-        rest = np.arange(flat.shape[1])
+        values = np.empty_like(flat)
+        outside = np.arange(flat.shape[1])
         for grid in (self._fine, self._coarse):
-            index = grid.index(flat[:, rest])
+            index = grid.index(flat[:, outside])
             inside = grid.inside(index)
-            found[:, rest[inside]] = grid.at(index[:, inside])
-            rest = rest[~inside]
-        found[0, rest] = 0.0
+            values[:, outside[inside]] = grid.at(index[:, inside])
+            outside = outside[~inside]
+        values[0, outside] = 0.0
         pair = vortex_pair(
             1.0,
             self._filaments.separation,
             self._filaments.core_radius,
             model=self._filaments.model,
         )
-        found[1:, rest] = velocity(pair, flat[1, rest], flat[2, rest])
-        return found.reshape(np.shape(places))
+        values[1:, outside] = velocity(pair, flat[1, outside], flat[2, outside])
+        return values.reshape(np.shape(places))
 
     def _grid(self, crest: float, reach: tuple[float, float, float], spacing: np.ndarray) -> _Grid:
         """Splines on a grid to ``reach`` (+-l, lowest n, highest n; m)."""

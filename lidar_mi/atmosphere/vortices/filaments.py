@@ -84,19 +84,19 @@ class Filaments:
         far_nodes, far_steps = (
             np.concatenate(parts) for parts in zip(*map(_coarse, self.curves), strict=True)
         )
-        found = self._straight(flat)
+        wind = self._straight(flat)
         shifts = [j * self.period for j in range(-self.images, self.images + 1)]
         size = max(1, _CHUNK // len(nodes))
         for first in range(0, len(flat), size):
             some = flat[first : first + size]
-            # the core matters near a line only: most nodes are far from points that are neighbours
+            # the core matters only near a line; neighbouring points are far from most nodes
             near = self._within(some, nodes, _FAR * self._sigma)
-            found[first : first + size] += (
+            wind[first : first + size] += (
                 self._sum(some, nodes[near], steps[near], [0.0], self._kernel, self._nearby)
                 + self._sum(some, nodes[~near], steps[~near], [0.0], self._far, self._nearby)
                 + self._sum(some, far_nodes, far_steps, shifts, self._far, self._beyond)
             )
-        return found.reshape(np.shape(places))
+        return wind.reshape(np.shape(places))
 
     @property
     def _sigma(self) -> float:
@@ -172,15 +172,15 @@ class Filaments:
 
     def _straight(self, places: np.ndarray) -> np.ndarray:
         """Velocity by a straight pair beyond the images."""
-        reach, found = (self.images + 0.5) * self.period, np.zeros((len(places), 3))
+        reach, wind = (self.images + 0.5) * self.period, np.zeros((len(places), 3))
         for side in (1, -1):
             left, up = places[:, 1] - side * self.separation / 2, places[:, 2]
             far = np.sqrt(reach**2 + left**2 + up**2)
             # omega of an endless line, less that of its part within reach
             omega = side / (2 * np.pi * far * (far + reach))
-            found[:, 1] -= omega * up
-            found[:, 2] += omega * left
-        return found
+            wind[:, 1] -= omega * up
+            wind[:, 2] += omega * left
+        return wind
 
     @cached_property
     def drift(self) -> np.ndarray:

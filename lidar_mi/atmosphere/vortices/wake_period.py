@@ -104,12 +104,12 @@ def one_period(
     closed, changed = (_mirrored if ends == "mirror" else _blended)(flow, planes)
     # differences reach one plane beyond those that were changed
     count = closed.sizes["x"]
-    beside = sorted({(k + j) % count for k in changed for j in (-1, 0, 1)})
+    near = sorted({(k + j) % count for k in changed for j in (-1, 0, 1)})
     return closed, Closing(
         ends,
         count * step,
         changed,
-        _divergence(closed, np.array(beside), step),
+        _divergence(closed, np.array(near), step),
         _divergence(flow, np.arange(1, flow.sizes["x"] - 1), step),
     )
 
@@ -130,9 +130,9 @@ def _seam(values: np.ndarray, floor: float) -> str:
         rms = np.sqrt((size**2).mean((0, 2, 3)))
         inside, seam = rms[:-order].max(), rms[-order:].max()
         if seam > _SEAM * inside + floor:
-            what = "step" if order == 1 else "curvature"
+            measure = "step" if order == 1 else "curvature"
             return (
-                f"the {what} from its last plane to its first is {seam / inside:.2g} times the "
+                f"the {measure} from its last plane to its first is {seam / inside:.2g} times the "
                 "largest within"
             )
     return ""
@@ -145,12 +145,12 @@ def _mirrored(flow: xr.Dataset, planes: int) -> tuple[xr.Dataset, tuple[int, ...
     weight = 0.5 * (1 - np.cos(np.pi * np.minimum(away / planes, 1.0)))
     # a mirror across x turns u around
     signs = np.where(np.arange(len(order)) < count, 1.0, -1.0)
-    found = _at_places(flow.isel(x=order), flow)
+    closed = _at_places(flow.isel(x=order), flow)
     if "u" in flow:
         factor = xr.DataArray(weight[order] * signs, dims="x")
-        found = found.assign(u=(found["u"] * factor).transpose(*flow["u"].dims))
+        closed = closed.assign(u=(closed["u"] * factor).transpose(*flow["u"].dims))
     changed = tuple(k for k, plane in enumerate(order) if weight[plane] < 1)
-    return found, changed
+    return closed, changed
 
 
 def _blended(flow: xr.Dataset, planes: int) -> tuple[xr.Dataset, tuple[int, ...]]:
@@ -162,8 +162,8 @@ def _blended(flow: xr.Dataset, planes: int) -> tuple[xr.Dataset, tuple[int, ...]
         name: (weights * field + (1 - weights) * last[name].drop_vars("x")).transpose(*field.dims)
         for name, field in first.drop_vars("x").data_vars.items()
     }
-    rest = flow.isel(x=slice(planes, count - planes)).drop_vars("x")
-    return _at_places(xr.concat([xr.Dataset(mixed), rest], "x"), flow), tuple(range(planes))
+    middle = flow.isel(x=slice(planes, count - planes)).drop_vars("x")
+    return _at_places(xr.concat([xr.Dataset(mixed), middle], "x"), flow), tuple(range(planes))
 
 
 def _at_places(planes: xr.Dataset, flow: xr.Dataset) -> xr.Dataset:

@@ -82,9 +82,9 @@ class ImageStore:
     def store_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
         """Write a rendered image; returns it as it is read."""
         self.write(part, value)
-        found = self.stored(part)
-        assert found is not None
-        return found
+        stored = self.stored(part)
+        assert stored is not None
+        return stored
 
     def write(self, part: str, value: xr.Dataset) -> None:
         """Write an image with its signature."""

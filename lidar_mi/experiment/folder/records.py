@@ -105,7 +105,7 @@ def read_study(
     started = {key: (folder / key / RECORD).is_file() for key in variants}
     records = {key: read_record(folder / key) if started[key] else None for key in variants}
     metrics = {key: read_metrics(folder / key) for key in variants}
-    return name, records, {key: one for key, one in metrics.items() if one is not None}
+    return name, records, {key: numbers for key, numbers in metrics.items() if numbers is not None}
 
 
 def answers(folder: str | Path) -> list[tuple[str, list[str]]]:
@@ -124,8 +124,8 @@ def failure(folder: str | Path) -> str | None:
 
 def file_checksum(path: Path) -> str:
     """SHA-256 of a file as it is now."""
-    found = path.stat()
-    return _checksum_of(path, found.st_size, found.st_mtime_ns)
+    status = path.stat()
+    return _checksum_of(path, status.st_size, status.st_mtime_ns)
 
 
 @functools.lru_cache(64)

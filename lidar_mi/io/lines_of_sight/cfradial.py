@@ -60,7 +60,7 @@ def write_cfradial(lines: xr.Dataset, path: str | Path) -> None:
     lines, number = lines.isel(time=order), number[order]
     _, first, counts = np.unique(number, return_index=True, return_counts=True)
     sweeps = [slice(start, start + count) for start, count in zip(first, counts, strict=True)]
-    modes, fixed = zip(*(_mode(lines.isel(time=one)) for one in sweeps), strict=True)
+    modes, fixed = zip(*(_mode(lines.isel(time=sweep)) for sweep in sweeps), strict=True)
     fields = {
         name: values.transpose("time", "range").reset_coords(drop=True)
         for name, values in lines.data_vars.items()

@@ -80,36 +80,36 @@ def flags(
         velocity in all directions.
     """
     kind = str(scan.about.get("kind", ""))
-    given = blind_range is not None
+    explicit = blind_range is not None
     limit = _limit(scan, min_cnr)
     blind = BLIND_RANGE.get(kind, BLIND_RANGE[""]) if blind_range is None else blind_range
     velocity, snr = scan.fields["radial_velocity"], scan.fields.get("snr")
-    found = np.zeros(velocity.shape, np.uint16)
-    found[~np.isfinite(velocity)] |= LineFlag.MISSING.value
+    flag = np.zeros(velocity.shape, np.uint16)
+    flag[~np.isfinite(velocity)] |= LineFlag.MISSING.value
     overlap = 1.0
     if snr is not None:
         # as the total power would be none: never written
-        found[snr <= -1.0] |= LineFlag.MISSING.value
+        flag[snr <= -1.0] |= LineFlag.MISSING.value
         overlap = overlapping(scan, snr, limit)[0]
-        found[np.isfinite(velocity) & ~(snr >= 10 ** (limit / 10))] |= LineFlag.LOW_CNR.value
-        _nyquist_of_noise(scan, velocity[found == LineFlag.LOW_CNR.value])
+        flag[np.isfinite(velocity) & ~(snr >= 10 ** (limit / 10))] |= LineFlag.LOW_CNR.value
+        _nyquist_of_noise(scan, velocity[flag == LineFlag.LOW_CNR.value])
     near = np.broadcast_to(scan.range < blind, velocity.shape).copy()
-    if not given:
+    if not explicit:
         near |= reflection(scan, overlap)
-    found[near] |= LineFlag.BLIND_RANGE.value
+    flag[near] |= LineFlag.BLIND_RANGE.value
     if snr is not None:
-        found[hard_targets(scan, snr, found != 0, overlap)] |= LineFlag.HARD_TARGET.value
-    same = repeated(np.where(found == 0, velocity, np.nan))
+        flag[hard_targets(scan, snr, flag != 0, overlap)] |= LineFlag.HARD_TARGET.value
+    same = repeated(np.where(flag == 0, velocity, np.nan))
     if same.any():
         number = velocity[same][0]
-        found[same] |= LineFlag.REPEATED.value
+        flag[same] |= LineFlag.REPEATED.value
         scan.remarks.append(
             f"{int(same.sum())} cells in {int(same.any(1).sum())} lines repeat one number "
             f"({number:g} m/s): flagged"
         )
     if scan.rejected is not None:
-        found[scan.rejected] |= LineFlag.REJECTED.value
-    return found, {"min_cnr": limit, "blind_range": blind}
+        flag[scan.rejected] |= LineFlag.REJECTED.value
+    return flag, {"min_cnr": limit, "blind_range": blind}
 
 
 def _nyquist_of_noise(scan: Scan, noise: np.ndarray) -> None:
@@ -133,7 +133,7 @@ def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
     count, error = overlapping(scan, snr, _limit(scan, min_cnr))
     if count == 1.0:
         return
-    said = (
+    finding = (
         f"noise of neighbouring gates correlates by {1 - 1 / count:.2f}, as of gates that overlap "
         f"{count:.0f}-fold, but range has steps of {step:g} m for gates of {length:g} m"
     )
@@ -142,10 +142,11 @@ def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
         scan.range = scan.range[:1] + step / count * np.arange(scan.range.size)
         # adjacent gates are as long as their steps
         scan.about.setdefault("gate_length", length)
-        scan.remarks.append(f"{said}: steps of {step / count:.3g} m are used (range_step)")
+        scan.remarks.append(f"{finding}: steps of {step / count:.3g} m are used (range_step)")
     else:
         scan.remarks.append(
-            f"{said}: ranges may be {count:.0f} times too long (range_step: '{step / count:.3g} m')"
+            f"{finding}: ranges may be {count:.0f} times too long "
+            f"(range_step: '{step / count:.3g} m')"
         )
 
 
@@ -189,24 +190,24 @@ def repeated(velocity: np.ndarray) -> np.ndarray:
     there `EXCESS` times as often as any of its neighbours. Of a smooth distribution with at most
     `LEAST_REPEATED` / `EXCESS` cells at each velocity, the second happens by chance once in 1e8.
     """
-    known = np.isfinite(velocity)
-    many = known.sum(1) >= _LEAST_GATES
+    finite = np.isfinite(velocity)
+    many = finite.sum(1) >= _LEAST_GATES
     low, high = (
-        np.where(many, f(np.where(known, velocity, one), axis=1), one)
-        for f, one in ((np.min, np.inf), (np.max, -np.inf))
+        np.where(many, f(np.where(finite, velocity, limit), axis=1), limit)
+        for f, limit in ((np.min, np.inf), (np.max, -np.inf))
     )
     constant = many & (low == high)
-    found = np.zeros(velocity.shape, bool)
+    cells = np.zeros(velocity.shape, bool)
     if many.any() and (not constant[many].all() or np.unique(low[constant]).size == 1):
-        found |= constant[:, None] & known
-    values, counts = np.unique(np.round(velocity[known], 6), return_counts=True)
+        cells |= constant[:, None] & finite
+    values, counts = np.unique(np.round(velocity[finite], 6), return_counts=True)
     if values.size > 10:
         top = int(counts.argmax())
         near = counts[max(top - 10, 0) : top + 11].copy()
         near[min(top, 10)] = 0
         if counts[top] >= max(LEAST_REPEATED, EXCESS * near.max()):
-            found |= np.round(velocity, 6) == values[top]
-    return found
+            cells |= np.round(velocity, 6) == values[top]
+    return cells
 
 
 def _structure(values: np.ndarray, lag: int) -> np.ndarray:
@@ -251,10 +252,10 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
     before it and moves by less than `HARD_TARGET_SPEED`.
     """
     velocity = scan.fields["radial_velocity"]
-    found = np.zeros(snr.shape, bool)
+    blocked = np.zeros(snr.shape, bool)
     low = np.abs(scan.angles["elevation"]) <= HARD_TARGET_ELEVATION
     if not low.any() or snr.shape[1] <= 2 * _BEFORE:
-        return found
+        return blocked
     width = math.ceil(overlap)
     usable = np.where(bad, np.nan, snr)
     for line in np.flatnonzero(low):
@@ -262,8 +263,8 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
         still = np.abs(velocity[line]) < HARD_TARGET_SPEED
         (gates,) = np.nonzero(still & (usable[line] > bright))
         if gates.size:
-            found[line, max(gates[0] - width, 0) :] = True
-    return found
+            blocked[line, max(gates[0] - width, 0) :] = True
+    return blocked
 
 
 def _median_before(snr: np.ndarray, width: int) -> np.ndarray:
