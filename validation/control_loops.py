@@ -10,6 +10,7 @@ import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.encounter.control_block.block import control_block
+from lidar_mi.encounter.control_block.losses import loss_chain
 from lidar_mi.encounter.control_block.sensor_samples import SensorSamples, samples_of
 from lidar_mi.encounter.slab_recorder import SlabRecorder
 from lidar_mi.experiment.truth.wake_along_path import encounter_of
@@ -95,20 +96,28 @@ def _with_losses(
     return found
 
 
-def _ratios(flights: list[SensorSamples], hold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Variances in flight over predicted ones with the lidar, and without it, of `SIGNALS`."""
+def _ratios(
+    flights: list[SensorSamples], with_losses: list[SensorSamples], hold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variances in flight over predicted ones with the lidar, and without it, of `SIGNALS`.
+
+    Filters and gusts are identified from every flight once, the chain of losses from all draws.
+    """
     loop = runpy.run_path(str(LOOP))
     block = {name: values.values for name, values in control_block(flights).variables.items()}
+    lost = [~np.isfinite(one.estimate[:, 1:]).all(axis=1) for one in with_losses]
+    block["loss_transition"] = loss_chain(lost).transition
     found = []
     for forward in (1.0, 0.0):
-        flown = loop["rms_in_flights"](block, flights, forward, hold)
+        flown = loop["rms_in_flights"](block, with_losses, forward, hold)
         found.append((flown / loop["rms"](block, forward, hold)) ** 2)
     return found[0], found[1]
 
 
 def of_rendered_flights(effort: Effort) -> Check:
     """Every air, with every fraction of losses and both replacements of a lost estimate."""
-    lines, every = [], {}
+    lines: list[tuple[str, ...]] = []
+    every: dict[tuple[float, float], list[np.ndarray]] = {}
     for air, keys in AIRS.items():
         flights = [_flown(_experiment(keys, seed + 1)) for seed in range(FLIGHTS * effort.scale)]
         known = np.mean([np.isfinite(one.estimate[:, 1:]).all(1).mean() for one in flights])
@@ -116,8 +125,8 @@ def of_rendered_flights(effort: Effort) -> Check:
             for hold in (0.0, 1.0):
                 random = np.random.default_rng([round(100 * lost), len(air)])
                 some = _with_losses(flights, lost, random)
-                lidar, without = _ratios(some, hold)
-                every.setdefault((lost, hold), []).append((lidar, without))
+                lidar, without = _ratios(flights, some, hold)
+                every.setdefault((lost, hold), []).append(lidar)
                 lines.append(
                     (
                         air,
@@ -129,7 +138,7 @@ def of_rendered_flights(effort: Effort) -> Check:
                 )
     rows = []
     for (lost, hold), found in every.items():
-        of_airs = np.array([lidar for lidar, _ in found])
+        of_airs = np.array(found)
         mean, spread = of_airs.mean(0), of_airs.std(0, ddof=1) / len(of_airs) ** 0.5
         way = "last value held" if hold else "announces nothing"
         rows += [
@@ -143,9 +152,15 @@ def of_rendered_flights(effort: Effort) -> Check:
             )
             for k, signal in enumerate(SIGNALS)
         ]
-    heads = ("air", "lost by itself", "lost in addition", "in place of a lost estimate")
-    heads += tuple(f"{signal}, with the lidar" for signal in SIGNALS)
-    heads += ("roll, without", "load, without")
+    heads = (
+        "air",
+        "lost by itself",
+        "lost in addition",
+        "in place of a lost estimate",
+        *(f"{signal}, with the lidar" for signal in SIGNALS),
+        "roll, without",
+        "load, without",
+    )
     return Check(
         "Variance in flight over the predicted one",
         f"{FLIGHTS * effort.scale} flights of 11 s in each air. Images of 60 x 40 m, texture of "
