@@ -381,7 +381,7 @@ def test_lost_estimates_are_counted(tmp_path, samples):
 
 
 def test_gusts_of_many_short_flights(samples):
-    """Cut into flights of 9 s, whose winds do not follow each other: the same model of the gusts."""
+    """Cut into flights of 9 s, whose winds do not follow each other: the same model of gusts."""
     short = [
         replace(
             one,

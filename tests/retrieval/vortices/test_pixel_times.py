@@ -50,7 +50,10 @@ def test_derivatives_of_the_misfit_by_differences():
 
 
 def biases(patterns, seeds):
-    """Mean over seeds of what the fit errs by without noise, in standard errors with it."""
+    """Mean over seeds of what the fit errs by without noise, in standard errors with it.
+
+    Accepted or not: in images without noise the splines' errors may pass for a further vortex.
+    """
     truth, found = vector(*uneven(), mean=MEAN), {}
     for seed in seeds:
         noisy, times = moving_vortices("raster", uneven(), MEAN, seed=seed, noise=NOISE)
@@ -59,7 +62,6 @@ def biases(patterns, seeds):
             images, times = moving_vortices(pattern, uneven(), MEAN, seed=seed)
             for given in (times, None):
                 fit = fit_vortices(*images, DT, NOISE, times=given)
-                assert fit.success, fit.reasons
                 error = (fit.parameters - truth) / stderr
                 found.setdefault((pattern, given is not None), []).append(error)
     return {case: np.mean(errors, 0) for case, errors in found.items()}
