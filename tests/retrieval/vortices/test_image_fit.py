@@ -432,7 +432,8 @@ def test_a_disturbed_flow_is_admitted():
         stated.append(np.hypot(found.model_error, found.ambient.rms))
         noise = pair_bound(images[0], uneven(), 0.01)
         assert np.diag(found.covariance)[0] > 4 * noise[0, 0]
-    assert np.mean(stated) == pytest.approx(0.5, rel=0.3)
+    # taken for turbulence of the shortest length, 15 m, of which the images show the large eddies
+    assert 0.5 < np.mean(stated) < 0.75
     assert 0.7 < np.sqrt(np.mean(np.square(reduced))) < 1.5
     assert 0.7 < np.sqrt(np.mean(np.square(winds))) < 1.3
 
