@@ -272,11 +272,11 @@ def _is_hollow(
     """Whether a piece is a cavity: within a larger one, and wound the other way round."""
     volume, (low, high) = volumes[index], boxes[index]
     return any(
-        other * volume < 0
-        and abs(other) > abs(volume)
+        other_volume * volume < 0
+        and abs(other_volume) > abs(volume)
         and (first <= low).all()
         and (high <= last).all()
-        for other, (first, last) in zip(volumes, boxes, strict=True)
+        for other_volume, (first, last) in zip(volumes, boxes, strict=True)
     )
 
 
@@ -381,11 +381,11 @@ def _volume(corners: np.ndarray, faces: np.ndarray) -> float:
 
 def _corners(mesh: Shape) -> np.ndarray:
     """Corners (P, 3), which are a tensor from Mitsuba 3.10 on and a flat buffer before."""
-    found = mesh.positions() if hasattr(mi.Mesh, "positions") else mesh.vertex_positions_buffer()
-    return np.array(found, float).reshape(-1, 3)
+    corners = mesh.positions() if hasattr(mi.Mesh, "positions") else mesh.vertex_positions_buffer()
+    return np.array(corners, float).reshape(-1, 3)
 
 
 def _faces(mesh: Shape) -> np.ndarray:
     """Numbers of the corners of every face (F, 3)."""
-    found = mesh.faces() if hasattr(mi.Mesh, "positions") else mesh.faces_buffer()
-    return np.array(found).reshape(-1, 3)
+    faces = mesh.faces() if hasattr(mi.Mesh, "positions") else mesh.faces_buffer()
+    return np.array(faces).reshape(-1, 3)

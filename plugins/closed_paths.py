@@ -55,8 +55,8 @@ class OpenPath:
         """Length of a flight that consumes ``used`` of the excess length."""
         return used * (0.5 * used + self.distance) / (used + self.distance * one_plus_cosine)
 
-    def left(self, direction: Vector, gap: Float, whole: Float) -> Float:
-        """Excess length that a flight leaves which ends ``gap`` before it would close the path.
+    def remaining(self, direction: Vector, gap: Float, whole: Float) -> Float:
+        """Excess length after a flight that ends ``gap`` before it would close the path.
 
         ``whole`` is the length of the flight that closes it.
         """

@@ -171,8 +171,8 @@ def define() -> type:
                 delay = change / (2 * step) * self.wavelength / (2 * np.pi * SPEED_OF_LIGHT)
             self.order = 2 * self.index * self.gap / self.wavelength
             if tuned:
-                rest = self.order + shift - self.order_fraction
-                self.order += round(rest) - rest
+                difference = self.order + shift - self.order_fraction
+                self.order += round(difference) - difference
                 self.gap = self.order * self.wavelength / (2 * self.index)
             self.order_on_axis = self.order + shift
             if not tuned:

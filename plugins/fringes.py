@@ -296,9 +296,9 @@ def _surfaces(scene: Scene, ray: Ray, rng: Generator, context: Context, active: 
         else:
             weight = matrix * si.to_world_mueller(weight, si.wi, si.wi)
         matrix = dr.select(active, weight, matrix)
-        rest = ray.maxt - si.t
+        remaining = ray.maxt - si.t
         ray = si.spawn_ray(ray.d)
-        ray.maxt = rest
+        ray.maxt = remaining
     return matrix
 
 

@@ -297,8 +297,8 @@ def define() -> type:
                         for value, place in zip(results, cells, strict=False):
                             dr.scatter(image, value, place)
                         dr.eval(image)
-                        lit, fraction = results[0].numpy() > 0, results[-1].numpy()
-                        counts += lit.sum(), (lit & (fraction >= HALF)).sum(), 0
+                        bright, fraction = results[0].numpy() > 0, results[-1].numpy()
+                        counts += bright.sum(), (bright & (fraction >= HALF)).sum(), 0
                         total = None
                     counts[2] += rejected[0]
                     # kernels run asynchronously: what is reported or stored must have been computed
@@ -371,8 +371,8 @@ def define() -> type:
             dr.enqueue(dr.ADMode.Forward, wanted)
             dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
             for lidar, sample, cell, low, high, part in self._replayed(scene, sensor, seed, spp):
-                found = gradients(lidar, sample, low, high, orders, phases)
-                for value, place in zip(found, cell, strict=True):
+                gradient = gradients(lidar, sample, low, high, orders, phases)
+                for value, place in zip(gradient, cell, strict=True):
                     add(image, value * part, place)
                 dr.eval(image)
             return mi.TensorXf(image, shape)
@@ -546,7 +546,7 @@ def define() -> type:
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
             if by_order:
-                means += [one / _opaque(rounds) for one in by_order.totals(parts)]
+                means += [total / _opaque(rounds) for total in by_order.totals(parts)]
             if self.common:
                 # without the sample's number of the pass: of every beam the same passes are traced
                 odd = (
@@ -595,8 +595,8 @@ def define() -> type:
                 by_order,
             )
             dr.eval(sums, products, largest, by_order.sums if by_order else None)
-            sums = [dr.block_sum(one, parts) for one in sums]
-            products = {pair: dr.block_sum(one, parts) for pair, one in products.items()}
+            sums = [dr.block_sum(total, parts) for total in sums]
+            products = {pair: dr.block_sum(total, parts) for pair, total in products.items()}
             largest = dr.block_reduce(dr.ReduceOp.Max, largest, parts)
             number = _opaque(rounds)
             means = [s / number for s in sums]
@@ -606,7 +606,7 @@ def define() -> type:
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
             if by_order:
-                means += [one / number for one in by_order.totals(parts)]
+                means += [total / number for total in by_order.totals(parts)]
             return (rounds, means, deviations, largest), lidar.rejected
 
         def _products(self) -> tuple[tuple[int, int], ...]:

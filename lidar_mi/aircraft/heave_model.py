@@ -91,10 +91,8 @@ class HeaveModel:
         """Aileron, elevator, symmetric aileron, rad."""
         return np.array([self.deflection[0], self.deflection[1], self.symmetric])
 
-    def _array(self, one: AircraftState) -> np.ndarray:
-        return np.array(
-            [one.z, one.vertical_speed, one.pitch, one.pitch_rate, one.roll, one.roll_rate]
-        )
+    def _array(self, s: AircraftState) -> np.ndarray:
+        return np.array([s.z, s.vertical_speed, s.pitch, s.pitch_rate, s.roll, s.roll_rate])
 
     def _equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Per state, and per force, pitching and rolling moment, aileron, elevator, symmetric."""
@@ -124,12 +122,12 @@ class HeaveModel:
     ) -> AircraftState:
         motion, per_input = self._equations()
         rates = motion @ now + per_input @ inputs
-        rise, turn = rates[1], rates[5]
+        rise, roll_acceleration = rates[1], rates[5]
         both = self.heave.bent(now[_HEAVE], inputs[4:], rise)
         difference = (
             self._wing_damping * now[5]
             + self.control_moments[0, 0] * inputs[3]
-            - self._roll_relief * turn
+            - self._roll_relief * roll_acceleration
         )
         port, starboard = loads.bending + np.array([both + difference, both - difference]) / 2
         z, climb, pitch, pitch_rate, roll, roll_rate = map(float, now)

@@ -153,11 +153,11 @@ class JSBSimAircraft:
 
     def _read(self, time: float, by_wind: np.ndarray) -> AircraftState:
         """State in the path frame, with the wind's bending moments."""
-        found = state_in_path(self._fdm, self._origin, self._climb, time)
-        if found is None:
+        state = state_in_path(self._fdm, self._origin, self._climb, time)
+        if state is None:
             return replace(self.state, time=time, departed=True)
         port, starboard = self._bent(by_wind)
-        return replace(found, port_bending=port, starboard_bending=starboard)
+        return replace(state, port_bending=port, starboard_bending=starboard)
 
     def _bent(self, by_wind: np.ndarray) -> tuple[float, float]:
         """Bending moments of port and starboard wing, changes from the trim, N m.

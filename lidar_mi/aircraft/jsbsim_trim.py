@@ -37,7 +37,7 @@ _NOTHING = 1e-6  # of a coefficient of lift or moment: rounding
 
 def such_as(name: str) -> str:
     """Words that name a large aircraft other than this one."""
-    return f"such as {next(one for one in _LARGE if one != name)}"
+    return f"such as {next(other for other in _LARGE if other != name)}"
 
 
 def check_aeroplane(name: str, path: Path) -> None:
@@ -96,14 +96,14 @@ def trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec
     RuntimeError
         From JSBSim, of an aircraft that it cannot load or start.
     """
-    found = _trimmed(name, path, flap_settings)
-    if found is None:
+    fdm = _trimmed(name, path, flap_settings)
+    if fdm is None:
         raise InputError(
             f"encounter.path.speed: {name} does not trim at {path.speed:g} m/s and "
             f"{math.degrees(path.climb_angle):.3g} deg at {path.altitude:g} m; "
             f"expected {_where_it_trims(name, path)}"
         )
-    return found
+    return fdm
 
 
 def _trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec | None":
@@ -142,9 +142,8 @@ def _where_it_trims(name: str, path: Path) -> str:
         for lift in (level, highest)
     )
     speeds = np.unique(np.geomspace(slow, fast, _TRIALS).round())
-    for speed in sorted(speeds, key=lambda one: abs(one - path.speed)):
-        other = path.model_copy(update={"speed": float(speed)})
-        if _trimmed(name, other, FLAPS[:1]) is not None:
+    for speed in sorted(speeds, key=lambda v: abs(v - path.speed)):
+        if _trimmed(name, path.model_copy(update={"speed": float(speed)}), FLAPS[:1]) is not None:
             return f"another speed, such as {speed:g} m/s"
     return (
         "another climb_angle or altitude, or another aircraft, "

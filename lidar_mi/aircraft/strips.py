@@ -169,7 +169,9 @@ def as_wing(surface: Strips) -> Strips:
 def joined(*surfaces: Strips) -> Strips:
     """Strips of several surfaces."""
     names = ("places", "normals", "areas", "slopes", "roll_slopes", "bends", "chords")
-    return Strips(*(np.concatenate([getattr(one, name) for one in surfaces]) for name in names))
+    return Strips(
+        *(np.concatenate([getattr(surface, name) for surface in surfaces]) for name in names)
+    )
 
 
 def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float) -> Loads:

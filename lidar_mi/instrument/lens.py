@@ -138,8 +138,8 @@ def trace(
         # the conic c (x^2 + y^2 + (1 + k) z^2) = 2 z on the line place + step direction
         square = curvature * (stretch * way * way).sum(0)
         slope = way[2] - curvature * (stretch * place * way).sum(0)
-        rest = curvature * (stretch * place * place).sum(0) - 2 * place[2]
-        place += rest / (slope + np.sqrt(slope**2 - square * rest)) * way
+        gap = curvature * (stretch * place * place).sum(0) - 2 * place[2]
+        place += gap / (slope + np.sqrt(slope**2 - square * gap)) * way
         normal = np.array([[0], [0], [1]]) - curvature * stretch * place
         normal /= np.linalg.norm(normal, axis=0)
         ratio = before / index

@@ -253,10 +253,10 @@ def untrusted_pixels(scan: xr.Dataset) -> str | None:
 
     None where there are at most 1 % of those that receive light; see ``S0_largest_share``.
     """
-    lit, untrusted = (scan.attrs.get(f"{name}_pixels", 0) for name in ("lit", "untrusted"))
-    if untrusted <= 0.01 * lit:
+    bright, untrusted = (scan.attrs.get(f"{name}_pixels", 0) for name in ("lit", "untrusted"))
+    if untrusted <= 0.01 * bright:
         return None
     return (
-        f"in {untrusted} of {lit} pixels that receive light one Monte Carlo sample carries half of "
-        "the variance or more; their standard errors are unreliable; expected more samples"
+        f"in {untrusted} of {bright} pixels that receive light one Monte Carlo sample carries half "
+        "of the variance or more; their standard errors are unreliable; expected more samples"
     )

@@ -164,19 +164,19 @@ def invert_extinction(
         gains.append(counts_per_signal * rendered.signal / layers.signal(profile, factor)[0])
         variances.append(counts_per_signal**2 * rendered.variance)
         gain, variance = np.mean(gains, 0), np.mean(variances, 0) / len(variances)
-        found = fit(number, gain, variance, layers, factor, known, profile)
-        steps = np.log(found.extinction / profile) ** 2 / np.diag(found.covariance)
-        profile, change = found.extinction, float(np.sqrt(steps.mean()))
+        solution = fit(number, gain, variance, layers, factor, known, profile)
+        steps = np.log(solution.extinction / profile) ** 2 / np.diag(solution.covariance)
+        profile, change = solution.extinction, float(np.sqrt(steps.mean()))
         if progress:
             progress(round_, change)
-        noisy = found.monte_carlo_fraction > settings.monte_carlo_fraction
+        noisy = solution.monte_carlo_fraction > settings.monte_carlo_fraction
         if near and change < CONVERGED and not noisy:
             reason = f"no change above {CONVERGED:g} standard errors"
             break
         if not near or change > NEAR:
             near = near or change < NEAR
             gains, variances = [], []
-    return _dataset(found, rendered, plan, air, factor, round_, reason)
+    return _dataset(solution, rendered, plan, air, factor, round_, reason)
 
 
 def attenuation_factor(rendered: _Rendered, depth: np.ndarray) -> float:
@@ -325,7 +325,7 @@ def _checked(
 
 
 def _dataset(
-    found: Fit,
+    solution: Fit,
     rendered: _Rendered,
     plan: ScanPlan,
     air: LayeredAir,
@@ -335,9 +335,9 @@ def _dataset(
 ) -> xr.Dataset:
     ratio = (rendered.signal / rendered.single).reshape(-1, len(plan.z), len(plan.y))
     layers = len(air.x)
-    mean = found.extinction.reshape(layers, -1).mean(1)
-    slopes = np.kron(np.eye(layers), np.ones(_NODES) / _NODES) * found.extinction / mean[:, None]
-    covariance = slopes @ found.covariance @ slopes.T
+    mean = solution.extinction.reshape(layers, -1).mean(1)
+    slopes = np.kron(np.eye(layers), np.ones(_NODES) / _NODES) * solution.extinction / mean[:, None]
+    covariance = slopes @ solution.covariance @ slopes.T
     stderr = mean * np.sqrt(np.diag(covariance))
     unit = {"units": "m-1"}
     return xr.Dataset(
@@ -355,8 +355,8 @@ def _dataset(
         attrs={
             "rounds": rounds,
             "reason": reason,
-            "walk_step": found.walk_step,
+            "walk_step": solution.walk_step,
             "attenuation_factor": factor,
-            "monte_carlo_fraction": found.monte_carlo_fraction,
+            "monte_carlo_fraction": solution.monte_carlo_fraction,
         },
     )

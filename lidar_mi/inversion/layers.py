@@ -51,10 +51,10 @@ class Layers:
         The extinction (m^-1) is above 0; the factor q is that of attenuation.
         """
         weights = self._weights * np.exp(-2 * factor * (self._depths @ extinction))
-        here = self._values @ extinction
-        signal = (weights * here).sum(1)
+        local = self._values @ extinction
+        signal = (weights * local).sum(1)
         slope = np.einsum("gpb,gpbn->gbn", weights, self._values)
-        slope -= 2 * factor * np.einsum("gpb,gpbn->gbn", weights * here, self._depths)
+        slope -= 2 * factor * np.einsum("gpb,gpbn->gbn", weights * local, self._depths)
         return signal, slope * extinction
 
     def depth(self, extinction: np.ndarray) -> np.ndarray:

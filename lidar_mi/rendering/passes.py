@@ -46,4 +46,4 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
 
 def _is_full(error: BaseException) -> bool:
     """Whether Dr.Jit got no memory: it has no type for it."""
-    return any("out of memory" in str(one).lower() for one in causes(error))
+    return any("out of memory" in str(cause).lower() for cause in causes(error))

@@ -12,7 +12,7 @@ def most_likely(
     terms: np.ndarray,
     limits: np.ndarray,
     number: np.ndarray | float,
-    held: np.ndarray | float = 0.0,
+    fixed: np.ndarray | float = 0.0,
     floor: float = 1e-9,
 ) -> tuple[float, np.ndarray]:
     """Factors a, from 0 to their limits, of variances `held` + sum a_k terms_k of mean squares.
@@ -47,7 +47,7 @@ def most_likely(
     # terms of one size, as the solver wants them
     sizes = np.maximum(terms.mean(1), np.finfo(float).tiny)
     scaled, most = terms / sizes[:, None], limits * (sizes / mean)
-    observed, known = np.maximum(squares / mean, floor), held / mean
+    observed, known = np.maximum(squares / mean, floor), fixed / mean
 
     def variances(factors: np.ndarray) -> np.ndarray:
         return np.maximum(factors @ scaled + known, floor)
@@ -64,7 +64,7 @@ def most_likely(
         step = lsq_linear((scaled * weight).T, wanted, (0.0, most), method="bvls").x - factors
         # a whole step can go too far, to variances of nearly nothing
         tried = [factors + 0.5**n * step for n in range(_HALVINGS)]
-        after = [misfit(one) for one in tried]
+        after = [misfit(trial) for trial in tried]
         best = int(np.argmin(after))
         if after[best] >= reached - _CONVERGED:
             break

@@ -65,9 +65,9 @@ def in_turn(
         yield from map(function, parts)
         return
     # modes are of a thread
-    alike = torch.inference_mode(torch.is_inference_mode_enabled())(function)
+    in_mode = torch.inference_mode(torch.is_inference_mode_enabled())(function)
     try:
         with ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            yield from pool.map(alike, parts)
+            yield from pool.map(in_mode, parts)
     finally:
         torch.set_num_threads(before)

@@ -78,7 +78,7 @@ def measured_lines(
     lost = stderr > random_velocity(bandwidth)
     stderr = np.where(lost, random_velocity(bandwidth), stderr)
     # normal numbers made uniform
-    found = np.where(lost, bandwidth * (scipy.special.ndtr(noise) - 0.5), true + stderr * noise)
+    measured = np.where(lost, bandwidth * (scipy.special.ndtr(noise) - 0.5), true + stderr * noise)
 
     def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
         return both, values, {"units": units, "long_name": long_name}
@@ -87,7 +87,7 @@ def measured_lines(
     degree = {"units": "degree"}
     return xr.Dataset(
         {
-            "radial_velocity": field(found, "radial velocity, positive away"),
+            "radial_velocity": field(measured, "radial velocity, positive away"),
             "radial_velocity_stderr": field(stderr, "standard error of the radial velocity"),
             "radial_velocity_true": field(true, "radial velocity without noise"),
             "spectral_width": field(width, "width of the Doppler spectrum"),

@@ -33,8 +33,8 @@ _MEMORY = 80
 _BANDS = 10
 # Least rms of turbulence, m/s.
 _LEAST = 1e-3
-# Part of an error that is not correlated with its neighbours'.
-_OWN = 0.03
+# Fraction of an error's variance that is not correlated with the neighbours'.
+_WHITE = 0.03
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def noise_correlation(square: np.ndarray, twice: Mean) -> np.ndarray:
 def error_correlation(places: np.ndarray, twice: Mean) -> np.ndarray:
     """Correlation of the errors of vectors at places (n, 2), in m: (n, n)."""
     smooth = noise_correlation(((places[:, None] - places) ** 2).sum(-1), twice)
-    return (1 - _OWN) * smooth + _OWN * np.eye(len(places))
+    return (1 - _WHITE) * smooth + _WHITE * np.eye(len(places))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,21 +155,21 @@ class StatisticsEstimator:
         error = np.mean(vectors.stderr[:, valid] ** 2, 1)
         common = vectors.common**2 * valid.size
         # what is finer than this does not count: a mean is a Gaussian only nearly
-        own = _OWN * error[:, None, None]
+        white = _WHITE * error[:, None, None]
         self._last = x, waves
         for sums in self._sums.values():
             sums *= 1 - 1 / _MEMORY
         follows = last is not None and abs(x - last[0] - self.stride) < 0.3 * self.stride
         if last is not None and follows and last[1].shape == waves.shape:
-            products = (waves**2 + own, waves * last[1], last[1] ** 2 + own)
+            products = (waves**2 + white, waves * last[1], last[1] ** 2 + white)
         else:
             # the first one: by itself
-            products = (waves**2 + own, np.zeros_like(waves), np.zeros_like(waves))
+            products = (waves**2 + white, np.zeros_like(waves), np.zeros_like(waves))
             follows = False
         sums = self._sums.setdefault(valid.shape, np.zeros((2, 6, len(ACROSS), band.max() + 1)))
         part = sums[int(follows)]
-        for n, one in enumerate(products):
-            part[n] += [np.bincount(band, a.ravel()) for a in one]
+        for n, square in enumerate(products):
+            part[n] += [np.bincount(band, a.ravel()) for a in square]
         part[3] += np.bincount(band)
         part[4] += error[:, None] * np.bincount(band)
         # pointing moves the mean of all vectors
@@ -219,7 +219,7 @@ def _likelihood(
     now, product, before, count, error, common = sums
     number = np.maximum(count, 1e-9)
     noise = RATIOS[:, None, None] ** 2 * expected.errors[:, None, None, :] * (error / number)
-    known = (common + _OWN * error) / number / sigma[..., None, None] ** 2
+    known = (common + _WHITE * error) / number / sigma[..., None, None] ** 2
     variance = expected.turbulence[:, :, None] + noise + known
     if not follows:
         return (count * np.log(variance)).sum((-2, -1)), (now / variance).sum((-2, -1))

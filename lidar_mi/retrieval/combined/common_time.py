@@ -85,13 +85,13 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
     for part, mean, (of_v, of_w) in zip((v, w), drift, ((1, 0), (0, 1)), strict=True):
         # derivatives of the drift by the vorticity, and by v and w of every vector
         by_vorticity = 2 * vorticity * (part - mean) / total
-        own = vorticity**2 / total
-        by_v, by_w = own * of_v - by_z.T @ by_vorticity, own * of_w + by_vorticity @ by_y
+        direct = vorticity**2 / total
+        by_v, by_w = direct * of_v - by_z.T @ by_vorticity, direct * of_w + by_vorticity @ by_y
         by_noise = _of_vectors(errors, by_v, by_w)
         bias = float((noise * (part - mean)).sum()) / total
         variances.append(max(by_noise, _between_signs(vorticity, part)) + bias**2)
-    found = [float(np.sqrt(part)) for part in variances]
-    return Drift((drift[0], drift[1]), (found[0], found[1]))
+    stderr = [float(np.sqrt(part)) for part in variances]
+    return Drift((drift[0], drift[1]), (stderr[0], stderr[1]))
 
 
 def _between_signs(vorticity: np.ndarray, part: np.ndarray) -> float:
@@ -142,8 +142,8 @@ def _of_differences(slope: np.ndarray, overlap: np.ndarray) -> np.ndarray:
 def _of_vectors(errors: _Errors, by_v: np.ndarray, by_w: np.ndarray) -> float:
     """Variance of a sum of vectors with the factors by_v and by_w, dims (z, y)."""
     # two independent errors make those of v and w
-    own = np.sqrt(np.clip(1 - errors.together**2, 0, 1))
-    parts = (by_v * errors.v + by_w * errors.w * errors.together, by_w * errors.w * own)
+    independent = np.sqrt(np.clip(1 - errors.together**2, 0, 1))
+    parts = (by_v * errors.v + by_w * errors.w * errors.together, by_w * errors.w * independent)
     return float(sum((part * (errors.along_z @ part @ errors.along_y)).sum() for part in parts))
 
 
@@ -256,13 +256,13 @@ def _vectors(crossflow: xr.Dataset, time: float, drift: tuple[float, float]) -> 
     inside = ((source > -_ROUNDING) & (source < ends + _ROUNDING)).all(0)
     around = scipy.ndimage.map_coordinates(valid.astype(float), source, order=1, mode="nearest")
     known = inside & (around > 1 - _ROUNDING)
-    found = {}
+    fields = {}
     for name in (name for name in _FIELDS if name in flow):
         filled = nearest_filled(np.where(valid, flow[name].values.astype(float), np.nan))
         order = 3 if name in ("v", "w") else 1
         moved = scipy.ndimage.map_coordinates(filled, source, order=order, mode="nearest")
-        found[name] = flow[name].copy(data=np.where(known, moved, np.nan))
+        fields[name] = flow[name].copy(data=np.where(known, moved, np.nan))
     flag = flow["flag"]
-    found["flag"] = flag.copy(data=np.where(known, 0, np.maximum(flag.values, 1)))
-    found["time"] = flow["time"].copy(data=np.full(when.shape, float(time)))
-    return flow.assign(found)
+    fields["flag"] = flag.copy(data=np.where(known, 0, np.maximum(flag.values, 1)))
+    fields["time"] = flow["time"].copy(data=np.full(when.shape, float(time)))
+    return flow.assign(fields)

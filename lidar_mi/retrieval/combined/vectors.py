@@ -43,13 +43,13 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
     # variables: their coordinates take longer to attach than all checks
     variables = scan.variables
-    own = {"line"} & set(variables["platform_velocity"].dims)
+    each_line = {"line"} & set(variables["platform_velocity"].dims)
     for name, dims in (
         ("v_los", {"line"}),
         ("v_los_std", {"line"}),
         ("range", {"line"}),
         ("direction", {"line", "axis"}),
-        ("platform_velocity", {"axis"} | own),
+        ("platform_velocity", {"axis"} | each_line),
         ("origin", {"line", "axis"}),
     ):
         if name in variables and set(variables[name].dims) != dims:
@@ -285,7 +285,7 @@ def error_variables(
 ) -> dict[str, tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]]:
     """Standard errors and correlations of u, v, w from covariances (..., 3, 3), as variables."""
     stderr = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    found = {
+    variables = {
         f"{name}_stderr": (
             dims,
             stderr[..., index],
@@ -301,8 +301,8 @@ def error_variables(
         correlation[np.isnan(both)] = np.nan
         first, second = COMPONENTS[i], COMPONENTS[j]
         text = {"units": "1", "long_name": f"correlation of the errors of {first} and {second}"}
-        found[f"{first}{second}_correlation"] = (dims, correlation, text)
-    return found
+        variables[f"{first}{second}_correlation"] = (dims, correlation, text)
+    return variables
 
 
 def flag_attributes(flags: type[enum.IntFlag]) -> dict[str, str | np.ndarray]:

@@ -62,7 +62,7 @@ _FILTERS = {2: FilterSettings(), 3: VOLUME_FILTER}
 
 def bootstrap_covariance(
     images: Sequence[torch.Tensor],
-    found: Displacement,
+    displacement: Displacement,
     windows: Windows,
     retrieve: Callable[..., Displacement],
     centred: bool,
@@ -138,7 +138,7 @@ def bootstrap_covariance(
         return reduce(lambda part, axis: strided(part, every, axis), range(-windows.dims, 0), field)
 
     neighbour = max(1, round(windows.template / coarse.stride / 2))
-    flow, replaced = validated(some(working(found.d)), neighbour)
+    flow, replaced = validated(some(working(displacement.d)), neighbour)
     everywhere = torch.ones_like(replaced)
     textured = everywhere if textured is None else some(textured)
     wind = at_mid_time(flow, coarse, centred)
@@ -149,7 +149,7 @@ def bootstrap_covariance(
     # the Wiener filter smears rims, which would be taken for motion
     spline, sharper = likeliest(first, settings), band_limited([first], settings=settings)[0]
     came_from = origin(wind)
-    moved, sharp = (advected(one, came_from) for one in (spline, sharper))
+    moved, sharp = (advected(air, came_from) for air in (spline, sharper))
     # of air that came in nothing is known
     compared = second.isfinite() & moved.inside
     residual = torch.where(compared, second - moved.image, 0.0)
@@ -163,7 +163,7 @@ def bootstrap_covariance(
     again = retrieve(first, image, stride=coarse.stride)
     use = _unflagged(again) & ~median_outliers(again.d, 3, neighbour) & textured
     if not bool(use.any()):
-        return torch.full_like(torch.stack([found.d] * windows.dims), torch.nan)
+        return torch.full_like(torch.stack([displacement.d] * windows.dims), torch.nan)
 
     vectors, wrong = validated(again.d, neighbour)
     at = places(vectors, coarse, centred)
@@ -195,7 +195,7 @@ def bootstrap_covariance(
     width = _WIDTH * windows.template / coarse.stride
     noise_variance = coarse.of_templates(1 / weight)
     scaled = error / noise_variance.sqrt()
-    rows = [[averaged(one * other, use, width) for other in scaled] for one in scaled]
+    rows = [[averaged(a * b, use, width) for b in scaled] for a in scaled]
     covariance = finer.leverage * torch.stack([torch.stack(row) for row in rows]) * noise_variance
     number = _in_a_mean(windows) * averaged(use.to(error), everywhere, width)
     recovered = averaged(use.to(error), textured, _AROUND / _WIDTH * width)
@@ -217,10 +217,10 @@ def bootstrap_covariance(
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
 
 
-def _unflagged(found: Displacement) -> torch.Tensor:
+def _unflagged(displacement: Displacement) -> torch.Tensor:
     """Vectors that are valid, be it from what is finite in their windows."""
-    flag = found.flag & ~Flag.NON_FINITE_INPUT.value
-    return (flag == 0) & found.d.isfinite().all(0)
+    flag = displacement.flag & ~Flag.NON_FINITE_INPUT.value
+    return (flag == 0) & displacement.d.isfinite().all(0)
 
 
 def _between(valid: torch.Tensor, windows: Windows) -> torch.Tensor:

@@ -94,12 +94,12 @@ def first_pass(
     # sheared texture decorrelates in large windows: smaller ones compete with them
     score = _correlation(spline, grid, d, width)
     for size in smaller:
-        other, filled = _on(grid, *_of_images(images, size))
-        found = _correlation(spline, grid, other, width)
-        better = found > score + _BETTER
+        smaller_d, filled = _on(grid, *_of_images(images, size))
+        new_score = _correlation(spline, grid, smaller_d, width)
+        better = new_score > score + _BETTER
         d, replaced, score = (
             torch.where(better, new, old)
-            for new, old in ((other, d), (filled, replaced), (found, score))
+            for new, old in ((smaller_d, d), (filled, replaced), (new_score, score))
         )
     return d, replaced
 
@@ -130,9 +130,10 @@ def _correlation(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> t
         torch.stack([p - part / 2, p + part / 2]) for p, part in zip(grid.places(), d, strict=True)
     ]
     inside = spline.holds(*places).all(0)
-    one, two = spline._replace(coefficients=spline.coefficients[:2]).sample(*places)[0]
+    first, second = spline._replace(coefficients=spline.coefficients[:2]).sample(*places)[0]
     mean1, mean2, square1, square2, cross = (
-        averaged(field, inside, width) for field in (one, two, one**2, two**2, one * two)
+        averaged(field, inside, width)
+        for field in (first, second, first**2, second**2, first * second)
     )
     contrast = (square1 - mean1**2) * (square2 - mean2**2)
     # without texture rounding may leave a negative variance
@@ -161,12 +162,12 @@ def whole_pixels(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -
     correlation is flagged, and where more than half of a template of image 1 or of a search region
     of image 2 is not finite.
     """
-    one, two = (working(torch.isfinite(image)) for image in (image1, image2))
+    known1, known2 = (working(torch.isfinite(image)) for image in (image1, image2))
     sizes = windows.template, windows.search, windows.stride
-    found = cross_correlation(filled_in(image1), filled_in(image2), *sizes)
-    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
-    usable &= (windows.of_templates(one) >= 0.5) & (windows.of_regions(two) >= 0.5)
-    return torch.where(usable, found.d, torch.nan)
+    displacement = cross_correlation(filled_in(image1), filled_in(image2), *sizes)
+    usable = (displacement.flag == 0) | (displacement.flag == Flag.NO_SUBPIXEL_FIT.value)
+    usable &= (windows.of_templates(known1) >= 0.5) & (windows.of_regions(known2) >= 0.5)
+    return torch.where(usable, displacement.d, torch.nan)
 
 
 def _of_volumes(

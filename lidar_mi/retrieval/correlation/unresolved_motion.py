@@ -128,8 +128,8 @@ def unresolved(
     same = torch.eye(windows.dims).to(total)
     same = same.reshape(*same.shape, *[1] * windows.dims).expand_as(total)
     square = (residuals.given[use].square() - leverage * known) * weight
-    seen = [_seen(slopes, m, windows)[use] * weight for m in (resolved, same)]
-    terms = torch.stack([torch.ones_like(weight), *seen])
+    by_motion = [_variance_by_motion(slopes, m, windows)[use] * weight for m in (resolved, same)]
+    terms = torch.stack([torch.ones_like(weight), *by_motion])
     b, c = _significant(terms, square, visible) / visible
     return Unresolved(b * resolved + c * same, leverage)
 
@@ -182,21 +182,21 @@ def _visible(
     means = of_windows(slopes * difference * weight, windows, centred).movedim(0, -1)
     followed = torch.linalg.solve(matrix, means[..., None])[..., 0].movedim(-1, 0)
     followed = followed - of_windows(fine, windows, centred)
-    left = difference - (slopes * followed).sum(0)
-    part = difference[use], left[use]
+    remaining = difference - (slopes * followed).sum(0)
+    part = difference[use], remaining[use]
     weight = weight[use]
     linear = float((part[0] * part[1] * weight).sum() / _positive((part[0] ** 2 * weight).sum()))
     steep = slopes.square().sum(0)[use] * weight
     terms = torch.stack([torch.ones_like(steep), steep])
-    whole, seen = (_least_squares(terms, p.square() * weight, -np.inf)[1] for p in part)
-    if not 0 < seen <= whole:
+    whole, visible = (_least_squares(terms, p.square() * weight, -np.inf)[1] for p in part)
+    if not 0 < visible <= whole:
         return 1.0, 1.0
-    return linear, float(seen / whole)
+    return linear, float(visible / whole)
 
 
 def _products(field: torch.Tensor, valid: torch.Tensor, width: float) -> torch.Tensor:
     """Local means (axes, axes, ...) of the products of a field's components, where valid."""
-    rows = [[averaged(one * other, valid, width) for other in field] for one in field]
+    rows = [[averaged(a * b, valid, width) for b in field] for a in field]
     return torch.stack([torch.stack(row) for row in rows])
 
 
@@ -206,7 +206,9 @@ def _less(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
     return total * part.clamp(min=0.0)
 
 
-def _seen(slopes: torch.Tensor, covariance: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _variance_by_motion(
+    slopes: torch.Tensor, covariance: torch.Tensor, windows: Windows
+) -> torch.Tensor:
     """Variance of the images' difference by motion of some covariance at the vectors."""
     return torch.einsum("i...,j...,ij...->...", slopes, slopes, _between(covariance, windows))
 

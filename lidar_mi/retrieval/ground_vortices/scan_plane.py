@@ -101,15 +101,15 @@ def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan]
     scans, lost, few = [], int((~known).sum()), "0 lines and 0 gates"
     for number in np.unique(sweep):
         whole = np.flatnonzero(sweep == number)
-        one = lines.isel(time=whole)
+        swept = lines.isel(time=whole)
         # in the plane, where an azimuth that turns at the zenith is no turn
-        azimuth, elevation = (np.deg2rad(one[name].values) for name in ("azimuth", "elevation"))
+        azimuth, elevation = (np.deg2rad(swept[name].values) for name in ("azimuth", "elevation"))
         forward = np.cos(elevation) * np.cos(azimuth - common)
-        for part in _passes(np.arctan2(np.sin(elevation), forward), one["time"].values):
+        for part in _passes(np.arctan2(np.sin(elevation), forward), swept["time"].values):
             index = whole[part]
-            here = usable[index]
-            if here.any(1).sum() < _LEAST_LINES or here.any(0).sum() < _LEAST_GATES:
-                few = f"{here.any(1).sum()} lines and {here.any(0).sum()} gates"
+            valid = usable[index]
+            if valid.any(1).sum() < _LEAST_LINES or valid.any(0).sum() < _LEAST_GATES:
+                few = f"{valid.any(1).sum()} lines and {valid.any(0).sum()} gates"
                 lost += len(index)
                 continue
             scans.append(_plane_scan(lines.isel(time=index), noise, int(number), common))
@@ -218,7 +218,7 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
         velocity,
         variance,
         float(np.median(np.diff(angle[order]))),
-        not any(one in words for one in STANDING),
+        not any(word in words for word in STANDING),
         clock,
         float(np.rad2deg(along) % 360),
         number,

@@ -71,9 +71,9 @@ def shape(square: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
         return value, -(value**2)
     a = LAMB_OSEEN_CONSTANT
     s = np.maximum(square, _SMALL)
-    rest = np.exp(-a * s)
-    value = (1 - rest) / s
-    slope = (a * rest - value) / s
+    decay = np.exp(-a * s)
+    value = (1 - decay) / s
+    slope = (a * decay - value) / s
     # below: the series, to 1e-8
     small = square < _SMALL
     value = np.where(small, a - a**2 * square / 2, value)
@@ -127,7 +127,7 @@ def motion(
     return np.stack([v, w], -1)
 
 
-def seen(
+def radial_velocity(
     lines: Lines,
     places: np.ndarray,
     strengths: np.ndarray,
@@ -156,10 +156,10 @@ def seen(
         By y, z, circulation, logarithm of the core radius, departure; by y and z times the time of
         the node, s, after `Lines.time`: of a line whose beam moves.
     """
-    value, slope = _seen(lines, places, strengths, None, model, departure)
+    value, slope = _radial_velocity(lines, places, strengths, None, model, departure)
     if ground is None:
         return value, slope
-    image, by = _seen(lines, places, strengths, ground, model, departure)
+    image, by = _radial_velocity(lines, places, strengths, ground, model, departure)
     return value + image, slope + by
 
 
@@ -169,7 +169,7 @@ def node_angles(lines: Lines) -> tuple[np.ndarray, np.ndarray]:
     return lines.angle[:, None] + offset, lines.time[:, None] + lines.rate[:, None] * offset
 
 
-def _seen(
+def _radial_velocity(
     lines: Lines,
     places: np.ndarray,
     strengths: np.ndarray,

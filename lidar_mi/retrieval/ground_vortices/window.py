@@ -62,8 +62,8 @@ class Window:
         square[1:-1] = (full[:-2] - 2 * full[1:-1] + full[2:]) ** 2 / 6
         known = np.isfinite(square)
         total, number = (
-            scipy.ndimage.uniform_filter(one, _NEIGHBOURS, mode="constant")
-            for one in (np.where(known, square, 0.0), known.astype(float))
+            scipy.ndimage.uniform_filter(array, _NEIGHBOURS, mode="constant")
+            for array in (np.where(known, square, 0.0), known.astype(float))
         )
         everywhere = float(square[known].mean())
         local = np.where(number > 0.3, total / np.maximum(number, 0.01), everywhere)

@@ -27,13 +27,13 @@ def inpainted(values: np.ndarray) -> np.ndarray:
     """
     missing = ~np.isfinite(values)
     distance, nearest = distance_transform_edt(missing, return_indices=True)
-    found = values[tuple(nearest)]
+    filled = values[tuple(nearest)]
     unknown = missing & (distance <= _REACH)
     number = np.full(values.shape, -1)
     number[unknown] = np.arange(np.count_nonzero(unknown))
     matrices, rights = [], []
     for axis in range(values.ndim):
-        along, known = np.moveaxis(number, axis, 0), np.moveaxis(found, axis, 0)
+        along, known = np.moveaxis(number, axis, 0), np.moveaxis(filled, axis, 0)
         for stencil in (np.array([1.0, -2.0, 1.0]), np.sqrt(_TENSION) * np.array([-1.0, 1.0])):
             length = len(along) - len(stencil) + 1
             if length < 1:
@@ -52,9 +52,9 @@ def inpainted(values: np.ndarray) -> np.ndarray:
             matrices.append(sparse.csr_matrix((data, (row, column)), shape=shape))
             rights.append(right)
     matrix, right = sparse.vstack(matrices).tocsr(), np.concatenate(rights)
-    found = found.astype(float, copy=True)
-    found[unknown] = spsolve((matrix.T @ matrix).tocsc(), matrix.T @ right)
-    return found
+    filled = filled.astype(float, copy=True)
+    filled[unknown] = spsolve((matrix.T @ matrix).tocsc(), matrix.T @ right)
+    return filled
 
 
 def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.Tensor:

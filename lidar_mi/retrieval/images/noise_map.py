@@ -68,5 +68,5 @@ def variance_of_residual(
     if noise is None or not bool(use.any()):
         return relative
     whole = float(residual[use].square().mean())
-    share = min(1.0, 2 * rms(noise) ** 2 / whole) if whole > 0 else 1.0
-    return share * relative + 1 - share
+    fraction = min(1.0, 2 * rms(noise) ** 2 / whole) if whole > 0 else 1.0
+    return fraction * relative + 1 - fraction

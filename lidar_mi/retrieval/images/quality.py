@@ -146,7 +146,7 @@ def low_texture(
         raise InputError(f"min_texture: {min_texture!r} px^-1 is not >= 0")
     check_between("min_isotropy", min_isotropy, 0, 1)
     image = working(image)
-    found = texture(image, windows)
+    textures = texture(image, windows)
     sigma = torch.as_tensor(noise, dtype=image.dtype, device=image.device)
     if sigma.ndim and sigma.shape != image.shape:
         raise InputError(
@@ -156,13 +156,13 @@ def low_texture(
     if not bool((sigma >= 0).all()):
         raise InputError("noise: not a standard deviation >= 0 everywhere")
     variance = windows.of_templates((sigma**2).expand_as(image))
-    squared = (found.slope * found.mean) ** 2
+    squared = (textures.slope * textures.mean) ** 2
     low = (
-        (found.slope <= min_texture)
-        | (found.isotropy < min_isotropy)
+        (textures.slope <= min_texture)
+        | (textures.isotropy < min_isotropy)
         | (squared < 2 * _SOBEL_NOISE * variance)
     )
-    return found, low
+    return textures, low
 
 
 def clearly_textured(

@@ -135,9 +135,9 @@ class Windows:
                     slice(top, min(top + height, rows)),
                     slice(left, min(left + width, columns)),
                 )
-                yield Tile(vectors, (self._seen(vectors[0]), self._seen(vectors[1])))
+                yield Tile(vectors, (self._searched(vectors[0]), self._searched(vectors[1])))
 
-    def _seen(self, vectors: slice) -> slice:
+    def _searched(self, vectors: slice) -> slice:
         """Pixels along an axis in the search regions of some windows of an image."""
         return slice(vectors.start * self.stride, (vectors.stop - 1) * self.stride + self.search)
 

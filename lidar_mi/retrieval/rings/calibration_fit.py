@@ -214,11 +214,11 @@ def _fitted(
         fisher = fisher_matrix(jacobian, weight)
         score = (jacobian @ (weight * residual)[:, :, None])[:, :, 0]
         # what every frame has of its own is eliminated: Schur's complement
-        own, mixed = fisher[:, :few, :few], fisher[:, :few, few:]
-        by_shared = torch.linalg.solve(own, mixed)
-        own_step = torch.linalg.solve(own, score[:, :few, None])[:, :, 0]
+        local_fisher, mixed = fisher[:, :few, :few], fisher[:, :few, few:]
+        by_shared = torch.linalg.solve(local_fisher, mixed)
+        local_step = torch.linalg.solve(local_fisher, score[:, :few, None])[:, :, 0]
         total = (fisher[:, few:, few:] - mixed.transpose(1, 2) @ by_shared).sum(0)
-        reduced = (score[:, few:] - torch.einsum("bls,bl->bs", mixed, own_step)).sum(0)
+        reduced = (score[:, few:] - torch.einsum("bls,bl->bs", mixed, local_step)).sum(0)
         for k, name in enumerate(shared):
             if name in INSTRUMENT:
                 information = tolerances[name] ** -2
@@ -233,11 +233,11 @@ def _fitted(
             for name, value in zip(shared, step.tolist(), strict=True)
         }
         # back substitution, with the speed within the linear range of the waves
-        own_step = own_step - by_shared @ step
+        local_step = local_step - by_shared @ step
         limit = state.model.velocity_range / 16
-        own_step[:, 0] = own_step[:, 0].clamp(-limit, limit)
+        local_step[:, 0] = local_step[:, 0].clamp(-limit, limit)
         parameters = state.parameters.clone()
-        for name, column in zip(local, own_step.unbind(1), strict=True):
+        for name, column in zip(local, local_step.unbind(1), strict=True):
             parameters[:, PARAMETERS.index(name)] += column
         for name in shared:
             if name in ("falloff", "damping", "roughness", *LIGHT):
@@ -252,7 +252,7 @@ def _fitted(
             shared,
             covariance,
             by_shared[:, 0],
-            torch.linalg.inv(own)[:, 0, 0],
+            torch.linalg.inv(local_fisher)[:, 0, 0],
             float((weight * residual**2).sum()) / freedom,
             freedom,
         )

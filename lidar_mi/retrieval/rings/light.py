@@ -124,12 +124,12 @@ def _noise(residual: np.ndarray, used: np.ndarray) -> np.ndarray:
     for first, last in pairwise(edges):
         cells = np.abs(residual[:, first:last][used[:, first:last]])
         variances.append((1.4826 * np.median(cells)) ** 2 if len(cells) else np.nan)
-    found = np.array(variances)
-    known = found > 0
+    variance = np.array(variances)
+    known = variance > 0
     if not known.any():
         return np.full(size, np.finfo(float).tiny)
     middle = (edges[:-1] + edges[1:]) / 2
-    return np.interp(np.arange(size), middle[known], found[known])
+    return np.interp(np.arange(size), middle[known], variance[known])
 
 
 def _median(value: np.ndarray) -> np.ndarray:

@@ -189,8 +189,8 @@ def mean_and_jacobian(
     profile = terms[3]
     for term in reversed(terms[:3]):
         profile = torch.addcmul(term, moved, profile)
-    lit = light * profile.add_(1)
-    mean = torch.addcmul(background, level, lit)
+    pattern = light * profile.add_(1)
+    mean = torch.addcmul(background, level, pattern)
     uneven = [name for name in model.smooth if name in BACKGROUND]
     if uneven:
         mean += _smooth(model, cells, parameters, uneven)
@@ -205,19 +205,19 @@ def mean_and_jacobian(
             row[:] = bright * slope * (cosine / model.velocity_range)
         elif name in ("x", "y"):
             off = dx - cells.x if name == "x" else dy - cells.y
-            row[:] = (by_r2 - level * lit * falloff / area) * 2 * off
+            row[:] = (by_r2 - level * pattern * falloff / area) * 2 * off
         elif name == "level":
-            row[:] = lit
+            row[:] = pattern
         elif name == "background":
             row[:] = 1
         elif name == "falloff":
-            row[:] = -level * lit * r2 / area
+            row[:] = -level * pattern * r2 / area
         elif name in SHAPE:
             first = by[name] * turned
             change = _product(first, waves.waves)
             row[:] = bright * (change + moved * _product(first * (2j * math.pi * n), waves.waves))
         elif name in LIGHT:
-            row[:] = level * lit * cells.terms[:, model.smooth.index(name)]
+            row[:] = level * pattern * cells.terms[:, model.smooth.index(name)]
         elif name in BACKGROUND:
             row[:] = cells.terms[:, model.smooth.index(name)]
         elif name == "focal_length":

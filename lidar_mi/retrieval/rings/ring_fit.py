@@ -96,8 +96,8 @@ def fit_all(
         # a ring that its noise would move off its line stays where the pattern has it
         firm = system.parts(std)[1] < 0.1 * pattern.width
         deviation = {
-            key: float(deviation.get(key, 0.0) + moved) if held else 0.0
-            for key, moved, held in zip(system.keys, ring_change, firm, strict=True)
+            key: float(deviation.get(key, 0.0) + moved) if certain else 0.0
+            for key, moved, certain in zip(system.keys, ring_change, firm, strict=True)
         }
         top = np.maximum(pattern.height + heights, 0.2 * pattern.height)
         pattern = replace(
@@ -352,7 +352,7 @@ class _System:
 
 def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
     """Order, line and number of sectors of the rings in enough of them, by their radius."""
-    found = []
+    rings = []
     present = (sectors.used > 0).sum(0)
     half = 0.5 * pattern.width * pattern.spacing
     for line, fraction in enumerate(pattern.fraction):
@@ -360,11 +360,11 @@ def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
             place = (order + fraction) * pattern.spacing
             last = int((place + half) / sectors.step)
             if place > 2 * half and last < len(present) and present[last] >= LEAST:
-                found.append((place, order, line, present[last]))
-    if len(found) < 2:
-        raise InputError(f"rings: {len(found)} detected; expected at least 2")
-    found.sort()
-    return np.array([f[1:] for f in found]).T
+                rings.append((place, order, line, present[last]))
+    if len(rings) < 2:
+        raise InputError(f"rings: {len(rings)} detected; expected at least 2")
+    rings.sort()
+    return np.array([f[1:] for f in rings]).T
 
 
 def _usual(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
