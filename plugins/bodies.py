@@ -31,7 +31,7 @@ MOST_SHEETS = 64
 
 
 def parts_of_shape(shape: Shape) -> "list[Body | Sheet]":
-    """What is on both sides of a shape whose surface lets light pass: bodies and open surfaces."""
+    """Media on both sides of shapes whose surface lets light pass: bodies and open surfaces."""
     if shape.class_name() == "Sphere":
         return [Sphere(shape)]
     if not shape.is_mesh():
@@ -227,7 +227,7 @@ def slabs(low: Point, high: Point, origin: Point, direction: Vector) -> Line:
 
 def first_hit(scene: Scene, origin: Point, direction: Vector, active: Mask) -> tuple[Float, Vector]:
     """Distance of the first surface, infinite if there is none, and its normal."""
-    # one by one: packets of rays are slower here, coherent or not
+    # single rays: packets are slower here, coherent or not
     si = scene.ray_intersect(
         mi.Ray3f(origin, direction), ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active
     )

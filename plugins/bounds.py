@@ -135,7 +135,7 @@ class _Blocks:
 
 
 def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
-    """Those of a medium; ``known`` again if it still is what it was."""
+    """Bounds of a medium; ``known`` again if it is unchanged."""
     volume = _parts(medium).get("sigma_t")
     data = _grid(volume)
     if data is None:
@@ -176,7 +176,7 @@ def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
 
 
 def _parts(medium: Medium) -> dict[str, Any]:
-    """What a medium consists of, by name."""
+    """Parts of a medium, by name."""
     parts: dict[str, Any] = {}
 
     class Parts(mi.TraversalCallback):

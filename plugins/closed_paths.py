@@ -94,7 +94,7 @@ class OpenPath:
         return level_frame(self.away).to_world(local)
 
     def density(self, used: Float, direction: Vector) -> Float:
-        """Of `sample`, per steradian."""
+        """Density of `sample`, per steradian."""
         least, width, logarithm = self._limits(used)
         one_plus = self.one_plus_cosine(direction)
         one_minus = 0.5 * dr.squared_norm(self.away - direction)
@@ -177,7 +177,7 @@ def sample_ahead(most: Float, scale: Float, sample: Float) -> Float:
 
 
 def ahead_density(distance: Float, most: Float, scale: Float) -> Float:
-    """Of `sample_ahead`, per metre."""
+    """Density of `sample_ahead`, per metre."""
     return dr.rcp((distance + scale) * _steps(most, scale))
 
 
@@ -200,7 +200,7 @@ def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: F
 
 
 def near_density(gap: Float, least: Float, most: Float, scale: Float) -> Float:
-    """Of `sample_near`, per metre."""
+    """Density of `sample_near`, per metre."""
     # of the draws that fall out of the range and are replaced by uniform ones
     outside = 1 - _near_chance(most, scale) + _near_chance(least, scale)
     density = dr.log(1 + dr.square(scale / gap)) / (dr.pi * scale)

@@ -93,7 +93,7 @@ def define() -> type:
             )
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 2)
             self.physical = Physical(NAME)
-            # set by whoever renders
+            # set by the caller
             self.progress: Progress | None = None
             self.batches: Batches | None = None
 

@@ -229,11 +229,11 @@ def define() -> type:
             # unreliable, and samples that were lost to rounding
             self.lit, self.untrusted, self.rejected = 0, 0, 0
             self.warned = False
-            # of the orders that count, for comparing order by order
+            # lowest order that counts, for tests of single orders
             self.lowest_order = 1
             self.physical = Physical(NAME)
             self.bounds = Bounds()
-            # set by whoever renders
+            # set by the caller
             self.progress: Progress | None = None
             self.batches: Batches | None = None
 
@@ -318,7 +318,7 @@ def define() -> type:
             return mi.TensorXf(image, (height, width, gates * quantities))
 
         def _warn(self, samples: int) -> None:
-            """Of an image that is not what it should be, at an integrator's first such image."""
+            """Warn of an unreliable image, at an integrator's first one."""
             said = []
             if self.untrusted > 0.01 * self.lit and not self.shares:
                 said.append(
@@ -367,7 +367,7 @@ def define() -> type:
             image = dr.zeros(mi.Float, shape[0] * shape[1] * shape[2])
             wanted, phases = differentiable(NAME, scene)
             orders = self.lowest_order, self.max_order
-            # what plugins have made of their parameters, which kernels look up
+            # quantities that plugins derive from their parameters
             dr.enqueue(dr.ADMode.Forward, wanted)
             dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
             for lidar, sample, cell, low, high, part in self._replayed(scene, sensor, seed, spp):

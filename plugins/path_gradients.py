@@ -75,7 +75,7 @@ def gradients(
     if last == 1:
         return slopes
     least, most = (dr.opaque(mi.UInt32, order) for order in orders)
-    # matrices of paths that go on, one for each order above two
+    # phase matrices at which paths go on, one for each order above two
     count, chosen = last - 2 if phases else 0, None
     if count:
         chosen = 2 + dr.minimum(mi.UInt32(sample.rng.next_float32() * count), count - 1)
@@ -106,7 +106,7 @@ def _traced(
     chosen: UInt | None = None,
     replays: bool = False,
 ) -> tuple[Stokes, Stokes, Stokes, ScatteringVertex | None]:
-    """One walk along the paths: the sums of their light, or what of it remains after a replay.
+    """One walk along the paths: the sums of their light, or its remainder after a replay.
 
     ``coming`` is light, ``hidden`` light that a single vertex without scattering would give, were
     its coefficient the largest one of its medium. Of a replay also the derivatives; with ``chosen``
@@ -130,7 +130,7 @@ def _traced(
     flight, excess, weight = lidar._first_flight(rng, position, direction, sample.aperture, path)
     active = flight > 0
     while dr.hint(active, label="path replay"):
-        # what is drawn stays where it is
+        # samples are not differentiated
         with dr.resume_grad(when=replays):
             out, medium = transmittance(
                 lidar.air,
@@ -157,7 +157,7 @@ def _traced(
         instead = dr.select(dark, most, scattered)
         clear = missing == 0
         missing += dr.select(dark, mi.UInt32(1), 0)
-        # by the largest coefficient: where there is little scattering, its derivative is as large
+        # by the majorant: where there is little scattering, its derivative is as large
         likely = weight * passed * most
         weight *= passed * instead
         survival = dr.select(order == 2, 1, dr.minimum(path_sampling.ROULETTE_FACTOR * likely, 1))

@@ -135,16 +135,16 @@ class Lidar:
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
-        # of the delays, half the path: so ranges of a gate shift by as much
+        # standard deviation of the delays in range, half the path
         self.pulse_sigma = None
         if sensor.laser.pulse_duration > 0:
             sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
             self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
         self.peak = narrowest_peak(media_of(scene, sensor), self.wavelengths)
-        # of each sample's beam, once they are emitted
+        # replaced by that of each sample's beam in `emit`
         self.field_tan = sensor.field_tangent(mi.UInt32(0))
-        # last vertices that were drawn in the field of view and are not in it: rounding alone
+        # last vertices drawn in the field of view that rounding puts outside
         self.rejected = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self.rejected)
 
@@ -214,7 +214,7 @@ class Lidar:
         si, back, path = self._target(sample)
         active = (path >= low) & (path < high)
         medium = mi.MediumPtr(self.sensor.get_medium())
-        # as far as in front of the surface, which would hide itself
+        # ends in front of the surface, which would occlude itself
         out, medium = transmittance(
             self.air,
             self.bounds,
@@ -455,7 +455,7 @@ class Lidar:
         return open_path, gains, active
 
     def _reject(self, lost: Mask) -> None:
-        """Count samples of which a sampler has left its own domain."""
+        """Count samples that left their sampler's domain."""
         dr.scatter_reduce(
             dr.ReduceOp.Add,
             self.rejected,

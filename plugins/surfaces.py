@@ -83,7 +83,7 @@ class Air:
         self.bounds = _everywhere() if everywhere else (self.low, self.high)
 
     def crossings(self, origin: Point, direction: Vector) -> Crossings:
-        """What each body needs to know of a line, and the distance of its first opaque surface."""
+        """Crossings of each body with a line, and the distance of the first opaque surface."""
         lines = [body.line(origin, direction) for body in self.bodies]
         if self.opaque is None:
             return lines, None

@@ -110,7 +110,7 @@ class AileronLift:
 
 
 def aileron_lift(aircraft: Aircraft) -> AileronLift:
-    """What the ailerons lift, from what they roll, by strips.
+    """Lift by the ailerons, from their rolling moment, by strips.
 
     A strip with the deflection d has the lift of the angle k d. With the integrals over the
     stations eta = 2 |y| / b, I_n = 4 / pi int eta^n sqrt(1 - eta^2) d eta, the rolling moment

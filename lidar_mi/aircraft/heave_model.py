@@ -105,7 +105,7 @@ class HeaveModel:
         return motion, inputs
 
     def _step(self, dt: float) -> tuple[np.ndarray, ...]:
-        """Of a step: per state, per inputs at its start, per change of the inputs in it."""
+        """State after a step per state, per inputs at its start, and per their change in it."""
         if dt not in self._steps:
             motion, inputs = self._equations()
             count = inputs.shape[1]
@@ -144,6 +144,6 @@ class HeaveModel:
             load_factor=1 + float(rise) / g,
             port_bending=float(port),
             starboard_bending=float(starboard),
-            # not "beyond": an angle that is no number is an upset, too
+            # NaN is an upset, too
             departed=not (abs(roll) <= LARGEST_ROLL and abs(pitch) <= LARGEST_ROLL),
         )

@@ -112,7 +112,7 @@ class JSBSimAircraft:
 
     @property
     def mass(self) -> float:
-        """Now, kg."""
+        """Mass now, kg."""
         return self._fdm["inertia/mass-slugs"] * slug
 
     @property
@@ -223,7 +223,7 @@ def neu_place(fdm: "FGFDMExec") -> np.ndarray:
 
 
 def air_density(fdm: "FGFDMExec") -> float:
-    """Of the air at the aircraft, kg/m^3."""
+    """Density of the air at the aircraft, kg/m^3."""
     return fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
 
 

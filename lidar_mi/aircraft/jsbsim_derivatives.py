@@ -39,7 +39,7 @@ def set_loads(fdm: "FGFDMExec", force: np.ndarray, moment: np.ndarray) -> None:
 
 
 def commands_of(fdm: "FGFDMExec") -> np.ndarray:
-    """Of aileron, elevator and rudder, -1 to 1."""
+    """Commands of aileron, elevator and rudder, -1 to 1."""
     return np.array([fdm[f"fcs/{name}-cmd-norm"] for name in _CONTROLS])
 
 

@@ -36,7 +36,7 @@ _NOTHING = 1e-6  # of a coefficient of lift or moment: rounding
 
 
 def such_as(name: str) -> str:
-    """Words that name a large aircraft other than this one."""
+    """Words that name another large aircraft."""
     return f"such as {next(other for other in _LARGE if other != name)}"
 
 
@@ -132,7 +132,7 @@ def _trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExe
 
 
 def _where_it_trims(name: str, path: Path) -> str:
-    """What to change: a speed at which it trims, or else the path or the aircraft."""
+    """Advice: a speed at which it trims, or else another path or aircraft."""
     level, raised = (_lift(_in_flow(name, path, incidence)) for incidence in (0.0, _RAISED))
     weight = _in_flow(name, path, 0.0)["inertia/weight-lbs"]
     highest = level + (raised - level) * _HIGHEST / _RAISED
@@ -222,7 +222,7 @@ def loaded(name: str) -> "FGFDMExec":
 
 @cache
 def _silent_logger(jsbsim: ModuleType) -> "FGLogger":
-    """In place of JSBSim's own, which writes to the terminal whatever it also raises."""
+    """Logger that writes nothing: JSBSim also raises what it writes to the terminal."""
 
     def ignore(self: object, *arguments: Any) -> None:
         pass

@@ -72,7 +72,7 @@ def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
         without = from_state @ state + np.einsum("okl,kl->o", from_wind, wind)
         without = without + by_bending @ bending
         room, reach = (np.tile(limit[:, None], KNOTS) for limit in (largest, rate * INTERVAL))
-        # what roll leaves of the ailerons' travel and rate
+        # travel and rate of the ailerons that roll does not use
         room[1] = np.minimum(room[1], limits.deflection[0] - np.abs(ailerons[1:]))
         reach[1] = np.maximum(reach[1] - np.abs(np.diff(ailerons)), 0.0)
         ways = [least_travel(now[k], room[k], reach[k]) for k in used]
@@ -94,7 +94,7 @@ def _outputs(heave: Heave) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     whole = np.zeros((7, 7))
     whole[:3] = np.hstack([heave.motion, inputs])
     flow = expm(whole * INTERVAL)[:3]
-    # states on the first state and on all inputs
+    # derivatives of the state by the first state and all inputs
     now = np.zeros((3, 3 + 4 * KNOTS))
     now[:, :3] = np.eye(3)
     rows: list[list[np.ndarray]] = [[], [], [], []]

@@ -55,7 +55,7 @@ class RollModel:
                 moments = loads.moment[0] + self.control_moments[0, 0] * np.array([start, end])
                 roll, rate = self._rolled(roll, rate, duration, *(moments / self.roll_inertia))
         time = state.time + dt
-        # not "beyond": a roll angle that is no number is an upset, too
+        # NaN is an upset, too
         self.state = replace(
             state,
             time=time,

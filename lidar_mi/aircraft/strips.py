@@ -204,7 +204,7 @@ def roll_damping(strips: Strips, airspeed: float, density: float) -> float:
 
 
 def _angles(n: int) -> np.ndarray:
-    """Of the nodes of the quadrature, rad, shape (n,)."""
+    """Angles of the nodes of the quadrature, rad, shape (n,)."""
     if n < 2:
         raise InputError(f"strips.n: {n} is not allowed; expected 2 or more")
     return np.arange(1, n + 1) * np.pi / (n + 1)

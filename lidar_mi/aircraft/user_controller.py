@@ -1,4 +1,4 @@
-"""A controller of the user: its faults become one line with its name and what is expected."""
+"""A controller of the user, whose errors become one line with its name."""
 
 import functools
 import inspect
@@ -18,7 +18,7 @@ _CONTROLLER = "expected a function of the preview and the state that returns Com
 
 
 def name_of(maker: Callable[..., Any]) -> str:
-    """What a controller is called in tables, figures and messages."""
+    """Name of a controller in tables, figures and messages."""
     while isinstance(maker, functools.partial):
         maker = maker.func
     name = getattr(maker, "__name__", type(maker).__name__)

@@ -240,7 +240,7 @@ def true_pose(
             )
     if motion.attitude:
         for number, axis in enumerate(ANGLES):
-            # streams of their own: [seed, 2] and [seed, image, 1] are others'
+            # independent streams: [seed, 2] and [seed, image, 1] are used elsewhere
             random = np.random.default_rng([seed, 3, 1, number + 1])
             offset[axis] += random_process(
                 time, motion.attitude.rms, motion.attitude.bandwidth, random

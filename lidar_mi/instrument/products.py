@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
 
-# whose products are computed together
+# Gates whose products are computed together.
 _GATES = 16
 _ORDER = re.compile(r"order\d+\.S0")
 
@@ -249,7 +249,7 @@ def _samples(scan: xr.Dataset) -> int:
 
 
 def untrusted_pixels(scan: xr.Dataset) -> str | None:
-    """What a rendered scan says of pixels whose standard error rests on one Monte Carlo sample.
+    """Warning of a rendered scan on pixels whose standard error rests on one Monte Carlo sample.
 
     None where there are at most 1 % of those that receive light; see ``S0_largest_share``.
     """

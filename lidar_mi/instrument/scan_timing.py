@@ -45,7 +45,7 @@ class Directions:
 
 
 class Load(NamedTuple):
-    """What a scan asks of its scanner: rad/s and rad/s^2, the larger of both axes."""
+    """Load of the scanner: rad/s and rad/s^2, the larger of both axes."""
 
     rate: float
     acceleration: float
@@ -373,7 +373,7 @@ def _four_digits(value: float, rounded: Callable[[float], int]) -> float:
     if value == 0:
         return 0.0
     unit = 10.0 ** (math.floor(math.log10(value)) - 3)
-    # rounding must not lead from exact digits to the next number
+    # exact digits stay in spite of rounding
     slack = 1e-9 if rounded is math.floor else -1e-9
     return float(f"{rounded(value / unit + slack) * unit:.4g}")
 

@@ -59,7 +59,7 @@ class LayeredAir:
 
 
 class _Rendered(NamedTuple):
-    """S0, its Monte Carlo variance and single scattering's S0, (gates, beams)."""
+    """S0, its Monte Carlo variance, and S0 of single scattering, (gates, beams)."""
 
     signal: np.ndarray
     variance: np.ndarray
@@ -186,7 +186,7 @@ def attenuation_factor(rendered: _Rendered, depth: np.ndarray) -> float:
     depth t. Of the least squares of its logarithm, weighted by the Monte Carlo variance.
     """
     ratio = np.log(np.maximum(rendered.signal, rendered.single) / rendered.single)
-    # of what two samples in thousands tell nothing
+    # a floor: variances from few samples are uncertain
     weights = 1 / (rendered.variance / rendered.signal**2 + 1e-4)
     slope = (weights * ratio * depth).sum() / (weights * depth**2).sum()
     return float(np.clip(1 - slope / 2, 0.3, 1))
@@ -210,7 +210,7 @@ def _render(
 
 
 def _check_light(signal: np.ndarray, plan: ScanPlan) -> None:
-    """Refuse gates without light: whatever the air is, they would count the background alone."""
+    """Refuse gates without light, which count the background alone."""
     dark = np.argwhere(~(signal > 0))
     if dark.size:
         edges = np.linspace(plan.gate_start, plan.gate_stop, plan.gate_count + 1)
@@ -234,7 +234,7 @@ def _renderer(
 
 
 def _grid(profile: np.ndarray, plan: ScanPlan, air: LayeredAir) -> xr.DataArray:
-    """The profile as a field, so wide that what leaves it sideways does not come back."""
+    """The profile as a field, so wide that light that leaves it sideways does not return."""
     lateral = max(np.abs(plan.y).max(), np.abs(plan.z).max()) * plan.gate_stop / plan.centre
     half, nodes = float(lateral + np.ptp(air.x)), air.nodes()
     field = np.broadcast_to(profile[:, None, None], (len(profile), 2, 2)).copy()

@@ -7,7 +7,7 @@ _SUBDIVISIONS, _POINTS = 8, 4
 
 
 class Layers:
-    """Light that gates receive from air whose extinction changes along x alone.
+    """Light that gates receive from air whose extinction changes only along x.
 
     The extinction is linear between nodes and constant beyond them, as the renderer's grid is. A
     gate from r_1 to r_2 along a beam receives, but for a factor,
@@ -38,7 +38,7 @@ class Layers:
         x = ranges[..., None] * cosines
         step = nodes[1] - nodes[0]
         face = nodes[0] - step / 2
-        # of air, whose faces are half a step outside of the outermost nodes
+        # the air ends half a step beyond the outermost nodes
         inside = (x > face) & (x < nodes[-1] + step / 2)
         self._weights = np.broadcast_to((steps / ranges**2)[..., None], shape) * inside
         self._values = _hats(x, nodes)

@@ -45,5 +45,5 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
 
 
 def _is_full(error: BaseException) -> bool:
-    """Whether Dr.Jit got no memory: it has no type for it."""
+    """Whether Dr.Jit ran out of memory, for which it has no exception of its own."""
     return any("out of memory" in str(cause).lower() for cause in causes(error))

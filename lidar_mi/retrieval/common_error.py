@@ -16,7 +16,7 @@ NAMES = ("v_common_stderr", "w_common_stderr")
 """Variables of a data set of vectors that state it, m/s."""
 ROTATION = "rotation_common_stderr"
 """The same of a rotation, rad/s, with the attributes `centre_y` and `centre_z`, m."""
-# Least fraction of a stated error that is the vector's own.
+# Least fraction of a stated error that is independent of the other vectors'.
 _LEAST_INDEPENDENT = 1e-3
 
 
@@ -97,7 +97,7 @@ def _hypot(a: xr.DataArray, b: xr.DataArray | float) -> xr.DataArray:
 
 
 def _like(values: xr.DataArray, like: xr.DataArray) -> xr.DataArray:
-    """In the type, the order of dims and with the attributes of another field."""
+    """Values with the type, order of dims and attributes of another field."""
     return values.transpose(*like.dims).astype(like.dtype).assign_attrs(like.attrs)
 
 

@@ -64,7 +64,7 @@ def in_turn(
     if number < 2:
         yield from map(function, parts)
         return
-    # modes are of a thread
+    # inference mode is local to a thread
     in_mode = torch.inference_mode(torch.is_inference_mode_enabled())(function)
     try:
         with ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:

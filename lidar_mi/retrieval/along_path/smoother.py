@@ -157,7 +157,7 @@ class Observation:
 def observation(
     basis: Basis, statistics: Statistics, vectors: SlabVectors, extra: np.ndarray | float = 0.0
 ) -> Observation:
-    """Of the vectors over the lattice, with `extra` variance (nz, ny), m^2/s^2."""
+    """Observation by the vectors over the lattice, with `extra` variance (nz, ny), m^2/s^2."""
     number = ACROSS.index(basis.component)
     y, z = np.meshgrid(vectors.y, vectors.z)
     reach = [np.abs(axis).max() + vectors.window / 4 for axis in basis.axes]
@@ -177,7 +177,7 @@ def observation(
     whole = float(covariance(basis.component, 0.0, 0.0, 0.0, basis.length, statistics.mean(2)))
     missing = np.maximum(whole - forward**2 @ basis.variance, 0.0)
     uncorrelated = statistics.sigma**2 * missing + np.broadcast_to(extra, used.shape)[used]
-    # of errors of 0 the covariance would be singular
+    # errors of 0 would make the covariance singular
     errors[np.diag_indices(len(errors))] += uncorrelated + _ROUNDING
     precision = cho_solve(cho_factor(errors), np.eye(len(errors)))
     gain = forward.T @ precision
@@ -259,7 +259,7 @@ class PathField:
         reach = self.basis.reach
         a, b = to_left[:, None] / reach, to_right[:, None] / reach
         inside = (two & (to_left > 0) & (to_right > 0))[:, None]
-        # one slab alone, or beyond both: the nearest
+        # with one slab, or beyond both, the nearest counts
         nearer = np.where(two, to_left > 0, False)[:, None]
         with np.errstate(over="ignore", invalid="ignore"):
             both = np.sinh(np.where(inside, a + b, 1.0))
@@ -283,7 +283,7 @@ class PathField:
     ) -> np.ndarray:
         reach, sigma = self.basis.reach, self.statistics.sigma
         a, b = (np.exp(-np.abs(d)[:, None] / reach) for d in (to_left, to_right))
-        # of the state, given the states of the slabs without error
+        # variance of the state given exact states of both slabs
         bridge = np.maximum(1 - weight_left * a - weight_right * b, 0.0) * self.basis.variance
         prior = (value**2 * self.basis.variance).sum(-1)
         variance = sigma**2 * (np.maximum(1 - prior, 0.0) + (value**2 * bridge).sum(-1))

@@ -72,7 +72,7 @@ def counting(wind: xr.Dataset) -> xr.Dataset:
 
 
 def slab_vectors(wind: xr.Dataset) -> SlabVectors:
-    """Those of `counting`, without what their errors have in common."""
+    """Vectors of `counting`, with the common part of their errors stated separately."""
     y, z = (wind.variables[axis].values.astype(float) for axis in ("y", "z"))
 
     def values(name: str) -> np.ndarray:
@@ -112,7 +112,7 @@ def _separate(axis: np.ndarray, window: float) -> np.ndarray:
 
 
 def _mask_of(flag: xr.DataArray, meaning: str) -> int:
-    """The bit of a meaning; 0 where the flag does not have it."""
+    """The bit of a meaning; 0: the flag does not have it."""
     names = str(flag.attrs.get("flag_meanings", "")).split()
     masks = np.ravel(flag.attrs.get("flag_masks", []))
     return int(dict(zip(names, masks, strict=True)).get(meaning, 0)) if len(masks) else 0

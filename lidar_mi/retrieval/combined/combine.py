@@ -157,7 +157,7 @@ def combine(
     jets, 80 to 90 and 97 %.
     """
     if time is None and "time" in crossflow:
-        # variables: with their coordinates this takes ten times as long
+        # variables, as with coordinates this takes ten times as long
         times, flags = (crossflow.variables[name] for name in ("time", "flag"))
         time = float(times.where(flags == 0).mean())
     crossflow, scan = at_common_time(

@@ -131,7 +131,7 @@ def probable_statistics(
     variance = stds[of_std, None, None] ** 2
     white = np.linalg.inv(np.linalg.cholesky(fixed + variance * shapes[of_shape]))
     kinds = list(itertools.product(pairs, relative_stds))
-    # the one of largest evidence is there once more than it was drawn
+    # the best was appended, not drawn
     best = int(np.searchsorted(drawn, np.argmax(evidence)))
     times[best] -= 1
     choices = []

@@ -41,7 +41,7 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
     for name in _NAMES:
         if name not in scan:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
-    # variables: their coordinates take longer to attach than all checks
+    # variables, as attaching coordinates takes longer than all checks
     variables = scan.variables
     each_line = {"line"} & set(variables["platform_velocity"].dims)
     for name, dims in (
@@ -127,7 +127,7 @@ def solve_lines(
     """
     matrix = directions / std[..., None]
     left, values, right = np.linalg.svd(matrix, full_matrices=False)
-    # of the directions themselves: errors may differ by orders of magnitude
+    # unweighted, as errors may differ by orders of magnitude
     unweighted = np.linalg.svd(directions, compute_uv=False)
     flat = unweighted[:, -1] <= _COPLANAR * unweighted[:, 0]
     inverse = 1 / np.where(flat[:, None], np.nan, values)
@@ -238,7 +238,7 @@ def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str
     shared = shared_covariance(scan)
     if shared is not None:
         shared = np.nan_to_num(shared[lines[:, :, None], lines[:, None]])
-    # any number will do: the results are replaced by NaN below
+    # a placeholder: these results become NaN below
     wind, covariance, chi_square = solve_lines(
         directions,
         np.where(missing[:, None], 0.0, values),

@@ -44,7 +44,7 @@ from lidar_mi.retrieval.images.windows import (
 # Standard deviation of all Gaussian means over the template, and of those that decide whether
 # errors are known at all.
 _WIDTH, _AROUND = 1.5, 4.5
-# Templates by which the residual is moved along z and y, away from the texture that it is of.
+# Templates by which the residual is shifted along z and y, away from its own texture.
 _SEPARATION = 2
 # Independent windows of known error within a mean that a variance needs: of the two components of
 # five windows, it is known to 45 %.
@@ -106,7 +106,7 @@ def bootstrap_covariance(
     ----------
     images : sequence of torch.Tensor, shape (z, y), or (x, z, y) of volumes
         The two images.
-    found : Displacement
+    displacement : Displacement
         Retrieved from them.
     retrieve : callable
         (image1, image2, stride=...) -> Displacement, the method with its options.
@@ -150,10 +150,10 @@ def bootstrap_covariance(
     spline, sharper = likeliest(first, settings), band_limited([first], settings=settings)[0]
     came_from = origin(wind)
     moved, sharp = (advected(air, came_from) for air in (spline, sharper))
-    # of air that came in nothing is known
+    # air that enters the image is unknown
     compared = second.isfinite() & moved.inside
     residual = torch.where(compared, second - moved.image, 0.0)
-    # smoothed, as a noise from few samples is itself noisy; 1 where none is known
+    # smoothed, as the variance of few samples is uncertain
     _, weight = known_and_weight(images, noise)
     weight = 1 / variance_of_residual(residual, 1 / weight.to(residual), compared, noise)
     level = averaged(residual.square() * weight, compared, _WIDTH * windows.template) / weight
@@ -218,7 +218,7 @@ def bootstrap_covariance(
 
 
 def _unflagged(displacement: Displacement) -> torch.Tensor:
-    """Vectors that are valid, be it from what is finite in their windows."""
+    """Valid vectors, also of windows with some masked pixels."""
     flag = displacement.flag & ~Flag.NON_FINITE_INPUT.value
     return (flag == 0) & displacement.d.isfinite().all(0)
 
@@ -234,7 +234,7 @@ def _between(valid: torch.Tensor, windows: Windows) -> torch.Tensor:
 
 
 def _in_a_mean(windows: Windows) -> float:
-    """Windows that do not overlap within a local mean, or in all."""
+    """Number of separate windows in a local mean, at most those of the image."""
     inside = math.prod(1 + (n - 1) * windows.stride / windows.template for n in windows.count)
     return min(_of_a_mean(windows.dims), inside)
 
@@ -244,7 +244,7 @@ def _of_a_mean(dims: int) -> float:
 
 
 def _widened(number: torch.Tensor, dims: int) -> torch.Tensor:
-    """Variance of errors over the square of a standard error from so many windows."""
+    """Variance of errors over the squared standard error estimated from so many windows."""
     degrees = dims * number.clamp(min=_FEWEST / 2)
     return degrees / (degrees - 2)
 

@@ -1,4 +1,4 @@
-"""The first displacement of a coarse-to-fine retrieval: correlation of large windows."""
+"""The first displacement of a coarse-to-fine retrieval, by correlation of large windows."""
 
 import math
 from collections.abc import Sequence
@@ -217,12 +217,12 @@ def volume_scores(
     for some in shifts.split(max(1, _AT_ONCE // first.numel())):
         moved = fields[:, *some.T]
         inside = sums(moved[2])
-        # of image 1 the part that is compared
+        # the part of image 1 that is compared
         parts = [moved[0], moved[1], first * moved[0], first * moved[2], first**2 * moved[2]]
         mean2, square2, cross, mean1, square1 = (sums(part) / inside for part in parts)
         contrast = (square1 - mean1**2) * (square2 - mean2**2)
         score = (cross - mean1 * mean2) / contrast.clamp(min=1e-12).sqrt()
-        # half of a window must have a partner
+        # at least half of a window must overlap
         scores.append(torch.where(inside > 0.5, score, -1.0))
     whole = torch.where(contrast1 > 1e-10, torch.cat(scores), torch.nan)
     centres = [
@@ -253,7 +253,7 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     for (a, b), term in zip(pairs, terms[4:], strict=True):
         curvature[:, a, b] = curvature[:, b, a] = term
     peaked = largest_eigenvalue(curvature) < 0
-    # a saddle has no top: it is replaced by what can be solved, and its offset by 0
+    # a saddle has no maximum: its offset is 0
     curvature = torch.where(peaked[:, None, None], curvature, -torch.eye(3).to(curvature))
     offset = -torch.linalg.solve(curvature, slope[..., None])[..., 0]
     # the quadratic holds between neighbours only
@@ -273,7 +273,7 @@ def _cubic_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
         inner = (1.25 * x - 2.25) * x * x + 1
         outer = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
         weight = torch.where(x <= 1, inner, outer)
-        # beyond the ends the last value goes on
+        # constant beyond the ends
         column = (low.long() + shift).clamp(0, len(known) - 1)
         matrix.scatter_add_(1, column[:, None], weight[:, None])
     return matrix

@@ -109,7 +109,7 @@ def multipass(
     )
     flow, replaced = first_pass([image1, image2], spline, windows, grid)
     for width in settings.widths[:-1]:
-        # windows average over their width: vectors much closer than that say the same
+        # vectors much closer than a window's width are redundant
         step = max(1, round(settings.spacing * width * sigma))
         places = [torch.arange(0, n, step, device=image1.device) for n in grid.shape]
         fit = _fit(pair, flow, grid, places, width * sigma)
@@ -130,7 +130,7 @@ def multipass(
     curved = torch.diag_embed(curved.movedim(0, -1)).movedim((-2, -1), (0, 1))
     matched = (fit.score > 0) & (fit.fraction_valid > 0.5)
     at = torch.meshgrid(*places, indexing="ij")
-    # linearised about a displacement, the fit does not hold that far from it
+    # the linearisation does not hold that far from its displacement
     off = (d - torch.stack([part[at] for part in flow])).norm(dim=0) > max(settings.jump, sigma)
     bad = non_finite([image1, image2], windows)
     flag = (

@@ -43,7 +43,7 @@ class Residuals(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The known motion on pixels, and what windows make of it.
+    """The known motion on pixels, and its averages over windows.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Motion(NamedTuple):
 
 
 class Unresolved(NamedTuple):
-    """Displacement that the vectors lack, and what they absorb of differences of the images.
+    """Displacement that the vectors lack, and the leverage of the images' differences.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ def unresolved(
         return Unresolved(_less(total, by_errors), 1.0)
     linear, visible = _visible(residuals, motion.within, windows, valid, width, centred)
     weight = residuals.level[use].square().reciprocal()
-    # of the known motion the windows leave a known part
+    # the residual of the known motion contains a part that is known
     known = (residuals.known + linear * (slopes * lost).sum(0))[use].square()
     added = residuals.added[use].square()
     leverage = max(1.0, float((added * weight).sum() / _positive((known * weight).sum())))
@@ -176,7 +176,7 @@ def _visible(
     difference = (slopes * fine).sum(0)
     matrix = of_windows((slopes[:, None] * slopes * weight).flatten(0, 1), windows, centred)
     matrix = matrix.unflatten(0, (windows.dims,) * 2).movedim((0, 1), (-2, -1))
-    # windows with nothing in them follow nothing
+    # windows without texture follow no motion
     least = 1e-3 * matrix.diagonal(dim1=-2, dim2=-1).mean()
     matrix = matrix + _positive(least) * torch.eye(windows.dims).to(matrix)
     means = of_windows(slopes * difference * weight, windows, centred).movedim(0, -1)
@@ -201,7 +201,7 @@ def _products(field: torch.Tensor, valid: torch.Tensor, width: float) -> torch.T
 
 
 def _less(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
-    """A covariance by the fraction of its trace that is not by errors."""
+    """A covariance times the fraction of its trace that is not due to errors."""
     part = 1 - _trace(by_errors) / _positive(_trace(total))
     return total * part.clamp(min=0.0)
 

@@ -66,7 +66,7 @@ def ordered(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     values = vortices[order].copy()
     scale = np.ones_like(values)
     values[:, 3] = np.exp(values[:, 3])
-    # the fit has the logarithm
+    # derivative by the logarithm, which the fit has
     scale[:, 3] = values[:, 3]
     index = np.append(index, vortices.size + fit.state.departures.size)
     size = np.append(scale.ravel(), 1.0)

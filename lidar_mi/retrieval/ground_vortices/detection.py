@@ -34,7 +34,7 @@ _APART, _NEAR = 10.0, 50.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Vortices (n, 4) that a filter likes, and how much: the normalised amplitude."""
+    """Vortices (n, 4) at a maximum of a filter, and its normalised amplitude."""
 
     vortices: np.ndarray
     score: float
@@ -42,7 +42,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What matched filters say of a scan.
+    """Result of the matched filters of a scan.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ def _geometry(windows: _Windows) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Contrasts:
-    """Numbers that a mean wind leaves at zero, independent whatever turbulence and noise are.
+    """Contrasts that a mean wind does not change, independent in any turbulence and noise.
 
     ``basis`` (cells, numbers) makes them of the cells; turbulence of unit variance gives them the
     variances ``turbulent``, noise of unit variance 1 each.
@@ -198,7 +198,7 @@ def _contrasts(
 
 
 def _air(windows: _Windows, lidar: CoherentLidar) -> Air:
-    """Turbulence of most windows that do not overlap: a wake is in few of them."""
+    """Turbulence of most separate windows, of which a wake is in few."""
     whole = np.flatnonzero(windows.usable.all(1))
     chosen = _separate(windows, whole)
     if not chosen.size:
@@ -210,7 +210,7 @@ def _air(windows: _Windows, lidar: CoherentLidar) -> Air:
         noise = windows.noise[chosen][:, None]
         variance = _SIGMAS[:, None, None] ** 2 * some.turbulent + noise
         likelihood.append(-(np.log(variance) + numbers**2 / variance).sum(-1) / 2)
-        # the contrasts of another length are of other sizes: their determinant
+        # the determinant, as contrasts of other lengths differ in scale
         likelihood[-1] = likelihood[-1] + np.linalg.slogdet(some.basis.T @ some.basis)[1] / 2
     each = np.stack(likelihood)
     kind = int(np.median(each.max(1), axis=1).argmax())
@@ -269,7 +269,7 @@ def _few(which: np.ndarray, usable: np.ndarray) -> np.ndarray:
     if len(number) <= _MOST_PATTERNS:
         return which
     by_edge = usable.reshape(len(usable), _ROWS, -1)
-    # of a window within the scan: every row and column has some value
+    # which rows and columns have values
     edges = np.concatenate([by_edge.mean(2) > 0.5, by_edge.mean(1) > 0.5], axis=1)
     return np.unique(edges, axis=0, return_inverse=True)[1].ravel()
 
@@ -366,7 +366,7 @@ def _candidates(
     order = np.argsort(np.where(near, signs, -np.inf), axis=None)[::-1]
     for k in order[: int(near.sum()) * len(signs)]:
         template, place = np.unravel_index(int(k), signs.shape)
-        # as the fit sees it: y and z of both vortices
+        # y and z of both vortices, as in the fit
         mark = np.append(places[:, place], 0.0 if single else separations[template] / 2)
         if any(np.abs(mark - better).max() < _APART for better in taken):
             continue

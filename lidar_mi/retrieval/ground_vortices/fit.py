@@ -39,7 +39,7 @@ _LEAST_TURBULENCE, _MOST_TURBULENCE = 0.01, 5.0  # m/s
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What a fit takes for given.
+    """What a fit assumes.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ def fitted(
         ends.append((first.normal(state, factor, air)[0], state))
     ends.sort(key=lambda end: end[0])
     best = ends[0][1]
-    # times and heights about those of the vortices that were found
+    # times and heights relative to the fitted vortices
     vortices = best.vortices
     problem = replace(
         first, time=crossing_time(window, vortices), reference=float(vortices[:, 1].mean())
@@ -256,7 +256,7 @@ class Problem:
             )
             value += swirl
             slope[OF_VORTEX * k : OF_VORTEX * (k + 1)] += by[:4]
-            # every number moves the vortices
+            # every parameter changes the vortices' motion
             slope[-len(state.wind) - 1] += by[4]
             moved = by[5:] + by[:2] * since
             slope += np.tensordot(speed_by[k].T, moved, 1)
@@ -324,7 +324,7 @@ class Problem:
         return state, False
 
     def _limited(self, state: State, tried: State) -> State:
-        """A step of at most half a gate and a factor of 2 in the core, of any number."""
+        """A step limited to half a gate, and to a factor of 2 in the core."""
         move = tried.vortices - state.vortices
         limit = np.array([15.0, 15.0, np.inf, 0.7])
         vortices = state.vortices + np.clip(move, -limit, limit)

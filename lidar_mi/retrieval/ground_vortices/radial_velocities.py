@@ -82,7 +82,7 @@ def _place(scan: PlaneScan, vortex: np.ndarray) -> np.ndarray | None:
     whole = np.isfinite(part).any(0)
     if not whole.any() or lines.size < 5:
         return None
-    # white noise alone makes extremes: three lines together
+    # means of three lines, as noise alone makes extremes
     smooth = np.stack([part[:-2], part[1:-1], part[2:]]).mean(0)
     differences = np.where(whole, np.nanmax(smooth, 0) - np.nanmin(smooth, 0), -np.inf)
     k = int(np.nanargmax(differences))

@@ -102,7 +102,7 @@ def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan]
     for number in np.unique(sweep):
         whole = np.flatnonzero(sweep == number)
         swept = lines.isel(time=whole)
-        # in the plane, where an azimuth that turns at the zenith is no turn
+        # angles in the plane do not jump at the zenith, as azimuths do
         azimuth, elevation = (np.deg2rad(swept[name].values) for name in ("azimuth", "elevation"))
         forward = np.cos(elevation) * np.cos(azimuth - common)
         for part in _passes(np.arctan2(np.sin(elevation), forward), swept["time"].values):
@@ -140,7 +140,7 @@ def _passes(angle: np.ndarray, time: np.ndarray) -> list[slice]:
         else:
             way = signs[k]
     ends = [*starts[1:], len(angle)]
-    # an angle that jitters by more than its steps turns all the time
+    # jitter larger than the steps looks like turns: one pass
     if len(angle) < _LEAST_LINES * len(starts):
         return [slice(None)]
     return [slice(start, end) for start, end in zip(starts, ends, strict=True)]

@@ -74,7 +74,7 @@ def shape(square: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
     decay = np.exp(-a * s)
     value = (1 - decay) / s
     slope = (a * decay - value) / s
-    # below: the series, to 1e-8
+    # the series for small s, exact to 1e-8
     small = square < _SMALL
     value = np.where(small, a - a**2 * square / 2, value)
     return value, np.where(small, -(a**2) / 2 + a**3 * square / 3, slope)
@@ -122,7 +122,7 @@ def motion(
         square = np.exp(-2 * core)[..., None, :]
         omega = shape((dy**2 + dz**2) * square, model)[0] * square
         omega = omega * strength[..., None, :] / (2 * np.pi)
-        # none on itself: at no distance it is zero
+        # zero for the vortex itself, at distance 0
         v, w = v - (omega * dz).sum(-1), w + (omega * dy).sum(-1)
     return np.stack([v, w], -1)
 

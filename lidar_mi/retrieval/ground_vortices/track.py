@@ -92,7 +92,7 @@ def _predicted(
     ground: float | None,
     model: Model,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """State after a time, its derivatives and the covariance of what is unknown of the motion."""
+    """State after a time, its derivatives and the covariance of the process noise."""
     step = 1e-5 * np.maximum(np.abs(state), 1.0)
     both = np.concatenate([[state], state + np.diag(step), state - np.diag(step)])
     after = _moved(both, dt, ground, model)

@@ -73,7 +73,7 @@ class Window:
 
     @property
     def height(self) -> np.ndarray:
-        """Of the cells above the lidar, m."""
+        """Height of the cells above the lidar, m."""
         return self.lines.ranges[self.gate] * np.sin(self.lines.angle[self.line])
 
 

@@ -105,7 +105,7 @@ def _suspicious(design: np.ndarray, velocity: np.ndarray, interval: float) -> bo
 
 
 def _likeliest(design: np.ndarray, velocity: np.ndarray, interval: float) -> np.ndarray:
-    """Of horizontal winds on a grid an eighth of the interval apart along the lines."""
+    """Likeliest horizontal wind of a grid with steps of an eighth of the interval."""
     slant = float(np.hypot(design[:, 0], design[:, 1]).max())
     step = interval / (8 * max(slant, 1e-3))
     side = step * np.arange(-np.ceil(_FASTEST / step), np.ceil(_FASTEST / step) + 1)
@@ -135,7 +135,7 @@ def ambiguous(design: np.ndarray, wind: np.ndarray, nyquist: float | None) -> bo
         return False
     slant = np.hypot(design[:, 0], design[:, 1])
     inclined = design[slant > 0.1 * slant.max()]
-    # opposite lines fold by opposite numbers: any line of the horizontal ones
+    # opposite lines fold by opposite numbers: one line is enough
     alias = 2 * nyquist * inclined[:, :2] / (slant[slant > 0.1 * slant.max()] ** 2)[:, None]
     others = np.concatenate([wind[:2] + alias, wind[:2] - alias])
     same = (2 * nyquist) * np.round((others - wind[:2]) @ design[:, :2].T / (2 * nyquist))

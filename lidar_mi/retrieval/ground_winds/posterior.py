@@ -68,7 +68,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What levels that share their turbulence tell of it.
+    """Posterior of the turbulence that levels share.
 
     Attributes
     ----------

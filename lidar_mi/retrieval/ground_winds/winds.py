@@ -123,7 +123,7 @@ def fit_winds_to_lines(
         )
     if tilt > 0:
         for profile in profiles:
-            # its direction is not known
+            # the tilt's direction is unknown
             profile.covariance[:, 2, 2] += tilt**2 * (profile.wind[:, :2] ** 2).sum(1)
         remarks.append(
             f"pitch and roll of up to {np.rad2deg(tilt):.2f} degrees are not applied: the error of "
@@ -208,7 +208,7 @@ class _Cells:
 def _cells(scan: xr.Dataset, usable: np.ndarray, step: float | None) -> _Cells | None:
     if usable.sum() < 3:
         return None
-    # gates above and below are no levels
+    # gates beyond the usable ones form no levels
     present = np.isfinite(scan["radial_velocity"].values) & usable.any(0)
     line, gate = np.nonzero(present)
     sine = np.sin(np.deg2rad(scan["elevation"].values))
@@ -222,7 +222,7 @@ def _cells(scan: xr.Dataset, usable: np.ndarray, step: float | None) -> _Cells |
         heights = number * step
     spacing = np.median(np.diff(heights)) if heights.size > 1 else np.inf
     length = float(scan.attrs.get("gate_length", 0.0)) * float(sine.max())
-    # at most the whole profile: also where the file's length of a gate makes no sense
+    # at most the whole profile, whatever gate length the file states
     stride = int(np.clip(math.ceil(length / spacing - 0.1), 1, heights.size))
     level, count = level.ravel(), np.bincount(level.ravel())
     used = usable[line, gate]
@@ -246,7 +246,6 @@ def _profile(
         ],
         axis=-1,
     )
-    # of all usable cells
     velocity = scan["radial_velocity"].values.astype(float)[cells.line, cells.gate]
     seconds = (scan["time"].values - scan["time"].values[0]) / np.timedelta64(1, "s")
     count = cells.heights.size
@@ -372,7 +371,7 @@ def _level(
     order = np.lexsort((azimuth, steep))
     design, places, velocity, noise = (array[order] for array in (design, places, velocity, noise))
     many = math.ceil(len(velocity) / _MOST_LINES)
-    # of very many lines, neighbours are one line
+    # neighbours among very many lines are averaged
     every = Level(design, places, path, np.arange(0, len(velocity), many), velocity, noise)
     design, places, velocity = (every.averaged(array) for array in (design, places, velocity))
     size = math.ceil(len(velocity) / _MOST)

@@ -51,12 +51,12 @@ class Filter(NamedTuple):
     noisy_slopes: float
 
     def of_values(self) -> "Filter":
-        """That of the differences alone."""
+        """The filter of the differences alone."""
         passed = self.passed if self.values is self.gain else 1.0
         return self._replace(gain=self.values, passed=passed)
 
     def of_slopes(self) -> "Filter":
-        """That of the slopes alone."""
+        """The filter of the slopes alone."""
         return self._replace(gain=self.slopes)
 
     def to(self, like: torch.Tensor) -> "Filter":
@@ -219,7 +219,7 @@ def flat_if_better(
 
 
 def _mean(values: torch.Tensor, sizes: Sequence[int]) -> float:
-    """Over all waves, of values at those of a real Fourier transform."""
+    """Mean over all waves of values at those of a real Fourier transform."""
     # all but the first column stand for two waves
     return float(values[..., :1].sum() + 2 * values[..., 1:].sum()) / math.prod(sizes)
 

@@ -168,7 +168,7 @@ def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArra
 
 
 def all_on_one_grid(images: Sequence[xr.DataArray]) -> list[xr.DataArray]:
-    """A sequence of images, two or more, as `on_one_grid` has two; messages count from 1."""
+    """`on_one_grid` for a sequence of two or more images; messages count from 1."""
     for number, image in enumerate(images, 1):
         on_axes = {"z", "y"} == set(image.dims) <= set(image.coords)
         if not on_axes or image.ndim != 2 or min(image.shape) < 2:

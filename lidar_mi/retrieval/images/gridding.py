@@ -153,9 +153,9 @@ def _resampling_error(
         error[changed[part]] = variance(structure(speed), factors[part], from_node, when[part])
     error[changed] *= strength_at(errors, nodes[changed])
     error[changed] *= correlation_area(places, nodes[changed])
-    # what a node's noise shares with that of its neighbours, beyond its own
+    # covariance of a node's noise with that of the other nodes
     shared = weights @ weights.sum(0) - weights.power(2).sum(1)
-    # of sums, as the scatter from node to node is as often negative
+    # a local mean, as single nodes may have a negative sum
     _, around = KDTree(nodes[changed]).query(nodes[changed], min(_BEAMS, len(changed)))
     shared = shared[around].reshape(len(changed), -1).mean(1)
     error[changed] += errors.noise * np.clip(shared, 0.0, None)
@@ -183,7 +183,7 @@ def _leave_one_out(
 
 
 def _weights(places: np.ndarray, nodes: np.ndarray) -> csr_array:
-    """Of every beam for the value at every node, (nodes, beams); places in spacings."""
+    """Weight of every beam in the value at every node, (nodes, beams); places in spacings."""
     beams = min(_BEAMS, len(places))
     _, near = KDTree(places).query(nodes, beams)
     weights = _weights_of(places, nodes, near.reshape(len(nodes), beams))
@@ -192,7 +192,7 @@ def _weights(places: np.ndarray, nodes: np.ndarray) -> csr_array:
 
 
 def _weights_of(places: np.ndarray, nodes: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Of the beams of numbers near (nodes, beams), for the value at every node."""
+    """Weights of the beams `near` (nodes, beams) in the value at every node."""
     beams = near.shape[1]
     weights = np.zeros(near.shape)
     for start in range(0, len(nodes), _CHUNK):
@@ -212,7 +212,7 @@ def _weights_of(places: np.ndarray, nodes: np.ndarray, near: np.ndarray) -> np.n
 
 
 def _covariance(separation: np.ndarray) -> np.ndarray:
-    """Of the structure at two places, by their distance (..., 2) in spacings."""
+    """Covariance of the structure at a distance (..., 2) in spacings."""
     return np.exp(-0.5 * (separation**2).sum(-1) / _LENGTH**2)
 
 

@@ -1,4 +1,4 @@
-"""Values for pixels that are not known, for filters alone: the smoothest ones."""
+"""The smoothest values for unknown pixels, used by filters only."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ _TENSION = 0.1
 
 
 def inpainted(values: np.ndarray) -> np.ndarray:
-    """Values with smooth ones in place of those that are not finite.
+    """Values with smooth ones in place of non-finite ones.
 
     These minimise the sum of the squared second differences along the axes and, so that slopes do
     not go on for long, of a tenth of the squared first ones: a thin plate under tension (Smith &

@@ -63,9 +63,9 @@ def check_between(name: str, value: float, low: float, high: float) -> None:
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
 # noise: (1/2) from the difference times (1 + 4 + 1) / 16 from the smoothing across it.
 _SOBEL_NOISE = 3 / 16
-# By which texture exceeds its thresholds that exceeds them clearly.
+# Factor by which clear texture exceeds its thresholds.
 _MARGIN = 1.5
-# Standard error, px, that is no reason to reject a vector in any wind.
+# Standard error, px, up to which no vector is rejected.
 SMALL = 0.05
 
 

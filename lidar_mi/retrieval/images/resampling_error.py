@@ -58,14 +58,14 @@ class Pairs(NamedTuple):
 
 
 def pairs(places: np.ndarray, times: np.ndarray) -> Pairs:
-    """Of every beam with its nearest ones; places (n, 2) in spacings, times (n,) in s."""
+    """Pairs of every beam with its nearest ones; places (n, 2) in spacings, times (n,) in s."""
     _, near = KDTree(places).query(places, min(_NEIGHBOURS + 1, len(places)))
     near = near[:, 1:]
     return Pairs(places[near] - places[:, None], times[near] - times[:, None], near)
 
 
 def variogram(values: np.ndarray, near: Pairs) -> Variogram:
-    """The one that fits the differences of neighbouring beams best (Cressie 1985).
+    """The variogram that fits the differences of neighbouring beams best (Cressie 1985).
 
     Bins of distance and time count by their number of pairs over the square of the model (Cressie
     1985, Math. Geol. 17, 563-586). What no distance explains is the noise.
@@ -135,7 +135,7 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
 
 
 class LeaveOneOut(NamedTuple):
-    """Beams as their neighbours estimate them.
+    """Beams estimated from their neighbours.
 
     Places (n, 2), squared errors without noise (n,), and what these are for `structure` of
     strength 1 (n,); the noise of a beam and the strength in the mean.
@@ -149,7 +149,7 @@ class LeaveOneOut(NamedTuple):
 
 
 def structure(speed: float) -> Variogram:
-    """Of strength 1 and the length for which beams are weighted, rough beyond it."""
+    """Variogram of strength 1 and the length for which beams are weighted."""
     return Variogram(1.0, _LENGTH, 1.0, speed, 0.0)
 
 
@@ -168,7 +168,7 @@ def leave_one_out(
     means = [np.bincount(index, part) for part in (square, noisy, expected)]
     observed, by_noise, by_air = (part[number > 0] / number[number > 0] for part in means)
     observed = np.maximum(observed, 1e-300)
-    # divided by what was seen: bins of close beams, which show the noise, count as much as others
+    # relative to the observed: bins of close beams, which show the noise, weigh as much as others
     matrix = np.stack([by_noise / observed, by_air / observed], 1)
     scale = np.maximum(matrix.max(0), 1e-300)
     (noise, strength), _ = nnls(matrix / scale, np.ones(len(observed)))

@@ -52,11 +52,11 @@ class Spline(NamedTuple):
     settings: FilterSettings
 
     def only(self, number: int) -> "Spline":
-        """That of one of the images."""
+        """The spline of one of the images."""
         return self._replace(coefficients=self.coefficients[number : number + 1])
 
     def stacked_with(self, other: "Spline") -> "Spline":
-        """With the images of another one after the same filter."""
+        """The spline with the images of another one, after the same filter."""
         return self._replace(coefficients=torch.cat([self.coefficients, other.coefficients]))
 
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
@@ -98,7 +98,7 @@ class Spline(NamedTuple):
         return value, *(self.settings.nodes * slope for slope in slopes)
 
     def values(self, *place: torch.Tensor) -> torch.Tensor:
-        """The first of `sample` alone."""
+        """Values of `sample` without slopes."""
         at = self._in_nodes(place)
         if len(at) == 2:
             return _read_images(self.coefficients, at[0], at[1], slopes=False)[0]
@@ -346,7 +346,7 @@ def filtered_splines(
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
     )
-    # stored of images for the next ones, as the shells are
+    # cached for images only
     factor = _through_nodes if len(dims) == 2 else _through_nodes.__wrapped__
     through = factor(tuple(sizes), finer, images.dtype, images.device)
     keep = [slice(finer * (n + 2 * margin)) for n in shape]

@@ -119,7 +119,7 @@ class Rings(Tabular):
         """
         lines = len(self.fraction)
         table = np.full((self.order.max() + 2, lines), np.nan)
-        # a component that passes the centre first belongs to the order outside
+        # a component that passes the centre first belongs to the next order
         table[self.order, self.line] = self.radius**2
         split = table[:, 1:] - table[:, :1]
         return split[np.isfinite(split).any(1)]
@@ -289,7 +289,7 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
 
 
 def _explains(pattern: Pattern, noise: float) -> bool:
-    """Whether all of the profile but noise is of the pattern."""
+    """Whether the pattern explains the profile to its noise."""
     return pattern.unexplained - 2 * noise * pattern.freedom <= UNEXPLAINED * pattern.power
 
 

@@ -1,4 +1,4 @@
-"""An instrument as frames of a known line show it: stored in a file, given to the ring fit."""
+"""An instrument calibrated from frames of a known line: stored in a file, used by the ring fit."""
 
 import json
 import math

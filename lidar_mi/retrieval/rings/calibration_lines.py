@@ -37,7 +37,7 @@ def combined(
     achromatic: bool = True,
     tolerances: Mapping[str, float] = TOLERANCES,
 ) -> Calibration:
-    """The instrument of the first line, with its gap and what the other lines say of it.
+    """The instrument of the first line, with its gap, from all lines.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def combined(
         _check_same(lines[0], line, parts[0], part, achromatic)
     information = parts[0].information + sum(p.determined for p in parts[1:])
     covariance = np.linalg.inv(information)
-    # of departures from the first line's, so that numbers of different size cause no loss
+    # as departures from the first line, so that no digits are lost
     step = covariance @ sum(p.determined @ (p.value - parts[0].value) for p in parts[1:])
     common = parts[0].value + step
     slopes, independent, fraction = [], [], []
@@ -184,7 +184,7 @@ def _per_order(line: Calibration) -> float:
 def _moved(
     line: Calibration, part: _Geometry, step: np.ndarray, covariance: np.ndarray
 ) -> Calibration:
-    """A calibration after its shared part is moved by a step, with what is correlated to that."""
+    """A calibration after a step of its shared part and of the parameters correlated with it."""
     gain = line.systematic[:, part.places] @ part.information
     change = dict(zip(("v_los", *INSTRUMENT), gain @ step, strict=True))
     systematic = line.systematic - gain @ (np.linalg.inv(part.information) - covariance) @ gain.T

@@ -133,7 +133,7 @@ def _noise(residual: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def _median(value: np.ndarray) -> np.ndarray:
-    """Over sectors; 0 where there is none."""
+    """Median over sectors; 0 where there is none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # an annulus without cells
         return np.nan_to_num(np.nanmedian(value, 0))

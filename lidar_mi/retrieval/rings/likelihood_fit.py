@@ -307,7 +307,7 @@ def _fit_together(images: torch.Tensor, task: _Task, number: int, method: str) -
 
 
 def _without_spots(fit: RingFit, images: torch.Tensor, task: _Task, number: int) -> RingFit:
-    """Images that fit poorly again, without their hot and dead pixels, if they have any."""
+    """Poorly fitted images fitted again without their hot and dead pixels."""
     for k in (fit.chi_square > POOR).nonzero()[:, 0].tolist():
         bad = spots(images[k].double(), task.noise)
         if 0 < bad.sum() < MOST_SPOTS * bad.numel():
@@ -428,7 +428,7 @@ def _sensitivity(waves: Waves, end: Scored, task: _Task) -> torch.Tensor:
     fisher = torch.diag(information) + fisher_matrix(free, weight)
     moved = torch.linalg.solve(fisher, (free * weight[:, None]) @ known.transpose(1, 2))
     first = moved[:, task.free.index("v_los")]
-    # the zero of the speeds itself moves all of them
+    # an error of the zero shifts all speeds
     return -torch.cat([torch.ones_like(first[:, :1]), first], 1)
 
 

@@ -81,7 +81,7 @@ class MatchedScore:
 
 @dataclass(frozen=True, eq=False)
 class MatchedRead:
-    """What was read, tensors of shape (images,) unless stated, float64.
+    """Retrieved values, tensors of shape (images,) unless stated, float64.
 
     Attributes
     ----------
@@ -198,7 +198,7 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
 
 
 def _read(means: torch.Tensor, score: MatchedScore) -> tuple[torch.Tensor, ...]:
-    """Of some images the parameters from the cells' centre, their errors, chi-square, and an end.
+    """Parameters of some images from the cells' centre, errors, chi-square, and convergence.
 
     From means (images, cells) to (images, `PARAMETERS`), (images, names), (images,) and whether
     the last step was small, (images,). An image whose last step was small is not looked at again.

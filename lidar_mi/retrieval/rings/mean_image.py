@@ -178,12 +178,12 @@ def mean_and_jacobian(
     lean = _lean(model, torch.addcmul(r2, falloff, waves.variance, value=-1 / area))
     centre = model.order_at_centre
     moved = torch.add(centre % 1 - waves.order, lean, alpha=centre)
-    # the speed itself turns all waves alike, below: here is how that falls off with the angle
+    # the phase by the speed on the axis is applied below: this is its decrease with the angle
     moved.addcmul_(v / model.velocity_range, lean)
     amplitudes, by = model.amplitudes(parameters)
     n = torch.arange(1, amplitudes.shape[1] + 1, dtype=torch.float64, device=v.device)
     turned = torch.polar(torch.ones_like(v), 2 * math.pi * v / model.velocity_range) ** n
-    # of the Taylor series in the order
+    # terms of the Taylor series in the order
     powers = torch.stack([(2j * math.pi * n) ** k / math.factorial(k) for k in range(4)])
     terms = _product((powers[:, None] * (amplitudes * turned)).flatten(0, 1), waves.waves).chunk(4)
     profile = terms[3]
@@ -366,7 +366,7 @@ def _disc(square: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     Both are entire functions of z^2, so that a fit may pass through 0; below it they are modified
     Bessel functions.
     """
-    # next to 0 differences of numbers next to each other: the series is exact to 1e-9
+    # the closed forms cancel near 0: there the series is exact to 1e-9
     value = 1 - square / 8 + square**2 / 192
     slope = -1 / 8 + square / 96 - square**2 / 3072
     for side, zeroth, first, sign in (

@@ -82,10 +82,10 @@ def _harmonics(phase: np.ndarray, loss: float, spread: np.ndarray) -> np.ndarray
     """exp(-n loss - n^2 spread + 2 pi i n phase) from n = 1 on, complex, (n, annuli)."""
     n = np.arange(1, MOST_HARMONICS + 1)
     weight = np.exp(-n * loss - n**2 * spread.min())
-    # those after the last that counts, in P or in a derivative
+    # harmonics that neither P nor a derivative needs
     small = np.flatnonzero((weight < 1e-5) & (n * weight < 1e-4))
     waves = np.empty((small[0] + 1 if small.size else len(n), len(phase)), complex)
-    # from one to the next: exp(-n^2 spread) falls by exp(-(2 n - 1) spread)
+    # recursion: exp(-n^2 spread) falls by exp(-(2 n - 1) spread)
     factor = np.exp(2j * np.pi * phase - loss - spread)
     fall = np.exp(-2 * spread)
     before = np.ones(1)
@@ -207,7 +207,7 @@ class Profile:
         best = made(solution.x)
         residual, columns, linear = self.residual(best)
         wave = columns[:, 3:] @ linear[3:]
-        # power of the pattern alone: the part that a background would explain is not its own
+        # power of the pattern less the part that a background would explain
         basis = np.linalg.qr(columns[:, :3])[0]
         wave = wave - basis @ (basis.T @ wave)
         per_line = linear[3:].reshape(lines, -1)

@@ -161,7 +161,7 @@ def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
         return None
     usual = np.quantile(height[firm], 0.8)
     which = height + 3 * std < HIDDEN * usual
-    # the edge of what hides them runs through their neighbours
+    # the obstacle's edge runs through the neighbours
     which |= np.roll(which, 1, 0) | np.roll(which, -1, 0)
     return Hidden(pattern.spacing, fraction, which) if which.any() else None
 
@@ -213,7 +213,7 @@ class _System:
         q1 = q / q[-1]
         smooth = np.stack([np.ones_like(q), np.sqrt(q1), q1, total, q1 * total], -1)
         smooth = np.repeat(smooth[None], SECTORS, 0)
-        # about a single ring, a height that changes is hardly another than a shift
+        # for a single ring a height gradient is hardly different from a shift
         extent = np.where(sectors.used > 0, q, 0).max(1)
         smooth[extent < TWO_RINGS * pattern.spacing, :, 4] = 0
         root = np.sqrt(sectors.used)

@@ -28,7 +28,7 @@ Variable = tuple[Sequence[str], np.ndarray, dict[str, Any]]
 
 
 def spacing(image: xr.DataArray) -> tuple[float, ...]:
-    """Of the pixels along every dim, m."""
+    """Spacing of the pixels along every dim, m."""
     nodes = [image.coords.variables[axis].values.astype(float) for axis in image.dims]
     return tuple(float((n[-1] - n[0]) / (len(n) - 1)) for n in nodes)
 
@@ -65,7 +65,7 @@ def winds(
 
     Parameters
     ----------
-    found : Displacement
+    displacement : Displacement
     axes : sequence of str
         Of its components.
     steps : sequence of float

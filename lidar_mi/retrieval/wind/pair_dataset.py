@@ -102,7 +102,7 @@ def _options(method: Method, given: PairInput, validation: VectorValidation) -> 
 
 
 def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str, Any]:
-    """What was found in the images, of which nothing is said where there is nothing."""
+    """Remarks on the images; none where there is nothing to remark."""
     pattern = vectors.pattern
     patterns = [str(part) for part in (clean.defects.pattern, pattern) if str(part)]
     said = {

@@ -1,4 +1,4 @@
-"""What a retrieval from images is given, checked and as tensors."""
+"""Input of a retrieval from images, checked and as tensors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -89,7 +89,7 @@ def checked_input(
 
 
 def _in_pixels(blur: float, image: xr.DataArray) -> float:
-    """From m to px."""
+    """The blur in px, from m."""
     if not 0 <= blur < np.inf:
         raise InputError(f"blur: {blur!r} m is not allowed; expected a standard deviation >= 0")
     z, y = (np.ptp(image[name].values) / (image.sizes[name] - 1) for name in ("z", "y"))

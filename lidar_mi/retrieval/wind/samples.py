@@ -46,7 +46,7 @@ def samples_of(image: xr.DataArray, structure: Sampling) -> xr.DataArray:
     for name, step, first, middle in zip(
         map(str, image.dims), structure.steps, structure.first, structure.middle, strict=True
     ):
-        # without a middle a sample is one pixel of each kind, whole without the others
+        # without a middle one pixel of each kind is a whole sample
         last = image.sizes[name] - (step - 1 if middle else 0)
         parts[name] = slice(first, last, step)
         axis = image[name]

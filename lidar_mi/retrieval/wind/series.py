@@ -125,7 +125,7 @@ def retrieve_winds(
             return error
 
     pixels = shared[0].size
-    # threads share what a device other than the processor does
+    # threads would share a GPU
     side_by_side = pixels <= SMALL and device_of(options.get("device", "cpu")).type == "cpu"
     results: list[xr.Dataset | InputError] = []
     each = in_turn(of_pair, chosen) if side_by_side else (of_pair(pair) for pair in chosen)
@@ -141,7 +141,7 @@ def retrieve_winds(
         [_of_pair(wind, winds[0], times[a]) for (a, _), wind in zip(chosen, results, strict=True)],
         "time",
         combine_attrs="drop_conflicts",
-        # also where all pairs have theirs at the windows' centres
+        # concatenated even where they are equal in all pairs
         coords=["y_vector", "z_vector"],
         compat="equals",
     )
@@ -161,7 +161,7 @@ def retrieve_winds(
 
 
 def _unstacked(name: str, images: Sequence[xr.DataArray] | xr.DataArray) -> Sequence[xr.DataArray]:
-    """Images one by one: those of a stack along its first dimension."""
+    """A sequence of images, or those of a stack along its first dimension."""
     if not isinstance(images, xr.DataArray):
         return images
     if images.dims[1:] != ("z", "y"):
@@ -173,7 +173,7 @@ def _unstacked(name: str, images: Sequence[xr.DataArray] | xr.DataArray) -> Sequ
 
 
 def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[tuple[int, int]]:
-    """The pairs asked for, each of them within the sequence and in order."""
+    """The pairs as given or by default, checked."""
     if count < 2:
         raise InputError(f"images: {count} are not allowed; expected two or more")
     chosen = list(pairwise(range(count))) if pairs is None else list(pairs)
@@ -189,7 +189,7 @@ def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[
 
 
 def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
-    """Of each image from the first, s."""
+    """Reference time of each image from the first, s."""
     steps = list(dt) if isinstance(dt, Sequence) else [dt] * (count - 1)
     if len(steps) != count - 1:
         raise InputError(
@@ -197,7 +197,7 @@ def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
             f"{count - 1}"
         )
     whole = np.cumsum([0.0, *(positive("dt", step) for step in steps)])
-    # sums of steps such as 0.1 s have no digits of rounding
+    # rounded, so that sums of steps such as 0.1 s are exact
     return [float(f"{time:.12g}") for time in whole]
 
 
@@ -220,7 +220,7 @@ def _of_pair(result: xr.Dataset | InputError, like: xr.Dataset, start: float) ->
 
 
 def _nothing(like: xr.Dataset) -> xr.Dataset:
-    """A wind without a vector on the grid of another."""
+    """A wind without vectors on the grid of another."""
     empty = {
         name: xr.full_like(values, Flag.NO_MATCH.value if name == "flag" else np.nan)
         for name, values in like.data_vars.items()

@@ -99,7 +99,7 @@ def standard_errors(
         outlier = outlier | _outliers(d, use, width)
         use = d.isfinite().all(0) & ~outlier
     ones = torch.ones_like(use)
-    # of a mean over a Gaussian, by windows that do not overlap; two components each
+    # independent differences in a Gaussian mean: separate windows, two components
     number = 4 * np.pi * _WIDTH**2 * 2 * averaged(use.to(d), ones, width)
     student = torch.where(number > 2 * _FEWEST, number / (number - 2), torch.nan)
     spread = _mean_square(d, use, width) * student
@@ -140,7 +140,7 @@ def _outliers(d: torch.Tensor, use: torch.Tensor, width: float) -> torch.Tensor:
     weight = averaged(use.to(d), torch.ones_like(use), width)
     others = _mean_square(d, use, width) * weight - centre * used[:, None] * used[None]
     others = (others / (weight - centre * use).clamp(min=1e-12)).movedim((0, 1), (-2, -1))
-    # no difference at all around: whatever differs is far away
+    # where all others are 0, any difference is an outlier
     others = others + 1e-12 * torch.eye(2, dtype=d.dtype)
     column = used.movedim(0, -1)[..., None]
     return (column * torch.linalg.solve(others, column)).sum((-2, -1)) > _FAR**2

@@ -23,7 +23,7 @@ _PLACES = ("y_reported", "z_reported")
 _MIXED = 0.01
 # Beams that are next to each other.
 _NEIGHBOURS = 9
-# Images of one instant that are made one from the other.
+# Rounds of advection.
 _ROUNDS = 2
 # Pixels: the wind only has to be right to a few per cent, as it counts for half a scan at most.
 _TEMPLATE, _STRIDE = 16, 4
@@ -117,7 +117,7 @@ def advected(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
 
 
 def _winds(images: Sequence[xr.Dataset], steps: Sequence[float], name: str) -> list[Wind]:
-    """Of every image: from it to the next one, of the last from the one before."""
+    """Wind of every image: from it to the next one; of the last, from the one before."""
     pairs = zip(images[:-1], images[1:], steps, strict=True)
     winds = [_wind(pair, dt, name) for *pair, dt in pairs]
     return [*winds, winds[-1]]

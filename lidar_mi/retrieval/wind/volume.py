@@ -245,7 +245,7 @@ def _displacements(
 def without_attenuation(
     volumes: Sequence[torch.Tensor], noise: float | torch.Tensor | None = None
 ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-    """Volumes over their own brightness c exp(a x) less 1, and the noise of the first likewise.
+    """Volumes divided by their brightness c exp(a x), less 1, and the noise of the first likewise.
 
     The brightness is fitted to the means of the gates, so that attenuation through the volume
     causes no displacement. Non-finite voxels stay so.
