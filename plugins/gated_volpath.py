@@ -277,7 +277,7 @@ def define() -> type:
             trace = self._gated if self.estimator == "gated" else self._analog
             size = beams * gates * quantities
             before, arrays = stored_passes(self.batches, self.samples_per_pass, size)
-            image = _float(arrays.get("image"), size)
+            image = mi.Float(arrays["image"]) if "image" in arrays else dr.zeros(mi.Float, size)
             done, total = 0, _moments(arrays)
             # of the finished pixels that receive light: how many there are, and how many of them
             # have an unreliable standard error
@@ -638,11 +638,6 @@ def _nothing_freed() -> Iterator[None]:
 def _opaque(number: float) -> Float:
     """A number that changes from scan to scan without being compiled into a kernel."""
     return dr.opaque(mi.Float, number)
-
-
-def _float(values: np.ndarray | None, size: int) -> Float:
-    """An array of floats, zero where there are none yet."""
-    return dr.zeros(mi.Float, size) if values is None else mi.Float(values)
 
 
 def _arrays(

@@ -504,14 +504,12 @@ class Lidar:
         """Tangent of half the widest angle between a direction and one of the field of view."""
         local = axes.to_local(away)
         vertex = dr.norm(local.xy) / (1 + local.z)
-        field = self._half_fov()
+        # the tangent of half the angle
+        field = self.field_tan / (1 + dr.sqrt(1 + dr.square(self.field_tan)))
         return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
     def _in_view(self, axes: Frame, to_source: Vector) -> Mask:
         return self.sensor.in_field_of_view(axes, to_source, self.field_tan)
-
-    def _half_fov(self) -> Float:
-        return self.field_tan / (1 + dr.sqrt(1 + dr.square(self.field_tan)))
 
     def _last_flight(
         self,

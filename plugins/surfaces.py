@@ -79,8 +79,9 @@ class Air:
                 body.inside = self.around
         dr.make_opaque(self.around)
         # an open surface encloses nothing: behind it there may be air at any distance
-        everywhere = around is not None or self.sheets
-        self.bounds = _everywhere() if everywhere else (self.low, self.high)
+        self.bounds = self.low, self.high
+        if around is not None or self.sheets:
+            self.bounds = dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)
 
     def crossings(self, origin: Point, direction: Vector) -> Crossings:
         """Crossings of each body with a line, and the distance of the first opaque surface."""
@@ -259,7 +260,3 @@ def _check_fronts(
                     name_of(medium),
                     "behind this surface, as light of the telescope comes from another medium",
                 )
-
-
-def _everywhere() -> tuple[Point, Point]:
-    return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)

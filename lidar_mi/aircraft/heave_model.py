@@ -82,7 +82,9 @@ class HeaveModel:
         wind = np.array([loads.force[2], loads.moment[1], loads.moment[0]])
         start, end = (np.concatenate([wind, controls]) for controls in (before, self._deflections))
         flow, constant, ramp = self._step(dt)
-        now = flow @ self._array(state) + constant @ start + ramp @ (end - start)
+        vector = [state.z, state.vertical_speed, state.pitch]
+        vector += [state.pitch_rate, state.roll, state.roll_rate]
+        now = flow @ vector + constant @ start + ramp @ (end - start)
         self.state = self._after(state, dt, now, end, loads)
         return self.state
 
@@ -90,9 +92,6 @@ class HeaveModel:
     def _deflections(self) -> np.ndarray:
         """Aileron, elevator, symmetric aileron, rad."""
         return np.array([self.deflection[0], self.deflection[1], self.symmetric])
-
-    def _array(self, s: AircraftState) -> np.ndarray:
-        return np.array([s.z, s.vertical_speed, s.pitch, s.pitch_rate, s.roll, s.roll_rate])
 
     def _equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Per state, and per force, pitching and rolling moment, aileron, elevator, symmetric."""
