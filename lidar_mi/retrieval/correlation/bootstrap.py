@@ -182,7 +182,7 @@ def bootstrap_covariance(
             image.nan_to_num() - again_moved.image,
             level,
             moved.slopes,
-            compared & _between(valid, coarse),
+            compared & _among_valid(valid, coarse),
         ),
         Motion(wind - mean, float(response), on - of_windows(on, windows, centred)),
         coarse,
@@ -197,7 +197,7 @@ def bootstrap_covariance(
     scaled = error / noise_variance.sqrt()
     rows = [[averaged(a * b, use, width) for b in scaled] for a in scaled]
     covariance = finer.leverage * torch.stack([torch.stack(row) for row in rows]) * noise_variance
-    number = _in_a_mean(windows) * averaged(use.to(error), everywhere, width)
+    number = _windows_per_mean(windows) * averaged(use.to(error), everywhere, width)
     recovered = averaged(use.to(error), textured, _AROUND / _WIDTH * width)
     number = torch.where(recovered < _FOUND, 0.0, number)
     if clear is not None:
@@ -211,7 +211,7 @@ def bootstrap_covariance(
         separable(part, weights) for part in (covariance, finer.covariance)
     )
     number = separable(number, weights)
-    covariance = covariance * _widened(number, windows.dims) + covariance_finer
+    covariance = covariance * _student_factor(number, windows.dims) + covariance_finer
     covariance[:, :, number < _FEWEST] = torch.nan
     least = _LEAST**2 * torch.eye(windows.dims).to(error)
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
@@ -223,7 +223,7 @@ def _unflagged(displacement: Displacement) -> torch.Tensor:
     return (flag == 0) & displacement.d.isfinite().all(0)
 
 
-def _between(valid: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _among_valid(valid: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Pixels all of whose nearest vectors are valid."""
     weights = []
     for axis, n in enumerate(windows.shape):
@@ -233,7 +233,7 @@ def _between(valid: torch.Tensor, windows: Windows) -> torch.Tensor:
     return separable(valid.to(weights[0]), weights) > 1 - 1e-6
 
 
-def _in_a_mean(windows: Windows) -> float:
+def _windows_per_mean(windows: Windows) -> float:
     """Number of separate windows in a local mean, at most those of the image."""
     inside = math.prod(1 + (n - 1) * windows.stride / windows.template for n in windows.count)
     return min(_of_a_mean(windows.dims), inside)
@@ -243,7 +243,7 @@ def _of_a_mean(dims: int) -> float:
     return (2 * math.pi) ** (dims / 2) * _WIDTH**dims
 
 
-def _widened(number: torch.Tensor, dims: int) -> torch.Tensor:
+def _student_factor(number: torch.Tensor, dims: int) -> torch.Tensor:
     """Variance of errors over the squared standard error estimated from so many windows."""
     degrees = dims * number.clamp(min=_FEWEST / 2)
     return degrees / (degrees - 2)

@@ -87,14 +87,14 @@ def first_pass(
     """
     if windows.dims > 2:
         d, centres = _of_volumes(images, spline, windows)
-        return _on(grid, d, centres, continued=True)
+        return _on_grid(grid, d, centres, continued=True)
     coarse, *smaller = window_sizes(windows)
-    d, replaced = _on(grid, *_of_images(images, coarse))
+    d, replaced = _on_grid(grid, *_of_images(images, coarse))
     width = windows.template / 2
     # sheared texture decorrelates in large windows: smaller ones compete with them
     score = _correlation(spline, grid, d, width)
     for size in smaller:
-        smaller_d, filled = _on(grid, *_of_images(images, size))
+        smaller_d, filled = _on_grid(grid, *_of_images(images, size))
         new_score = _correlation(spline, grid, smaller_d, width)
         better = new_score > score + _BETTER
         d, replaced, score = (
@@ -114,7 +114,7 @@ def window_sizes(windows: Windows) -> list[Windows]:
     return sizes
 
 
-def _on(
+def _on_grid(
     grid: Grid, d: torch.Tensor, centres: list[torch.Tensor], continued: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Vectors at some centres, validated, on the whole grid, and where they were replaced."""

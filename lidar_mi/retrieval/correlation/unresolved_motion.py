@@ -117,14 +117,14 @@ def unresolved(
         for part in (lost, motion.response * motion.by_errors)
     )
     if int(use.sum()) < fewest * windows.template**windows.dims:
-        return Unresolved(_less(total, by_errors), 1.0)
+        return Unresolved(_without_errors(total, by_errors), 1.0)
     linear, visible = _visible(residuals, motion.within, windows, valid, width, centred)
     weight = residuals.level[use].square().reciprocal()
     # the residual of the known motion contains a part that is known
     known = (residuals.known + linear * (slopes * lost).sum(0))[use].square()
     added = residuals.added[use].square()
     leverage = max(1.0, float((added * weight).sum() / _positive((known * weight).sum())))
-    resolved = _less(total, leverage * by_errors)
+    resolved = _without_errors(total, leverage * by_errors)
     same = torch.eye(windows.dims).to(total)
     same = same.reshape(*same.shape, *[1] * windows.dims).expand_as(total)
     square = (residuals.given[use].square() - leverage * known) * weight
@@ -170,7 +170,7 @@ def _visible(
     """
     slopes, use = residuals.slopes, residuals.use
     square = _products(windows.of_centres(within), valid, width / windows.stride)
-    level = _between(_trace(square), windows) / windows.dims
+    level = _on_pixels(_trace(square), windows) / windows.dims
     fine = within / _positive(level).sqrt()
     weight = residuals.level.square().reciprocal() * use
     difference = (slopes * fine).sum(0)
@@ -200,7 +200,7 @@ def _products(field: torch.Tensor, valid: torch.Tensor, width: float) -> torch.T
     return torch.stack([torch.stack(row) for row in rows])
 
 
-def _less(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
+def _without_errors(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
     """A covariance times the fraction of its trace that is not due to errors."""
     part = 1 - _trace(by_errors) / _positive(_trace(total))
     return total * part.clamp(min=0.0)
@@ -210,10 +210,10 @@ def _variance_by_motion(
     slopes: torch.Tensor, covariance: torch.Tensor, windows: Windows
 ) -> torch.Tensor:
     """Variance of the images' difference by motion of some covariance at the vectors."""
-    return torch.einsum("i...,j...,ij...->...", slopes, slopes, _between(covariance, windows))
+    return torch.einsum("i...,j...,ij...->...", slopes, slopes, _on_pixels(covariance, windows))
 
 
-def _between(field: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _on_pixels(field: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Values (..., *windows.count) of windows on pixels, linearly."""
     weights = [
         linear_weights(windows.centres(axis).to(field), torch.arange(n).to(field))

@@ -244,7 +244,7 @@ def _scores(
     }
     packed = np.packbits(windows.usable, axis=1)
     _, which = np.unique(packed, axis=0, return_inverse=True)
-    which = _few(which.ravel(), windows.usable)
+    which = _merged_patterns(which.ravel(), windows.usable)
     for p in np.unique(which[which >= 0]):
         at = np.flatnonzero(which == p)
         known_cells = np.asarray(windows.usable[at].all(0))
@@ -260,7 +260,7 @@ def _scores(
     return np.where(known, z / np.sqrt(np.where(known, information, 1)), 0.0), information
 
 
-def _few(which: np.ndarray, usable: np.ndarray) -> np.ndarray:
+def _merged_patterns(which: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Numbers of patterns of usable cells, of which there are at most `_MOST_PATTERNS`.
 
     Of rarer ones, those that lack the same rows or columns have one pattern: what all of them have.

@@ -175,10 +175,10 @@ def _regular(seconds: np.ndarray, clock: float) -> np.ndarray:
 def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: float) -> PlaneScan:
     azimuth, elevation = np.deg2rad(lines["azimuth"].values), np.deg2rad(lines["elevation"].values)
     along = common
-    if not _aside(azimuth, elevation, along) < _OUT_OF_PLANE:
+    if not _out_of_plane(azimuth, elevation, along) < _OUT_OF_PLANE:
         along = _azimuth(azimuth, elevation)
     forward = np.cos(elevation) * np.cos(azimuth - along)
-    aside = _aside(azimuth, elevation, along)
+    aside = _out_of_plane(azimuth, elevation, along)
     if not aside < _OUT_OF_PLANE:
         raise InputError(
             f"{source_name(lines)}: scan {number} leaves the vertical plane of azimuth "
@@ -226,7 +226,7 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
     )
 
 
-def _aside(azimuth: np.ndarray, elevation: np.ndarray, along: float) -> float:
+def _out_of_plane(azimuth: np.ndarray, elevation: np.ndarray, along: float) -> float:
     """Largest distance of the directions from a vertical plane, of unit vectors."""
     return float(np.abs(np.cos(elevation) * np.sin(azimuth - along)).max())
 

@@ -62,16 +62,16 @@ def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.
 
     As it is if it is finite all over, or nowhere.
     """
-    smooth = _of_known(image, inpainted)
+    smooth = _replaced(image, inpainted)
     return smooth if pixels is None else torch.where(pixels, smooth, image)
 
 
 def nearest_in(image: torch.Tensor) -> torch.Tensor:
     """An image with the value of the nearest finite pixel where one is not."""
-    return _of_known(image, nearest_filled)
+    return _replaced(image, nearest_filled)
 
 
-def _of_known(image: torch.Tensor, fill: Callable[[np.ndarray], np.ndarray]) -> torch.Tensor:
+def _replaced(image: torch.Tensor, fill: Callable[[np.ndarray], np.ndarray]) -> torch.Tensor:
     finite = torch.isfinite(image)
     if bool(finite.all()):
         return image

@@ -122,7 +122,7 @@ def calibrate_rings(
     model = replace(
         model, light_degree=light_degree, background_degree=background_degree, centre=centre
     )
-    model = _near(model, whole, tolerances["focal_length"])
+    model = _with_focal_length(model, whole, tolerances["focal_length"])
     given = torch.ones(model.shape, dtype=torch.float64) if response is None else response.double()
     given = torch.where(hot, 0.0, given)
     start = fit_rings(frames, model, noise, centre=centre, response=given, max_chi_square=math.inf)
@@ -174,7 +174,7 @@ class _Fit(_State):
     freedom: int
 
 
-def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
+def _with_focal_length(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
     """The model with the focal length of the steps of r^2 between rings, if that is near."""
     try:
         spacing = analyse_rings(mean.numpy()).spacing

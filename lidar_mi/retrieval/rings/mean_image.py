@@ -125,7 +125,7 @@ def _area(model: RingModel) -> float:
     return PIXEL_R2 + model.blur / 2
 
 
-def _lean(model: RingModel, r2: torch.Tensor) -> torch.Tensor:
+def _cosine_less_one(model: RingModel, r2: torch.Tensor) -> torch.Tensor:
     """Cosine of the angle less 1."""
     tangent2 = (model.pixel / model.focal_length) ** 2 * r2
     secant2 = 1 + tangent2
@@ -175,7 +175,7 @@ def mean_and_jacobian(
     r2 = squared_radius(model, cells, dx, dy)
     light = _light(model, cells, r2, parameters)
     # more light at the inner end of a cell
-    lean = _lean(model, torch.addcmul(r2, falloff, waves.variance, value=-1 / area))
+    lean = _cosine_less_one(model, torch.addcmul(r2, falloff, waves.variance, value=-1 / area))
     centre = model.order_at_centre
     moved = torch.add(centre % 1 - waves.order, lean, alpha=centre)
     # the phase by the speed on the axis is applied below: this is its decrease with the angle

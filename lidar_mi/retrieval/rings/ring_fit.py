@@ -234,7 +234,7 @@ class _System:
             local = linear[:, 3, None] + linear[:, 4, None] * q1
             residual = sectors.value - np.einsum("sqk,sk->sq", smooth, linear)
             residual = residual - local * along_q * sectors.offset
-            keep = keep * _usual(residual, weight)
+            keep = keep * _undisturbed(residual, weight)
         columns = np.concatenate([moved, np.broadcast_to(shared.T, (SECTORS, *shared.T.shape))], -1)
         columns = columns * (local * root * keep)[..., None]
         residual = residual * root * keep
@@ -367,7 +367,7 @@ def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
     return np.array([f[1:] for f in rings]).T
 
 
-def _usual(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _undisturbed(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Cells that are no dust and no reflection: near the median of their annulus."""
     reduced = np.where(weight > 0, residual * weight, np.nan)
     with warnings.catch_warnings():
