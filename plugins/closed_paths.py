@@ -156,8 +156,8 @@ def shortened(end: Vector, direction: Vector, gap: Float) -> Float:
 
     ``end`` is the flight's end less the goal; without the difference of both distances.
     """
-    both = dr.norm(end) + dr.norm(end - direction * gap)
-    return gap * (1 + (2 * dr.dot(direction, end) - gap) / both)
+    total = dr.norm(end) + dr.norm(end - direction * gap)
+    return gap * (1 + (2 * dr.dot(direction, end) - gap) / total)
 
 
 def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[Float, Float]:

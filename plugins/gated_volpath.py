@@ -703,8 +703,8 @@ def _errors(number: Float, deviations: list[Float]) -> list[Float]:
     if len(deviations) == 1:
         return errors
     first, second, mixed, *_ = deviations
-    both = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
-    errors[2] = dr.select(both > 0, dr.clip(mixed / both, -1, 1), 0)
+    product = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
+    errors[2] = dr.select(product > 0, dr.clip(mixed / product, -1, 1), 0)
     return errors
 
 

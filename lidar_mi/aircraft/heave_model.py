@@ -122,13 +122,13 @@ class HeaveModel:
         motion, per_input = self._equations()
         rates = motion @ now + per_input @ inputs
         rise, roll_acceleration = rates[1], rates[5]
-        both = self.heave.bent(now[_HEAVE], inputs[4:], rise)
+        total = self.heave.bent(now[_HEAVE], inputs[4:], rise)
         difference = (
             self._wing_damping * now[5]
             + self.control_moments[0, 0] * inputs[3]
             - self._roll_relief * roll_acceleration
         )
-        port, starboard = loads.bending + np.array([both + difference, both - difference]) / 2
+        port, starboard = loads.bending + np.array([total + difference, total - difference]) / 2
         z, climb, pitch, pitch_rate, roll, roll_rate = map(float, now)
         return replace(
             before,

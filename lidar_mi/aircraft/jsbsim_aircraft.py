@@ -168,13 +168,13 @@ class JSBSimAircraft:
         fdm, (incidence, load_factor) = self._fdm, self._trim
         motion = np.array([0.0, fdm["aero/alpha-rad"] - incidence, fdm["velocities/q-rad_sec"]])
         rise = g * (fdm["accelerations/Nz"] - load_factor)
-        both = self.heave.bent(motion, np.zeros(2), rise)
+        total = self.heave.bent(motion, np.zeros(2), rise)
         difference = (
             self._wing_damping * fdm["velocities/p-rad_sec"]
             + self.control_moments[0, 0] * self.deflection[0]
             - self._roll_relief * fdm["accelerations/pdot-rad_sec2"]
         )
-        port, starboard = by_wind + np.array([both + difference, both - difference]) / 2
+        port, starboard = by_wind + np.array([total + difference, total - difference]) / 2
         return float(port), float(starboard)
 
 

@@ -79,5 +79,6 @@ class RollModel:
         free = rate - tau * (start - slope * tau)
         decay = np.exp(-dt / tau)
         after = tau * (end - slope * tau) + free * decay
-        way = tau * (dt * (start + end) / 2 - slope * tau * dt) - free * tau * np.expm1(-dt / tau)
-        return float(roll + way), float(after)
+        change = tau * (dt * (start + end) / 2 - slope * tau * dt)
+        change -= free * tau * np.expm1(-dt / tau)
+        return float(roll + change), float(after)

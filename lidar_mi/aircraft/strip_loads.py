@@ -60,8 +60,8 @@ class Memory:
         if self._state is None:
             self._state = self._weights * value
         elif dt > 0:
-            way = self._rates * dt
-            decay, mean = np.exp(-way), -np.expm1(-way) / way
+            distance = self._rates * dt
+            decay, mean = np.exp(-distance), -np.expm1(-distance) / distance
             driven = (mean - decay) * self._before + (1 - mean) * value
             self._state = decay * self._state + self._weights * driven
         self._before = value

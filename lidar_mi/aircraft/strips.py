@@ -189,8 +189,8 @@ def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float)
     moment[..., 0] = (pressure * strips.roll_slopes) @ arms[:, 0]
     # what both wings have in common has the first slope, their difference the second
     across = np.where(strips.bends, strips.places[:, 1], 0.0)
-    both, difference = lift @ np.abs(across), (pressure * strips.roll_slopes) @ across
-    bending = np.stack([both + difference, both - difference], -1) / 2
+    total, difference = lift @ np.abs(across), (pressure * strips.roll_slopes) @ across
+    bending = np.stack([total + difference, total - difference], -1) / 2
     return Loads(lift @ strips.normals, moment, bending)
 
 

@@ -36,9 +36,10 @@ def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Contr
     """
     called = f"controller {name_of(maker)}"
     if not _accepts(maker, 1):
-        both = _accepts(maker, 2)
-        given = "a controller itself, of the preview and the state" if both else "other arguments"
-        hint = ": lambda aircraft: the controller" if both else ""
+        given, hint = "other arguments", ""
+        if _accepts(maker, 2):
+            given = "a controller itself, of the preview and the state"
+            hint = ": lambda aircraft: the controller"
         raise InputError(f"{called}: takes {given}; {_MAKER}{hint}")
     try:
         made = maker(aircraft)

@@ -66,15 +66,15 @@ def with_common_error(
     ]
     turned = {"v_stderr": -rotation * arms[1], "w_stderr": rotation * arms[0]}
     for name in turned:
-        both = _hypot(_hypot(wind[name], stderr), turned[name])
-        widened[name] = _like(both, wind[name])
+        total = _hypot(_hypot(wind[name], stderr), turned[name])
+        widened[name] = _like(total, wind[name])
     for name in map(str, wind.data_vars):
         of_pair = name.endswith("_stderr") and _PER_ROTATION in wind[name].attrs
         if of_pair or name in _OF_A_PAIR:
             part = wind[name].attrs.get(_PER_ROTATION, 0.0) + _moved(name, centre)
             shared = stderr if name in _OF_A_PAIR else 0.0
-            both = _hypot(_hypot(wind[name], shared), rotation * part)
-            widened[name] = _like(both, wind[name])
+            total = _hypot(_hypot(wind[name], shared), rotation * part)
+            widened[name] = _like(total, wind[name])
     larger = widened["v_stderr"] * widened["w_stderr"]
     product = wind["vw_correlation"] * first * second + turned["v_stderr"] * turned["w_stderr"]
     correlation = (product / larger.where(larger > 0)).where(larger != 0, 0.0)

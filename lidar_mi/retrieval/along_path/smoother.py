@@ -262,12 +262,12 @@ class PathField:
         # with one slab, or beyond both, the nearest counts
         nearer = np.where(two, to_left > 0, False)[:, None]
         with np.errstate(over="ignore", invalid="ignore"):
-            both = np.sinh(np.where(inside, a + b, 1.0))
+            scale = np.sinh(np.where(inside, a + b, 1.0))
             weight_left = np.where(
-                inside, np.sinh(b) / both, np.where(nearer, 0.0, np.exp(-np.abs(a)))
+                inside, np.sinh(b) / scale, np.where(nearer, 0.0, np.exp(-np.abs(a)))
             )
             weight_right = np.where(
-                inside, np.sinh(a) / both, np.where(nearer, np.exp(-np.abs(b)), 0.0)
+                inside, np.sinh(a) / scale, np.where(nearer, np.exp(-np.abs(b)), 0.0)
             )
         return weight_left, weight_right
 
@@ -292,8 +292,8 @@ class PathField:
         for first, slab, second in pairs:
             variance += np.einsum("nm,nmk,nk->n", first, self.covariance[slab], second)
         if len(self.cross):
-            both = self.cross[np.minimum(left, len(self.cross) - 1)]
-            variance += 2 * np.einsum("nm,nmk,nk->n", from_left, both, from_right)
+            cross = self.cross[np.minimum(left, len(self.cross) - 1)]
+            variance += 2 * np.einsum("nm,nmk,nk->n", from_left, cross, from_right)
         larger = np.maximum(self.inflation[left], self.inflation[right])
         return np.sqrt(larger * variance)
 

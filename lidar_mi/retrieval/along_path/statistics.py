@@ -109,8 +109,8 @@ def _expected(shape: tuple[int, int], window: float, stride: float) -> _Expected
         """Mean squares by band of a field with covariances at all lags."""
         full = of_lags[index[0][:, None, :, None], index[1][None, :, None, :]]
         once = dctn(full, axes=(0, 1), norm="ortho")
-        both = dctn(once, axes=(2, 3), norm="ortho")
-        variance = np.einsum("zyzy->zy", both)
+        twice = dctn(once, axes=(2, 3), norm="ortho")
+        variance = np.einsum("zyzy->zy", twice)
         return np.bincount(band.ravel(), variance.ravel()) / counts
 
     now, lagged = np.zeros((2, len(LENGTHS), len(MEANS), len(ACROSS), len(counts)))

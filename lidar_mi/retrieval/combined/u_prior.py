@@ -60,12 +60,12 @@ def relative_std(
     square, known = np.zeros(field.valid.shape), np.zeros(field.valid.shape)
     for axis, nodes in enumerate((z, y)):
         step = np.diff(nodes).mean()
-        both = np.roll(field.valid, 1, axis) & np.roll(field.valid, -1, axis)
+        neighbours = np.roll(field.valid, 1, axis) & np.roll(field.valid, -1, axis)
         edge = np.arange(len(nodes))[[0, -1]]
-        both[(slice(None),) * axis + (edge,)] = False
+        neighbours[(slice(None),) * axis + (edge,)] = False
         change = np.roll(field.value, -1, axis) - np.roll(field.value, 1, axis)
-        square += np.where(both, ((change / (2 * step)) ** 2).sum(-1), 0)
-        known += both
+        square += np.where(neighbours, ((change / (2 * step)) ** 2).sum(-1), 0)
+        known += neighbours
     # over the lines' spacing: finer variations of u are not observed
     width = [spacing / np.diff(nodes).mean() for nodes in (z, y)]
     square, known = (

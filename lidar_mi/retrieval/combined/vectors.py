@@ -294,11 +294,11 @@ def error_variables(
         for index, name in enumerate(COMPONENTS)
     }
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        both = stderr[..., i] * stderr[..., j]
+        product = stderr[..., i] * stderr[..., j]
         correlation = np.divide(
-            covariance[..., i, j], both, out=np.zeros_like(both), where=both > 0
+            covariance[..., i, j], product, out=np.zeros_like(product), where=product > 0
         )
-        correlation[np.isnan(both)] = np.nan
+        correlation[np.isnan(product)] = np.nan
         first, second = COMPONENTS[i], COMPONENTS[j]
         text = {"units": "1", "long_name": f"correlation of the errors of {first} and {second}"}
         variables[f"{first}{second}_correlation"] = (dims, correlation, text)

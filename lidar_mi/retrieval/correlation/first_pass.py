@@ -214,8 +214,8 @@ def volume_scores(
     contrast1 = (sums((first**2)[None]) - sums(first[None]) ** 2)[0]
     shifts = torch.cartesian_prod(*[torch.arange(2 * reach + 1)] * 3)
     scores = []
-    for some in shifts.split(max(1, _AT_ONCE // first.numel())):
-        moved = fields[:, *some.T]
+    for chunk in shifts.split(max(1, _AT_ONCE // first.numel())):
+        moved = fields[:, *chunk.T]
         inside = sums(moved[2])
         # the part of image 1 that is compared
         parts = [moved[0], moved[1], first * moved[0], first * moved[2], first**2 * moved[2]]

@@ -32,8 +32,8 @@ def motion_around(
         linear_weights(windows.centres(axis).to(d), torch.arange(n).to(d))
         for axis, n in enumerate(windows.shape)
     ]
-    both = separable(torch.cat([d, scatter[None]]).nan_to_num(0.0), weights)
-    return both[:2], both[2]
+    on_pixels = separable(torch.cat([d, scatter[None]]).nan_to_num(0.0), weights)
+    return on_pixels[:2], on_pixels[2]
 
 
 def moved(image: torch.Tensor, d: torch.Tensor) -> torch.Tensor:

@@ -87,8 +87,8 @@ def _inner(
         used = [OF_VORTEX * k + 2, OF_VORTEX * k + 3, -1]
         slope = np.stack([by_core[:, k], by_fraction[:, k]], -1) * circulation[:, k, None]
         by = np.column_stack([part[:, k], slope])
-        both = covariance[:, used][:, :, used]
-        variance[:, k] = np.einsum("sa,sab,sb->s", by, both, by)
+        used_covariance = covariance[:, used][:, :, used]
+        variance[:, k] = np.einsum("sa,sab,sb->s", by, used_covariance, by)
     return circulation * part, np.sqrt(variance)
 
 
@@ -128,9 +128,9 @@ def vortex_dataset(scans: Sequence[ScanVortices], about: Mapping[str, Any]) -> x
     data["circulation_5_15_stderr"] = _variable(
         ("scan", "vortex"), inner_stderr, "m2 s-1", f"standard error: {text}"
     )
-    both = "scan", "number", "other_number"
+    dims = "scan", "number", "other_number"
     data["covariance"] = (
-        both,
+        dims,
         covariance[:, :-1, :-1],
         {"long_name": "covariance of the vortices' numbers"},
     )

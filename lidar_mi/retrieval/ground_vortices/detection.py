@@ -205,13 +205,14 @@ def _air(windows: _Windows, lidar: CoherentLidar) -> Air:
         return Air(0.3, LENGTHS[0])
     likelihood = []
     for length in LENGTHS:
-        some = _contrasts(windows, lidar, length, np.ones(windows.values.shape[1], bool))
-        numbers = windows.values[chosen] @ some.basis
+        contrasts = _contrasts(windows, lidar, length, np.ones(windows.values.shape[1], bool))
+        numbers = windows.values[chosen] @ contrasts.basis
         noise = windows.noise[chosen][:, None]
-        variance = _SIGMAS[:, None, None] ** 2 * some.turbulent + noise
+        variance = _SIGMAS[:, None, None] ** 2 * contrasts.turbulent + noise
         likelihood.append(-(np.log(variance) + numbers**2 / variance).sum(-1) / 2)
         # the determinant, as contrasts of other lengths differ in scale
-        likelihood[-1] = likelihood[-1] + np.linalg.slogdet(some.basis.T @ some.basis)[1] / 2
+        determinant = np.linalg.slogdet(contrasts.basis.T @ contrasts.basis)[1]
+        likelihood[-1] = likelihood[-1] + determinant / 2
     each = np.stack(likelihood)
     kind = int(np.median(each.max(1), axis=1).argmax())
     return Air(float(np.median(_SIGMAS[each[kind].argmax(0)])), LENGTHS[kind])
@@ -248,12 +249,12 @@ def _scores(
     for p in np.unique(which[which >= 0]):
         at = np.flatnonzero(which == p)
         known_cells = np.asarray(windows.usable[at].all(0))
-        some = _contrasts(windows, lidar, air.length, known_cells)
+        contrasts = _contrasts(windows, lidar, air.length, known_cells)
         for kind in np.unique(kinds[at]):
             rows = at[kinds[at] == kind]
-            wanted = templates[kind][:, known_cells] @ some.basis
-            numbers = windows.values[rows][:, known_cells] @ some.basis
-            variance = air.sigma**2 * some.turbulent + windows.noise[rows][:, None]
+            wanted = templates[kind][:, known_cells] @ contrasts.basis
+            numbers = windows.values[rows][:, known_cells] @ contrasts.basis
+            variance = air.sigma**2 * contrasts.turbulent + windows.noise[rows][:, None]
             information[:, rows] = wanted**2 @ (1 / variance).T
             z[:, rows] = wanted @ (numbers / variance).T
     known = information > 0

@@ -273,15 +273,15 @@ class Problem:
         """Speeds (vortices, 2) and their derivatives (vortices, 2, numbers)."""
         vector = state.vector
         step = 1e-5 * np.maximum(np.abs(vector), 1.0)
-        many = vector + np.concatenate([[np.zeros_like(step)], np.diag(step), -np.diag(step)])
+        shifted = vector + np.concatenate([[np.zeros_like(step)], np.diag(step), -np.diag(step)])
         first, second = state.vortices.size, state.departures.size
         speed = motion(
-            many[:, :first].reshape(len(many), -1, OF_VORTEX),
-            many[:, first + second + 1 :],
+            shifted[:, :first].reshape(len(shifted), -1, OF_VORTEX),
+            shifted[:, first + second + 1 :],
             self.reference,
             self.given.ground,
             self.given.model,
-        ) + many[:, first : first + second].reshape(len(many), -1, 2)
+        ) + shifted[:, first : first + second].reshape(len(shifted), -1, 2)
         ahead, behind = speed[1 : 1 + len(step)], speed[1 + len(step) :]
         slope = (ahead - behind) / (2 * step)[:, None, None]
         return speed[0], np.moveaxis(slope, 0, -1)
@@ -343,8 +343,8 @@ class Problem:
 
     def _white(self, state: State, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         value, slope = self.predicted(state)
-        both = np.column_stack([self.window.velocity - value, slope])
-        white = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
+        columns = np.column_stack([self.window.velocity - value, slope])
+        white = scipy.linalg.solve_triangular(factor, columns, lower=True, check_finite=False)
         return white[:, 0], white[:, 1:]
 
     def evaluated(
@@ -352,8 +352,8 @@ class Problem:
     ) -> "_Model":
         """Restricted likelihood, covariance and step of a state under some turbulence."""
         factor = self.factor(air)
-        both = np.column_stack([residual, slope])
-        white = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
+        columns = np.column_stack([residual, slope])
+        white = scipy.linalg.solve_triangular(factor, columns, lower=True, check_finite=False)
         away, weight = self.prior(state, air)
         matrix = white[:, 1:].T @ white[:, 1:] + np.diag(weight)
         gradient = white[:, 1:].T @ white[:, 0] - weight * away

@@ -132,13 +132,13 @@ def _passes(angle: np.ndarray, time: np.ndarray) -> list[slice]:
     clock = _clock(seconds)
     usual = (seconds.sum() / seconds.size) if clock else np.median(seconds)
     pause = seconds - clock > _PAUSE * usual
-    starts, way = [0], 0.0
+    starts, direction = [0], 0.0
     for k in np.flatnonzero(pause | (signs != 0)):
-        if pause[k] or (way and signs[k] != way):
+        if pause[k] or (direction and signs[k] != direction):
             starts.append(int(k) + 1)
-            way = 0.0
+            direction = 0.0
         else:
-            way = signs[k]
+            direction = signs[k]
     ends = [*starts[1:], len(angle)]
     # jitter larger than the steps looks like turns: one pass
     if len(angle) < _LEAST_LINES * len(starts):

@@ -94,8 +94,8 @@ def _predicted(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """State after a time, its derivatives and the covariance of the process noise."""
     step = 1e-5 * np.maximum(np.abs(state), 1.0)
-    both = np.concatenate([[state], state + np.diag(step), state - np.diag(step)])
-    after = _moved(both, dt, ground, model)
+    shifted = np.concatenate([[state], state + np.diag(step), state - np.diag(step)])
+    after = _moved(shifted, dt, ground, model)
     size = len(state)
     transition = ((after[1 : 1 + size] - after[1 + size :]) / (2 * step)[:, None]).T
     number = (size - 3) // OF_VORTEX

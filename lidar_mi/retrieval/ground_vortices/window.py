@@ -105,8 +105,8 @@ def window_of(
     thin = max(1, int(np.floor(0.5 * lidar.gate_length / step + 0.01)))
     gates = gates[gates.size % thin // 2 :: thin]
     fine = max(scan.step, 1e-9) * (ranges[0] + ranges[1]) / 2
-    many = max(1, round(cell / fine), int(np.ceil(lines.size * gates.size / MOST_CELLS)))
-    starts = np.arange(0, lines.size - many // 2, many)
+    averaged = max(1, round(cell / fine), int(np.ceil(lines.size * gates.size / MOST_CELLS)))
+    starts = np.arange(0, lines.size - averaged // 2, averaged)
     part = np.ix_(lines, gates)
     velocity, variance = scan.velocity[part], scan.variance[part]
     usable = np.isfinite(velocity)

@@ -119,9 +119,9 @@ def _without_wind(
     design: np.ndarray, velocity: np.ndarray, folds: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of velocities and folds about a wind (Frisch and Waugh 1933)."""
-    both = np.column_stack([velocity, folds])[near]
+    observed = np.column_stack([velocity, folds])[near]
     basis, _ = np.linalg.qr(design[near])
-    unexplained = both - basis @ (basis.T @ both)
+    unexplained = observed - basis @ (basis.T @ observed)
     return unexplained[:, 0], unexplained[:, 1]
 
 

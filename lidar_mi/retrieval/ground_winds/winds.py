@@ -129,8 +129,8 @@ def fit_winds_to_lines(
             f"pitch and roll of up to {np.rad2deg(tilt):.2f} degrees are not applied: the error of "
             "w contains them"
         )
-    said = filter(None, (lines.attrs.get("remarks", ""), *dict.fromkeys(remarks)))
-    return profile_dataset(profiles, {**lines.attrs, "remarks": "\n".join(said)})
+    known_remarks = filter(None, (lines.attrs.get("remarks", ""), *dict.fromkeys(remarks)))
+    return profile_dataset(profiles, {**lines.attrs, "remarks": "\n".join(known_remarks)})
 
 
 def _check(
@@ -370,16 +370,16 @@ def _level(
     steep, azimuth = np.round(20 * design[:, 2]), np.arctan2(design[:, 0], design[:, 1])
     order = np.lexsort((azimuth, steep))
     design, places, velocity, noise = (array[order] for array in (design, places, velocity, noise))
-    many = math.ceil(len(velocity) / _MOST_LINES)
+    grouped = math.ceil(len(velocity) / _MOST_LINES)
     # neighbours among very many lines are averaged
-    every = Level(design, places, path, np.arange(0, len(velocity), many), velocity, noise)
+    every = Level(design, places, path, np.arange(0, len(velocity), grouped), velocity, noise)
     design, places, velocity = (every.averaged(array) for array in (design, places, velocity))
     size = math.ceil(len(velocity) / _MOST)
     starts = np.arange(0, len(velocity), size)
     level = Level(design, places, path, starts, velocity, noise)
     weights = np.where(np.isfinite(noise), noise, 1.0)
     counts = np.diff(np.append(starts, len(velocity)))
-    variance = level.averaged(every.averaged(weights)) / counts / many
+    variance = level.averaged(every.averaged(weights)) / counts / grouped
     known = float(variance.mean()) if np.isfinite(noise).all() else math.nan
     noise = variance / variance.mean()
     return Level(design, places, path, starts, level.averaged(velocity), noise), known

@@ -148,10 +148,10 @@ def best_filter(
     values, slopes = (gain, gain) if blur else (white.sqrt(), response * white.sqrt())
     # power of the filtered slopes with noise, the part of it from texture, and its variance
     # the mean of two images has half the variance of their noise
-    both = texture + floor / 2
+    noisy = texture + floor / 2
     steep = radius**2 * gain[shell] ** 2
     power, informed, spread = (
-        float((steep * spectrum[shell]).sum()) for spectrum in (both, texture, response * both)
+        float((steep * spectrum[shell]).sum()) for spectrum in (noisy, texture, response * noisy)
     )
     return Filter(
         gain,

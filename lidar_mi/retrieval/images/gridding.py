@@ -82,8 +82,8 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
             )
     grid = np.meshgrid(*(scan[axis].values.astype(float) for axis in "zy"), indexing="ij")
     places, nodes = (
-        np.stack([part.ravel() / (step or 1.0) for part, step in zip(both, steps, strict=True)], -1)
-        for both in (reported, grid)
+        np.stack([part.ravel() / (step or 1.0) for part, step in zip(axes, steps, strict=True)], -1)
+        for axes in (reported, grid)
     )
     gridded = scan.drop_vars(["y_reported", "z_reported"])
     off = np.abs(places - nodes).max(1) > _ON_NODE

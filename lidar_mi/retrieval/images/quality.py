@@ -114,10 +114,10 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
     squares = eigenvalues(along_y, across, along_z)
     weakest, strongest = (square.clamp(min=0).sqrt() for square in squares)
     mean = windows.of_templates(image)
-    some = weakest > 0
+    textured = weakest > 0
     return Texture(
-        torch.where(some, weakest / mean.abs(), 0.0),
-        torch.where(some, weakest / strongest, 0.0),
+        torch.where(textured, weakest / mean.abs(), 0.0),
+        torch.where(textured, weakest / strongest, 0.0),
         mean,
     )
 

@@ -206,5 +206,5 @@ def variance(
     to_node = 2 * (weights * structure(from_node, times)).sum(-1)
     separation = from_node[:, :, None] - from_node[:, None]
     delay = times[:, :, None] - times[:, None]
-    both = np.einsum("mi,mij,mj->m", weights, structure(separation, delay), weights)
-    return np.clip(to_node - both, 0.0, None)
+    among = np.einsum("mi,mij,mj->m", weights, structure(separation, delay), weights)
+    return np.clip(to_node - among, 0.0, None)

@@ -214,9 +214,9 @@ def window_sums(
 
 def averaged(field: torch.Tensor, known: torch.Tensor, width: float) -> torch.Tensor:
     """Gaussian mean of a field where it is known; the mean of all of it where nothing is near."""
-    both = torch.stack([torch.where(known, field, 0.0), known.to(field)])
-    total, number = _gaussian_sums(both, width)
-    mean = both[0].sum() / both[1].sum().clamp(min=1)
+    fields = torch.stack([torch.where(known, field, 0.0), known.to(field)])
+    total, number = _gaussian_sums(fields, width)
+    mean = fields[0].sum() / fields[1].sum().clamp(min=1)
     return torch.where(number > 1e-3, total / number.clamp(min=1e-3), mean)
 
 

@@ -141,16 +141,16 @@ class Calibration(Tabular):
 
     def _gap_rows(self) -> list[tuple[str, str]]:
         """The gap of several lines; that it is ambiguous where it is."""
-        many = len(self.gaps)
+        count = len(self.gaps)
         rows = [
             (
-                "gap" if many == 1 else f"gap, {k} of {many} that agree",
+                "gap" if count == 1 else f"gap, {k} of {count} that agree",
                 with_error(1e3 * gap, 1e3 * std, "mm"),
             )
             for k, (gap, std) in enumerate(self.gaps[:_LISTED], 1)
         ]
-        if many > 1:
-            more = f"ambiguous, {many} gaps agree: the nominal one is kept"
+        if count > 1:
+            more = f"ambiguous, {count} gaps agree: the nominal one is kept"
             rows.append(("whole order at the centre", more))
         elif self.whole_orders:
             first, last = self.whole_orders[0], self.whole_orders[-1]

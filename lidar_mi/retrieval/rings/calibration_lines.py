@@ -142,9 +142,9 @@ def _geometry(
     places = [1 + INSTRUMENT.index(name) for name in shared]
     covariance = line.systematic[np.ix_(places, places)]
     known = np.array([line.std[name] < _DETERMINED * tolerances[name] for name in shared])
-    both = np.ix_(known, known)
+    index = np.ix_(known, known)
     determined = np.zeros_like(covariance)
-    determined[both] = np.linalg.inv(covariance[both])
+    determined[index] = np.linalg.inv(covariance[index])
     return _Geometry(
         places,
         np.array([value[name] for name in shared]),
@@ -161,9 +161,9 @@ def _check_same(
     known = part1.known & part2.known
     if not known.any():
         return
-    both = np.ix_(known, known)
+    index = np.ix_(known, known)
     off = (part2.value - part1.value)[known]
-    noise = np.linalg.inv(part1.information)[both] + np.linalg.inv(part2.information)[both]
+    noise = np.linalg.inv(part1.information)[index] + np.linalg.inv(part2.information)[index]
     misfit = float(off @ np.linalg.solve(noise, off))
     if chi2.sf(misfit, known.sum()) > _UNLIKELY:
         return

@@ -328,15 +328,15 @@ class _System:
         """Sectors over which errors are correlated: Andrews' rule for an autoregression."""
         shift, information = self._shifts()
         reduced = np.nan_to_num(shift * np.sqrt(information))
-        both = (reduced != 0) & (np.roll(reduced, 1, 1) != 0)
-        product = (reduced * np.roll(reduced, 1, 1))[both].sum()
-        power = (reduced**2)[both].sum()
+        pairs = (reduced != 0) & (np.roll(reduced, 1, 1) != 0)
+        product = (reduced * np.roll(reduced, 1, 1))[pairs].sum()
+        power = (reduced**2)[pairs].sum()
         if not power > 0:
             return 0.0
         # the harmonics that the geometry takes make neighbours of white noise anticorrelated
         correlation = product / power + (1 + self.geometry_slots) / SECTORS
         # of white noise the estimate scatters by one over the root of the number of pairs
-        if correlation < 2.5 / np.sqrt(both.sum()):
+        if correlation < 2.5 / np.sqrt(pairs.sum()):
             return 0.0
         rho = min(correlation, 0.9)
         return min(1.1447 * (4 * rho**2 / (1 - rho**2) ** 2 * SECTORS) ** (1 / 3), SECTORS / 5)

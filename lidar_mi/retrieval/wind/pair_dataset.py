@@ -105,7 +105,7 @@ def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str
     """Remarks on the images; none where there is nothing to remark."""
     pattern = vectors.pattern
     patterns = [str(part) for part in (clean.defects.pattern, pattern) if str(part)]
-    said = {
+    remarks = {
         "defects": str(clean.defects),
         "fixed_pattern": ", ".join(patterns),
         "standing_fraction": pattern.fraction,
@@ -113,4 +113,4 @@ def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str
         "identical_images": given.same,
         "illumination": clean.change_of_illumination,
     }
-    return {name: value for name, value in said.items() if value}
+    return {name: value for name, value in remarks.items() if value}

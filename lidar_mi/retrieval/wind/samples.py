@@ -78,5 +78,5 @@ def at_windows(
     wind = wind.assign(flag=flag.assign_attrs(sampled["flag"].attrs))
     for name in axes:
         wind[name].attrs.update(sampled[name].attrs)
-    said = ", ".join(filter(None, [structure.said, sampled.attrs.get("sampling", "")]))
-    return wind.assign_attrs(sampled.attrs, stride=windows.stride, sampling=said)
+    remark = ", ".join(filter(None, [structure.said, sampled.attrs.get("sampling", "")]))
+    return wind.assign_attrs(sampled.attrs, stride=windows.stride, sampling=remark)

@@ -138,8 +138,8 @@ def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
         checks=False,
     )
     valid = wind["flag"] == 0
-    both = np.stack([wind[c].where(valid).transpose("z", "y").values for c in "vw"])
-    filled, _ = validated(torch.as_tensor(both), 2)
+    components = np.stack([wind[c].where(valid).transpose("z", "y").values for c in "vw"])
+    filled, _ = validated(torch.as_tensor(components), 2)
     axes = wind["y"].values, wind["z"].values
     low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
     known = RegularGridInterpolator(axes, filled.numpy().transpose(2, 1, 0))

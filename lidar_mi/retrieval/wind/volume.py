@@ -170,13 +170,13 @@ def retrieve_wind_volume(
         "min_correlation": validation.min_correlation,
     }
     number = sum(int(outlier.sum()) for outlier in outliers)
-    said = {
+    remarks = {
         "identical_images": same,
         "sampling": structure.said,
         "copy_at_rest": str(copy),
         "defects": f"{number} voxels are replaced in {len(outliers)} volumes" if number else "",
     }
-    attributes |= {name: value for name, value in said.items() if value}
+    attributes |= {name: value for name, value in remarks.items() if value}
     coords = centres(stack[0], frame, "window")
     return dataset(variables, coords, "Wind from two volumes", attributes, displacement)
 
