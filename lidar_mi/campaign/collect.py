@@ -21,7 +21,7 @@ from lidar_mi.progress import Notice
 
 STATUS = ("done", "failed", "missing")
 
-# Points between two notices.
+# Points per progress notice.
 _EVERY = 200
 
 
@@ -123,7 +123,7 @@ def _data_set(
             about["units"] = units[name]
         if scales.get(name):
             about["scale"] = scales[name]
-        # objects: NetCDF then stores text of any length
+        # object arrays: NetCDF stores text of any length
         coords[name] = (dim, np.array(along, object if isinstance(along[0], str) else None), about)
     if MEMBER in dims:
         coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})

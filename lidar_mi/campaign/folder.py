@@ -115,7 +115,7 @@ class CampaignFolder:
     def drop_images(self, signature: str) -> None:
         """Remove images that no point needs any more."""
         shutil.rmtree(self.images(signature), ignore_errors=True)
-        with suppress(OSError):  # it holds images of other signatures
+        with suppress(OSError):  # the folder holds images of other signatures
             (self.path / IMAGES).rmdir()
 
     def claimed(self) -> AbstractContextManager[None]:
@@ -130,7 +130,7 @@ class CampaignFolder:
 
 
 def _read_mapping(path: Path, expected: str) -> dict[str, Any] | None:
-    """Content of a JSON file; None: it is missing, or torn, so that its point is computed again."""
+    """Content of a JSON file; None: missing or torn, so that its point is computed again."""
     try:
         content = read_json(path, expected) if path.is_file() else None
     except InputError:
@@ -172,7 +172,7 @@ def read_base(campaign: Campaign, origin: str | Path) -> tuple[dict[str, Any], P
             f"{origin}: base: {campaign.base} has variants; expected an experiment without, or the "
             "campaign of its variants: lidar-mi campaign run " + str(campaign.base)
         )
-    # a name in the base would only name its own run
+    # a name in the base names only its run
     return base, path.parent.resolve()
 
 

@@ -64,7 +64,7 @@ class Points:
     def __init__(self, campaign: Campaign, base: dict[str, Any], search_path: str | Path) -> None:
         self.campaign, self.search_path = campaign, Path(search_path)
         self.dimensions = tuple(_dimensions(campaign))
-        # a name of a point is no part of what it is
+        # the name of a point does not change its results
         self.base = reading.merged(base, _nested(campaign.set))
         self.seed = campaign.seed if campaign.seed is not None else self.base.get("seed", 1)
         _refuse_overlaps(self.dimensions)
@@ -185,7 +185,7 @@ def _dimensions(campaign: Campaign) -> Iterator[Dimension]:
 def _sampled(campaign: Campaign) -> Dimension:
     """The points of a space-filling sample, scrambled by the campaign's seed."""
     sample = campaign.sample
-    assert sample is not None  # as `_dimensions` has asked
+    assert sample is not None  # checked by `_dimensions`
     kinds = {"sobol": qmc.Sobol, "latin_hypercube": qmc.LatinHypercube}
     # the same points at every start of the campaign
     random = np.random.default_rng(campaign.seed or 0)

@@ -25,7 +25,7 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     rows = data.expand_dims("row") if not data.dims else data
     table = rows.to_dataframe(dim_order=[str(dim) for dim in rows.dims]).reset_index()
     places = [axis for axis in ("x", "y", "z") if axis in data.coords]
-    # vectors that are at the centres of their windows have no place of their own
+    # positions that equal the centres of the windows are omitted
     same = [f"{axis}_vector" for axis in places if _equal(data, axis, f"{axis}_vector")]
     labels = [str(name) for name in data.coords if name not in (*places, *same)]
     columns = [*labels, *places, *(str(name) for name in data.data_vars)]

@@ -7,13 +7,13 @@ import numpy as np
 from lidar_mi.errors import InputError
 
 _SINCE = re.compile(r"\s*(\S+)\s+(?:since|after|from|ref)\s+(?=\S*\d).*", re.IGNORECASE | re.DOTALL)
-# No two of them need be equally long.
+# The states need not be evenly spaced.
 _CALENDAR = re.compile(r"(common_|leap_|julian_|tropical_|gregorian_)?(months?|years?|yrs?)", re.I)
 
-# A state belongs to the time asked for to this fraction of the way to its neighbour: velocities of
-# two states are wrong by twice of it.
+# Tolerance of a state's time as a fraction of the interval to its neighbour; velocities from two
+# states have twice this relative error.
 _SAME = 1e-3
-# Of axes in single precision, to their rounding, where that is this fraction at most.
+# For axes in single precision, their rounding, up to this fraction.
 _ROUNDING = 1e-2
 # In seconds: the fastest air of a wake, 50 m/s, moves by 5 cm.
 _LARGEST = 1e-3
@@ -42,10 +42,10 @@ def count_unit(text: str, where: str) -> str:
 
 
 def tolerances(times: np.ndarray, rounding: np.ndarray) -> np.ndarray:
-    """How far from each time one may be that means it, s, whatever the axis counts from.
+    """Tolerance of each time, s, whatever the origin of the axis.
 
-    1e-3 of the way to the nearest other time or, up to 1e-2 of it, the axis' own rounding; 1 ms at
-    most.
+    1e-3 of the interval to the nearest other time or, up to 1e-2 of it, the rounding of the axis;
+    at most 1 ms.
     """
     order = np.argsort(times)
     steps = np.diff(times[order])
@@ -57,7 +57,7 @@ def tolerances(times: np.ndarray, rounding: np.ndarray) -> np.ndarray:
 
 
 def listing(times: np.ndarray, tolerance: np.ndarray, most: int = 20) -> str:
-    """Times as the shortest numbers that mean them: "40, 40.1 ..."."""
+    """Times as their shortest numbers within the tolerance: "40, 40.1 ..."."""
     numbers = [_shortest(float(t), float(d)) for t, d in zip(times[:most], tolerance, strict=False)]
     return ", ".join(numbers) + (" ..." if times.size > most else "")
 

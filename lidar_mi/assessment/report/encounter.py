@@ -231,8 +231,8 @@ def encounter_answer(
 def what_the_lidar_added(metrics: Mapping[str, float], controller: str = "") -> list[str]:
     """The verdict: what the lidar removes beyond the autopilot, of what perfect preview does.
 
-    Nothing without a flight with the lidar. A lidar that never had a preview, or too late, is said
-    first. Roll is always judged, the load factor where the aircraft rises.
+    Nothing without a flight with the lidar. It begins with a preview that came too late, or never.
+    Roll is always judged, the load factor where the aircraft rises.
     """
     if "encounter.feedforward.largest_roll" not in metrics:
         return []

@@ -64,7 +64,7 @@ class Film(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A figure as a data URL, the fractions of its width at which panels part, and what is seen."""
+    """A figure as a data URL, its panel boundaries as fractions of the width, and its alt text."""
 
     title: str
     caption: str

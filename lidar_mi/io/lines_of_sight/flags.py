@@ -33,7 +33,7 @@ HARD_TARGET_ELEVATION = 30.0
 """Largest elevation of hard targets, degrees: above it, bright gates are clouds."""
 
 _BEFORE = 5  # gates whose median is the signal before a target
-# of a reflection of the outgoing pulse: its speed does not depend on direction to this, m/s
+# a reflection of the outgoing pulse has the same speed in all directions, to this, m/s
 _SAME = 0.1
 _LONGEST_PULSES = 4  # gate lengths that a reflection may cover
 
@@ -61,7 +61,7 @@ LEAST_REPEATED = 40
 """Cells that a repeated number has at least."""
 
 _LEAST_NOISE = 500  # gates: a tenth of uniform velocities is above 90 % of the largest, to 1.5 %
-_LEAST_GATES = 8  # whose velocities are not equal by chance
+_LEAST_GATES = 8  # whose velocities are not equal by coincidence
 
 
 def flags(
@@ -88,7 +88,7 @@ def flags(
     flag[~np.isfinite(velocity)] |= LineFlag.MISSING.value
     overlap = 1.0
     if snr is not None:
-        # as the total power would be none: never written
+        # no total power: never written
         flag[snr <= -1.0] |= LineFlag.MISSING.value
         overlap = overlapping(scan, snr, limit)[0]
         flag[np.isfinite(velocity) & ~(snr >= 10 ** (limit / 10))] |= LineFlag.LOW_CNR.value
@@ -113,17 +113,17 @@ def flags(
 
 
 def _nyquist_of_noise(scan: Scan, noise: np.ndarray) -> None:
-    """Velocity beyond which those of the file fold: gates without a signal fill what is below."""
+    """Nyquist velocity of the file: velocities of gates without a signal are uniform below it."""
     top = float(np.abs(noise).max()) if noise.size >= _LEAST_NOISE else 0.0
     if top > 0 and 0.05 < np.mean(np.abs(noise) > 0.9 * top) < 0.2:
         scan.about.setdefault("nyquist_velocity", top * (1 + 1 / noise.size))
 
 
 def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
-    """Ranges of gates that the file states to be adjacent although they share their samples.
+    """Correct the ranges of overlapping gates that the file states to be adjacent.
 
-    The noise shows how many; ranges are corrected where it determines their whole number, or agrees
-    with that of the file.
+    The correlation of the noise gives the number that overlap; ranges are corrected where it
+    determines a whole number, or agrees with that of the file.
     """
     snr = scan.fields.get("snr")
     step = float(np.nanmedian(np.diff(scan.range)))
@@ -151,7 +151,7 @@ def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
 
 
 def overlapping(scan: Scan, snr: np.ndarray, limit: float) -> tuple[float, float]:
-    """How many neighbouring gates share their samples, and its standard error; 1: none.
+    """Number of neighbouring gates with common samples, and its standard error; 1: none overlap.
 
     From the correlation of the noise: gates of n samples that are one sample apart correlate by
     1 - 1/n. The error is that of the lines' own estimates, 0 where the file's number agrees.
@@ -173,7 +173,7 @@ def overlapping(scan: Scan, snr: np.ndarray, limit: float) -> tuple[float, float
     error = np.inf
     if lines > 2:
         error = float(np.std(far - count * first) / first.mean() / math.sqrt(lines))
-    # of as many samples as the file says, if the noise agrees
+    # the number of samples in the file, if the noise agrees
     samples = float(scan.about.get("samples_per_gate", np.nan))
     return (samples, 0.0) if abs(count / samples - 1) < 0.3 else (count, error)
 
@@ -184,7 +184,7 @@ def _limit(scan: Scan, min_cnr: float | None) -> float:
 
 
 def repeated(velocity: np.ndarray) -> np.ndarray:
-    """Cells (lines, gates) that hold a number instead of a measurement, as of a blocked beam.
+    """Cells (lines, gates) that hold a constant instead of a measurement, as with a blocked beam.
 
     Either every gate of a line has the same velocity while other lines vary; or one velocity is
     there `EXCESS` times as often as any of its neighbours. Of a smooth distribution with at most
