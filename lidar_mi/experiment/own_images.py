@@ -1,4 +1,4 @@
-"""The wind in images that a user has as files: which frames are meant, when, in what light."""
+"""Wind from image files of a user: selection of the frames, their times, their noise."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -189,7 +189,7 @@ def _on_nodes(
 
 
 def _in_pixels(wind: xr.Dataset, *, per_frame: bool) -> xr.Dataset:
-    """The same numbers, of pixels of 1 m, with their units; ``per_frame``: and of frames of 1 s."""
+    """A wind of 1 m pixels in units of pixels; ``per_frame``: of 1 s frames in units of frames."""
     wind = wind.copy()
     for variable in wind.variables.values():
         if "units" in variable.attrs:
@@ -203,7 +203,7 @@ def _in_pixels(wind: xr.Dataset, *, per_frame: bool) -> xr.Dataset:
 def _frames(
     files: Sequence[Path], layer: str | None, numbers: Sequence[int] | None, pairs: object
 ) -> list[tuple[Path, Sequence[int]]]:
-    """Which frames of which files are meant; what is ambiguous is refused with the choices."""
+    """The selected frames of each file; an ambiguous selection is refused with the choices."""
     if len(files) == 1:
         return [(files[0], _of_one_file(files[0], layer, numbers, pairs))]
     if numbers is None:
@@ -266,7 +266,7 @@ def _layer(paths: Sequence[Path]) -> str | None:
 def _time_steps(
     paths: Sequence[Path], dt: float | None, *, equal: bool
 ) -> tuple[list[float], list[str]]:
-    """From each image to the next as given, else from the files; remarks on contradictions."""
+    """Time steps from image to image, as given or from the files; remarks on contradictions."""
     from_headers = steps_of(paths)
     count = len(paths) - 1
     if from_headers is None:

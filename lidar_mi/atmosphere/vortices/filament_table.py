@@ -13,13 +13,13 @@ from lidar_mi.atmosphere.vortices.filaments import Filaments
 from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 
-# The fine grid reaches so many core radii beyond the lines, in l and n: five nodes of the coarse
-# one, in which what its splines miss of the cores falls to 1e-3. The coarse one reaches so many
-# periods.
+# The fine grid reaches this many core radii beyond the lines, in l and n: five nodes of the coarse
+# grid, over which the error of its splines by the cores falls to 1e-3. The coarse grid reaches this
+# many periods.
 _MARGIN = 8.0
 _WIDE = 0.4
 # Spacing across the axis in core radii, of the fine and the coarse grid; along it twice as much in
-# the fine one, as lines are steep to the axis by less than that, but for rings.
+# the fine one, as lines, except rings, are steep by less than that.
 _FINE, _COARSE = 0.4, 1.6
 # Periods in core radii up to which both grids have at most some million nodes.
 _LONGEST = 400.0
@@ -125,7 +125,7 @@ class FilamentTable:
             low + np.arange(int(np.ceil((high - low) / spacing[2])) + 1) * spacing[2],
         ]
         quarter = self._filaments.velocity(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-        # to the plane between the vortices l is odd; to that of a crest s is odd
+        # about the plane between the vortices l is odd; about that of a crest s is odd
         left = quarter[:, :0:-1] * np.array([1.0, -1.0, 1.0])
         whole = np.concatenate([left, quarter], axis=1)
         behind = whole[-2:0:-1] * np.array([-1.0, 1.0, 1.0])

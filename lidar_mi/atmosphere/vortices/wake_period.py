@@ -10,7 +10,7 @@ from lidar_mi.errors import InputError
 
 Ends = Literal["mirror", "blend", "refuse"]
 
-# A period is closed where its seam is no rougher than the roughest place within it, by this factor.
+# Largest ratio of the roughness at the seam to that within a period.
 _SEAM = 2.0
 # Planes that are equal to this fraction of the largest speed are the same plane.
 _EQUAL = 1e-5
@@ -54,7 +54,7 @@ def one_period(
         falls to 0 at both mirrors by a raised cosine over ``length``, which makes divergence there.
     blend
         Its last ``length`` is blended into the first one by a raised cosine, and the period is
-        shorter by that. Cores that differ are blurred, and what differs of u makes divergence.
+        shorter by that. Differences of the cores are blurred, and differences of u make divergence.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _winds(flow: xr.Dataset) -> np.ndarray:
 
 
 def _seam(values: np.ndarray, floor: float) -> str:
-    """What is not periodic; empty: nothing."""
+    """The reason why a volume is not periodic; empty: it is."""
     for order in (1, 2):
         # differences about the circle: those of the last `order` places go across the seam
         size = values

@@ -24,11 +24,10 @@ _BEYOND = 3
 class VolumeAlongPath:
     """A simulated wake, repeated along an axis that crosses the flight path.
 
-    The state of one instant moves with ``drift`` and does not change: what the vortices do to each
-    other and to themselves in the seconds of an encounter beyond that is neglected. Values are
-    interpolated by cubic splines, periodic along the axis. Outside of the volume the wind is that
-    of two straight vortices at the mean places with the mean circulations, the extinction the
-    background.
+    The state of one instant moves with ``drift`` and does not change: any further induction in the
+    seconds of an encounter is neglected. Values are interpolated by cubic splines, periodic along
+    the axis. Outside of the volume the wind is that of two straight vortices at the mean places
+    with the mean circulations, the extinction the background.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ class VolumeAlongPath:
 
     @property
     def period(self) -> float:
-        """Of the wake along its axis, m."""
+        """Period of the wake along its axis, m."""
         x = self.flow["x"].values
         return float(x[-1] - x[0]) + self._steps[0]
 

@@ -60,7 +60,7 @@ def advection_by(
 ) -> Advection:
     """From a field to the field after dt in the frame of the gates; trajectories are followed once.
 
-    They are followed when they are first needed: a field of one value stays.
+    They are computed on first use: a uniform field needs none.
     """
     flow, dt = mean_flow(flows), platform.dt
 
@@ -229,7 +229,7 @@ def _advected_along(flow: xr.Dataset, platform: Platform, scan: Scan) -> Flows:
 def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
     """Variables that the extinction needs of a wake's file; names of all in the file.
 
-    Tracers of the extinction have our names once they are read.
+    Tracers of the extinction have our names after reading.
     """
     mapping = wake.extinction
     in_file = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
