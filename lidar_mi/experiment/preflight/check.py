@@ -16,6 +16,7 @@ from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.preflight.coherent import coherent_rows, passage_rows
 from lidar_mi.experiment.run import prepare
@@ -30,7 +31,6 @@ from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
 from lidar_mi.experiment.stages.sensor_cost import lidar_costs
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth.clear_air import air_in_words
-from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.experiment.truth.in_time import values_of_states
 from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.lidar import BackscatterLidar
@@ -168,7 +168,7 @@ def _second(experiment: Experiment, wake: Wake) -> str:
     """Where the state at t2 is from."""
     if wake.stored is not None:
         return f"the state stored at {wake.stored:.15g} s"
-    along = wake.second == "advect_3d" or moves_along(wake, experiment.volume)
+    along = wake.second == "advect_3d" or call(Observation, experiment).moves_along
     return "air of the first, advected by " + ("u, v and w" if along else "v and w")
 
 

@@ -8,12 +8,10 @@ import xarray as xr
 
 from lidar_mi.atmosphere.advection import advect_to
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.experiment.truth.flows import Flows, mean_flow, moves_along
-from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.schema.platform import Platform
-from lidar_mi.schema.volume import Volume
-from lidar_mi.schema.wake import Wake
+from lidar_mi.experiment.truth.flows import Flows, mean_flow
+from lidar_mi.instrument.scan import ScanPlan
 
 LARGEST_STEP = 0.25
 """Node spacings by which air moves from one state to the next, at most.
@@ -25,9 +23,7 @@ half way between two states.
 MOST_VALUES = 2.5e8  # values of all states of a scan: 1 GB in the renderer
 
 
-def state_times(
-    wake: Wake, scan: Scan, volume: Volume | None, flows: Flows, times: np.ndarray
-) -> np.ndarray:
+def state_times(observation: Observation, flows: Flows, times: np.ndarray) -> np.ndarray:
     """Equally spaced times, s, at which the air is computed for beams at ``times``.
 
     The middle one is that of the middle of the scan.
@@ -41,7 +37,7 @@ def state_times(
     first, last = float(np.min(times)), float(np.max(times))
     if first == last:
         return np.array([first])
-    moved = (last - first) * _speed_in_nodes(flow, _along(wake, scan, volume, flow))
+    moved = (last - first) * _speed_in_nodes(flow, _along(observation, flow))
     # an odd number
     count = 2 * max(2, math.ceil(moved / LARGEST_STEP / 2)) + 1
     values = count * flow["v"].size
@@ -54,9 +50,7 @@ def state_times(
     return np.linspace(first, last, count)
 
 
-def values_of_states(
-    wake: Wake, scan: Scan, volume: Volume | None, flows: Flows, plans: Sequence[ScanPlan]
-) -> int:
+def values_of_states(observation: Observation, flows: Flows, plans: Sequence[ScanPlan]) -> int:
     """Values of all states of the scan that has most; 0 where air is frozen or beams have one time.
 
     Raises
@@ -64,22 +58,15 @@ def values_of_states(
     InputError
         As of `state_times`.
     """
-    if scan.air != "moving":
+    if observation.scan.air != "moving":
         return 0
     timed = [plan.beams.time for plan in plans if plan.beams is not None]
-    counts = [state_times(wake, scan, volume, flows, times).size for times in timed]
+    counts = [state_times(observation, flows, times).size for times in timed]
     return max(counts, default=0) * flows[0]["v"].size
 
 
 def air_in_time(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    truth: Truth,
-    flows: Flows,
-    which: int,
-    times: np.ndarray,
+    observation: Observation, truth: Truth, flows: Flows, which: int, times: np.ndarray
 ) -> xr.DataArray:
     """The extinction of scan ``which`` at the times of its beams, m^-1, dims (time, x, y, z).
 
@@ -103,10 +90,10 @@ def air_in_time(
     """
     if all(float(field.min()) == float(field.max()) for field in truth.extinction):
         return truth.extinction[which]
-    flow, dt = mean_flow(flows), platform.dt
-    u = _along(wake, scan, volume, flow)
+    flow, dt = mean_flow(flows), observation.platform.dt
+    u = _along(observation, flow)
     molecules = truth.molecules
-    taus = state_times(wake, scan, volume, flows, times)
+    taus = state_times(observation, flows, times)
 
     def advected(state: int) -> xr.DataArray:
         # molecules are everywhere, and no undershoot of a spline may remove them
@@ -121,9 +108,9 @@ def air_in_time(
     return ((1 - weight) * advected(0) + weight * advected(1)).astype(np.float32)
 
 
-def _along(wake: Wake, scan: Scan, volume: Volume | None, flow: xr.Dataset) -> xr.DataArray | None:
+def _along(observation: Observation, flow: xr.Dataset) -> xr.DataArray | None:
     """Speed of the air along x in the frame of the gates, m/s; None: it is uniform along x."""
-    return flow["u"] - scan.follow if moves_along(wake, volume) else None
+    return flow["u"] - observation.scan.follow if observation.moves_along else None
 
 
 def _speed_in_nodes(flow: xr.Dataset, u: xr.DataArray | None) -> float:
