@@ -35,7 +35,7 @@ ATTEMPTS = "attempts.txt"
 RUN = "run"
 """Run folder in that of a point, with ``keep: everything``."""
 
-_SHORT = 20
+_HASH_LENGTH = 20
 """Characters of a hash that name a folder: 80 bits, for which 10^7 points collide never."""
 
 
@@ -98,7 +98,7 @@ class CampaignFolder:
 
     def images(self, signature: str) -> Path:
         """Folder of images of one signature."""
-        return self.path / IMAGES / signature[:_SHORT]
+        return self.path / IMAGES / signature[:_HASH_LENGTH]
 
     def metrics(self, number: int) -> dict[str, float | None] | None:
         """Metrics of a point; None: there are none yet, or their file is damaged."""
@@ -283,7 +283,7 @@ def _row(experiment: Experiment, search_path: Path) -> Row:
     record = new_record(experiment, search_path)
     graph = stages_of(experiment)
     images = [made_by(record, graph.keys(stage)) for stage in storing_stages(graph)]
-    return Row(made_by(record)[:_SHORT], tuple(images))
+    return Row(made_by(record)[:_HASH_LENGTH], tuple(images))
 
 
 def _check_keys(points: Points) -> None:

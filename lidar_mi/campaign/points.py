@@ -12,6 +12,7 @@ from scipy.stats import qmc
 
 from lidar_mi.campaign.description import Campaign, Range
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.describe import value_at
 from lidar_mi.schema import reading
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import registry, split_quantity
@@ -140,7 +141,7 @@ class Points:
                 units |= {dimension.name: unit} if unit else {}
                 continue
             for key in dimension.changes[0]:
-                value = _at(reading.settings(self.experiment(0), si=True), key)
+                value = value_at(reading.settings(self.experiment(0), si=True), key)
                 if isinstance(value, str) and _number(value) is not None:
                     units[key] = value.partition(" ")[2]
         return units
@@ -150,7 +151,7 @@ class Points:
         # the first points along this dimension; of others the same values follow
         stride = math.prod(self.shape[axis + 1 :])
         values = [
-            _at(reading.settings(self.experiment(k * stride), si=True), key)
+            value_at(reading.settings(self.experiment(k * stride), si=True), key)
             for k in range(self.shape[axis])
         ]
         numbers = [_number(value) for value in values]
@@ -263,14 +264,6 @@ def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
             value = {part: value}
         sections = reading.merged(sections, value) if sections else dict(value)
     return sections
-
-
-def _at(settings: Mapping[str, Any], key: str) -> Any:
-    """The value at a dotted key; None: there is none."""
-    value: Any = settings
-    for part in key.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value
 
 
 def _number(value: object) -> float | None:

@@ -22,7 +22,7 @@ from lidar_mi.retrieval.wind.synchronised import synchronised
 
 Level = float | xr.DataArray | None
 
-_SAME = 1e-3
+_TOLERANCE = 1e-3
 """Relative difference between a time step given and one from headers that is rounding."""
 
 
@@ -275,7 +275,7 @@ def _time_steps(
         return [dt] * count, []
     text = ", ".join(f"{step:g}" for step in dict.fromkeys(from_headers))
     unequal = any(
-        abs(step - from_headers[0]) > _SAME * abs(from_headers[0]) for step in from_headers
+        abs(step - from_headers[0]) > _TOLERANCE * abs(from_headers[0]) for step in from_headers
     )
     if dt is not None:
         remarks = []
@@ -284,7 +284,7 @@ def _time_steps(
                 f"by their headers ({text} s) an image is not later than the one before: v and w "
                 "have the opposite sign if the images are swapped"
             )
-        elif unequal or abs(dt - from_headers[0]) > _SAME * from_headers[0]:
+        elif unequal or abs(dt - from_headers[0]) > _TOLERANCE * from_headers[0]:
             remarks.append(f"dt is {dt:g} s as given, but {text} s by the headers of the files")
         return [dt] * count, remarks
     if min(from_headers) <= 0:

@@ -37,7 +37,7 @@ from lidar_mi.retrieval.channels.model import ChannelModel, mean_and_jacobian, p
 from lidar_mi.retrieval.rings.model import PixelNoise
 
 # Annuli of a ring image, for each order: the tenth harmonic loses 1 % of its contrast.
-_STEPS = 128
+_ANNULI_PER_ORDER = 128
 # Speeds at which the response of two filters is examined.
 _SPEEDS = 4001
 # Range of a required pulse energy, relative to the lidar's.
@@ -143,7 +143,7 @@ def ring_receiver(
     cosine = fabry_perot.cosine_inside(etalon, camera.cosine(r2))
     order = fabry_perot.fractional_order(etalon, lidar.wavelength, cosine)
     # by the order, not the radius, as all rings have the same width in it
-    annulus = np.floor(order * _STEPS).astype(int)
+    annulus = np.floor(order * _ANNULI_PER_ORDER).astype(int)
     # orders fall towards the rim, and bincount takes no negative numbers
     annulus -= annulus.min()
     pixels = np.bincount(annulus)

@@ -26,7 +26,11 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     table = rows.to_dataframe(dim_order=[str(dim) for dim in rows.dims]).reset_index()
     places = [axis for axis in ("x", "y", "z") if axis in data.coords]
     # positions that equal the centres of the windows are omitted
-    same = [f"{axis}_vector" for axis in places if _equal(data, axis, f"{axis}_vector")]
+    same = [
+        vector
+        for axis in places
+        if (vector := f"{axis}_vector") in data.coords and (data[axis] == data[vector]).all()
+    ]
     labels = [str(name) for name in data.coords if name not in (*places, *same)]
     columns = [*labels, *places, *(str(name) for name in data.data_vars)]
     table = table[columns]
@@ -40,10 +44,6 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
         if "units" in data[name].attrs
     }
     write_text(path, table.rename(columns=heads).to_csv(index=False, na_rep="NaN"))
-
-
-def _equal(data: xr.Dataset, first: str, second: str) -> bool:
-    return second in data.coords and bool((data[first] == data[second]).all())
 
 
 def _in_words(flags: np.ndarray, attributes: dict[str, Any]) -> list[str]:

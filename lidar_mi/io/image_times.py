@@ -9,7 +9,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.exr import read_header
 
 _OF_A_RUN = ("dt", "telescope_position", "platform_speed")
-_SAME = 1e-3  # relative, of the distance flown
+_TOLERANCE = 1e-3  # relative, of the distance flown
 
 
 def steps_of(paths: Sequence[str | Path]) -> list[float] | None:
@@ -37,7 +37,7 @@ def _step(earlier: dict[str, Any], later: dict[str, Any]) -> float:
     dt = _rounded(earlier["dt"])
     way = later["telescope_position"] - earlier["telescope_position"]
     backwards = -earlier["platform_speed"] * dt
-    return -dt if way and abs(way - backwards) < _SAME * abs(backwards) else dt
+    return -dt if way and abs(way - backwards) < _TOLERANCE * abs(backwards) else dt
 
 
 def _rounded(seconds: float) -> float:

@@ -93,7 +93,7 @@ def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
     InputError
         As `read_pixels`.
     """
-    if kind_of(Path(path)) in _OF_ONE:
+    if kind_of(Path(path)) in _SINGLE_IMAGE:
         return 1, False
     frames = _frames(Path(path), layer)
     return frames.count, frames.channels
@@ -119,7 +119,7 @@ def _frames(path: Path, layer: str | None) -> Frames:
             f"layer: {layer!r} is not allowed for {path}; only EXR, FITS, npz, mat and HDF5 files "
             "have layers"
         )
-    return _WITHOUT[kind](path)
+    return _WITHOUT_LAYERS[kind](path)
 
 
 def _exr(path: Path, layer: str | None) -> Frames:
@@ -136,9 +136,9 @@ def _exr(path: Path, layer: str | None) -> Frames:
 
 
 _WITH_LAYERS = {"exr": _exr, "fits": read_fits, "npz": read_npz, "mat": read_mat, "hdf5": read_hdf5}
-_OF_ONE = ("exr", "png", "jpeg2000", "mat")
+_SINGLE_IMAGE = ("exr", "png", "jpeg2000", "mat")
 """Kinds that hold one image."""
-_WITHOUT = {
+_WITHOUT_LAYERS = {
     "tiff": read_tiff,
     "png": read_png,
     "picture": read_picture,

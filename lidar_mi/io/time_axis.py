@@ -12,11 +12,11 @@ _CALENDAR = re.compile(r"(common_|leap_|julian_|tropical_|gregorian_)?(months?|y
 
 # Tolerance of a state's time as a fraction of the interval to its neighbour; velocities from two
 # states have twice this relative error.
-_SAME = 1e-3
+_TOLERANCE = 1e-3
 # For axes in single precision, their rounding, up to this fraction.
-_ROUNDING = 1e-2
+_LARGEST_ROUNDING = 1e-2
 # In seconds: the fastest air of a wake, 50 m/s, moves by 5 cm.
-_LARGEST = 1e-3
+_LARGEST_TOLERANCE = 1e-3
 
 
 def count_unit(text: str, where: str) -> str:
@@ -51,9 +51,9 @@ def tolerances(times: np.ndarray, rounding: np.ndarray) -> np.ndarray:
     steps = np.diff(times[order])
     gaps = np.full(times.size, np.inf)
     gaps[order] = np.fmin(np.append(steps, np.inf), np.append(np.inf, steps))
-    fraction = np.maximum(_SAME * gaps, np.minimum(rounding, _ROUNDING * gaps))
+    fraction = np.maximum(_TOLERANCE * gaps, np.minimum(rounding, _LARGEST_ROUNDING * gaps))
     # text that is read and units that are converted differ by the last bits of double precision
-    return np.minimum(fraction, _LARGEST) + 2 * np.spacing(np.abs(times))
+    return np.minimum(fraction, _LARGEST_TOLERANCE) + 2 * np.spacing(np.abs(times))
 
 
 def listing(times: np.ndarray, tolerance: np.ndarray, most: int = 20) -> str:

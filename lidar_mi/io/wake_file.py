@@ -342,11 +342,6 @@ def _in_the_ground(variable: xr.DataArray, height: str, path: Path) -> int:
     return 0
 
 
-def _staggered(dims_of: Mapping[str, Mapping[str, str]], spatial: Mapping[str, str]) -> set[str]:
-    """Axes along which some variable is staggered."""
-    return {ours for dims in dims_of.values() for d, ours in dims.items() if d not in spatial}
-
-
 def _read(
     data: xr.Dataset,
     table: Mapping[str, str],
@@ -426,7 +421,8 @@ def _read(
         axes["x"] = axes["x"][index : index + 1]
         # planes that are not needed are not read
         planes = file_nodes.get(table["x"], axes["x"])
-        if planes.size > 1 and is_even(planes) and "x" not in _staggered(dims_of, spatial):
+        staggered = {o for dims in dims_of.values() for d, o in dims.items() if d not in spatial}
+        if planes.size > 1 and is_even(planes) and "x" not in staggered:
             index = int(np.argmin(np.abs(planes - axes["x"][0])))
             data = data.isel({table["x"]: slice(index, index + 1)})
             file_nodes[table["x"]] = axes["x"]

@@ -82,8 +82,11 @@ def names() -> list[str]:
 
 def settable() -> list[str]:
     """Keys that ``--set`` can change: no sections, nor keys of lists of sections."""
-    fields = _fields()
-    return [name for name, (_, field, within) in fields.items() if not within and _is_leaf(field)]
+    return [
+        name
+        for name, (_, field, within) in _fields().items()
+        if not within and section_in(field.annotation) is None
+    ]
 
 
 def explain(name: str) -> Key:
@@ -194,10 +197,6 @@ def _is_list(field: FieldInfo) -> bool:
     return any(
         get_origin(kind) is tuple for kind in (field.annotation, *get_args(field.annotation))
     )
-
-
-def _is_leaf(field: FieldInfo) -> bool:
-    return section_in(field.annotation) is None
 
 
 def _nearest(name: str, fields: Mapping[str, object]) -> list[str]:

@@ -61,7 +61,7 @@ class VortexPair(Section):
 
     @field_validator("aircraft")
     @classmethod
-    def _known(cls, value: str | None) -> str | None:
+    def _check_aircraft(cls, value: str | None) -> str | None:
         if value is not None and value not in TYPES:
             raise ValueError(f"{value!r} is not allowed; expected one of {', '.join(TYPES)}")
         return value

@@ -159,7 +159,8 @@ def doctor() -> Checkup:
     checks = [_check_python(), *_check_dependencies(), _check_llvm()]
     with ThreadPoolExecutor(max_workers=_cores()) as pool:
         checks += pool.map(lambda trial: trial(), trials)
-    checks += [_check_cores(), _check_memory(), _check_disk(), _check_exr_tools()]
+    checks.append(Check("cores", True, f"{_cores()} usable of {os.cpu_count()}"))
+    checks += [_check_memory(), _check_disk(), _check_exr_tools()]
     return Checkup(tuple(checks))
 
 
@@ -310,10 +311,6 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _check_cores() -> Check:
-    return Check("cores", True, f"{_cores()} usable of {os.cpu_count()}")
 
 
 def _check_memory() -> Check:

@@ -196,10 +196,10 @@ def encounter_answer(
             "missed, or both wings meet the same wind, as in a wake across the path.",
             *loads_answer(metrics),
         ]
-    parts = [
-        f"{'upset' if _lost(metrics, mode) else _degrees(roll)} ({flight_name(mode, controller)})"
-        for mode, roll in rolls.items()
-    ]
+    parts = []
+    for mode, roll in rolls.items():
+        size = "upset" if _lost(metrics, mode) else f"{three(math.degrees(roll))} degrees"
+        parts.append(f"{size} ({flight_name(mode, controller)})")
     best = "feedforward" if "feedforward" in rolls else "perfect" if "perfect" in rolls else "off"
     verdict = "stays below" if rolls[best] <= ACCEPTED_BANK else "exceeds"
     ratio = metrics[f"encounter.{best}.roll_control_ratio"]
@@ -361,10 +361,6 @@ def _values(
 
 def _lost(metrics: Mapping[str, float], mode: str) -> bool:
     return metrics.get(f"encounter.{mode}.departed", 0) > 0
-
-
-def _degrees(angle: float) -> str:
-    return f"{three(math.degrees(angle))} degrees"
 
 
 def _with_unit(value: float | None, factor: float) -> str:

@@ -15,7 +15,7 @@ from lidar_mi.schema.experiment import Experiment
 _FRACTION = f"{Source.NOISY}.monte_carlo_fraction"
 _SAMPLES = f"{Source.BACKSCATTER}.samples_per_beam"
 # Above this fraction of the error the remainder, and so the number of samples, is ill-determined.
-_NEARLY_ALL = 0.9
+_LARGEST_PART = 0.9
 # Least fraction of the mean square error that is mentioned: 5 % of the rms error.
 _LEAST_PART = 0.1
 
@@ -141,4 +141,4 @@ def _sufficient_samples(experiment: Experiment, metrics: Mapping[str, float]) ->
         return samples * metrics[_FRACTION] / allowed
     parts = () if experiment.volume else simulation_parts(metrics, experiment.retrieval.methods)
     largest = max((part.fraction for part in parts), default=1.0)
-    return samples * largest / (1 - largest) / allowed if largest < _NEARLY_ALL else 0.0
+    return samples * largest / (1 - largest) / allowed if largest < _LARGEST_PART else 0.0

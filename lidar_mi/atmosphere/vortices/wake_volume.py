@@ -17,7 +17,7 @@ from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.atmosphere.vortices.wake_path import Components, check_cut, cut_radius, wake_axes
 
 # Nodes beyond the period's ends that a cubic spline needs.
-_BEYOND = 3
+_SPLINE_MARGIN = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class VolumeAlongPath:
             for axis in (1, 2):
                 values = scipy.ndimage.spline_filter1d(values, axis=axis, mode="mirror")
             coefficients[str(name)] = np.take(
-                values, range(-_BEYOND, len(values) + _BEYOND), axis=0, mode="wrap"
+                values, range(-_SPLINE_MARGIN, len(values) + _SPLINE_MARGIN), axis=0, mode="wrap"
             )
         return coefficients
 
@@ -128,7 +128,7 @@ class VolumeAlongPath:
             place = (places[k] - nodes[0]) / self._steps[k]
             if name == "x":
                 # the coefficients begin so many nodes before the first plane
-                place = np.mod(place, len(nodes)) + _BEYOND
+                place = np.mod(place, len(nodes)) + _SPLINE_MARGIN
             else:
                 # nodes at the rim are inside, whatever the rounding
                 inside &= (place >= -1e-9) & (place <= len(nodes) - 1 + 1e-9)

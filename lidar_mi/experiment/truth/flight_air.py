@@ -32,7 +32,7 @@ from lidar_mi.schema.section import Section
 from lidar_mi.units import AS_GIVEN
 
 # Planes across the path, in separations from the middle, over which a wake's drift is averaged.
-_AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_DRIFT_PLANES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 def air_along_path(experiment: Experiment) -> WakeAlongPath:
@@ -229,7 +229,7 @@ def _drift(
     places = [(x, 0.0, 0.0)]
     if middle:
         separation = abs(middle[0].y - middle[1].y)
-        planes = [x + part * separation for part in _AROUND]
+        planes = [x + part * separation for part in _DRIFT_PLANES]
         places = [
             (plane, vortex.y, vortex.z)
             for plane in planes

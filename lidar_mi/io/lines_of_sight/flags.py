@@ -32,9 +32,9 @@ HARD_TARGET_SPEED = 0.3
 HARD_TARGET_ELEVATION = 30.0
 """Largest elevation of hard targets, degrees: above it, bright gates are clouds."""
 
-_BEFORE = 5  # gates whose median is the signal before a target
+_GATES_BEFORE = 5  # gates whose median is the signal before a target
 # a reflection of the outgoing pulse has the same speed in all directions, to this, m/s
-_SAME = 0.1
+_SAME_SPEED = 0.1
 _LONGEST_PULSES = 4  # gate lengths that a reflection may cover
 
 
@@ -230,10 +230,10 @@ def reflection(scan: Scan, overlap: float = 1.0) -> np.ndarray:
         return none
     most = math.ceil(_LONGEST_PULSES * overlap)
     spread = np.nanstd(velocity[slanted][:, : 2 * most], axis=0)
-    same = spread < _SAME
+    same = spread < _SAME_SPEED
     count = int(np.argmin(same)) if not same.all() else 0
     behind = spread[count + math.ceil(overlap) : count + 3 * math.ceil(overlap)]
-    if not (0 < count <= most and behind.size and np.nanmedian(behind) > 5 * _SAME):
+    if not (0 < count <= most and behind.size and np.nanmedian(behind) > 5 * _SAME_SPEED):
         return none
     # the gates in which reflection and air mix
     count += math.ceil(overlap / 2)
@@ -254,7 +254,7 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
     velocity = scan.fields["radial_velocity"]
     blocked = np.zeros(snr.shape, bool)
     low = np.abs(scan.angles["elevation"]) <= HARD_TARGET_ELEVATION
-    if not low.any() or snr.shape[1] <= 2 * _BEFORE:
+    if not low.any() or snr.shape[1] <= 2 * _GATES_BEFORE:
         return blocked
     width = math.ceil(overlap)
     usable = np.where(bad, np.nan, snr)
@@ -269,10 +269,10 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
 
 def _median_before(snr: np.ndarray, width: int) -> np.ndarray:
     """Median of the gates before each, (gates,), but its direct neighbours; NaN: too few."""
-    reach = _BEFORE * width
+    reach = _GATES_BEFORE * width
     padded = np.concatenate([np.full(reach + width, np.nan), snr])
     windows = np.lib.stride_tricks.sliding_window_view(padded, reach)[: snr.size]
-    enough = np.isfinite(windows).sum(1) >= min(3, _BEFORE)
+    enough = np.isfinite(windows).sum(1) >= min(3, _GATES_BEFORE)
     median = np.full(snr.size, np.nan)
     median[enough] = np.nanmedian(windows[enough], axis=1)
     return median

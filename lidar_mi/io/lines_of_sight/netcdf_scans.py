@@ -57,10 +57,10 @@ NAMES = {
 """Ours, and those of the makers in lower case, the most telling first."""
 
 _UNITS = {name: unit for name, (unit, _) in FIELDS.items()} | {"range": "m", "altitude": "m"}
-_EARTH = 6.371e6  # m, mean radius
+_EARTH_RADIUS = 6.371e6  # m, mean radius
 _MOVED = 100.0  # m, within a scan: more than the error of satellite navigation
 _WORDS = ("long_name", "comment", "description", "note", "sign_convention", "positive")
-_NEVER = -9999.0  # ARM's missing value, which not every file declares
+_ARM_MISSING = -9999.0  # ARM's missing value, which not every file declares
 _KINDS = (
     ("datastream", "sgp", "ARM"),
     ("dod_version", "dl", "ARM"),
@@ -214,8 +214,8 @@ def _moving(data: xr.Dataset, names: Mapping[str, str], time: np.ndarray, path: 
     finite = np.flatnonzero(np.isfinite(latitude) & np.isfinite(longitude))
     if finite.size < 2:
         return []
-    north = _EARTH * (latitude[finite] - latitude[finite[0]])
-    east = _EARTH * np.cos(latitude[finite]) * (longitude[finite] - longitude[finite[0]])
+    north = _EARTH_RADIUS * (latitude[finite] - latitude[finite[0]])
+    east = _EARTH_RADIUS * np.cos(latitude[finite]) * (longitude[finite] - longitude[finite[0]])
     way = float(np.hypot(np.ptp(north), np.ptp(east)))
     seconds = float((time[finite[-1]] - time[finite[0]]) / np.timedelta64(1, "s"))
     if way < _MOVED or seconds <= 0:
@@ -235,7 +235,7 @@ def _numbers(variable: xr.DataArray, ours: str, path: Path) -> np.ndarray:
     unlimited = variable.copy()
     unlimited.attrs = limits
     values = load_variable(unlimited, path).values.astype(float)
-    values = np.where(values == _NEVER, np.nan, values)
+    values = np.where(values == _ARM_MISSING, np.nan, values)
     unit = str(variable.attrs.get("units", "")).strip()
     if ours == "snr":
         return values

@@ -258,7 +258,7 @@ def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[s
 _TOWARD = r"(?:toward|approach|inbound|incoming)"
 _AWAY = r"(?:away|reced|outbound|outgoing|outward)"
 _SIGN = r"(?:positive|negative|(?<!\w)[+-]ve|(?<!\w)[><]\s*0)"
-_SAID = re.compile(
+_SIGN_CONVENTION = re.compile(
     rf"(?P<sign>{_SIGN})[^.;,]*?(?P<way>{_TOWARD}|{_AWAY})"
     rf"|(?P<way2>{_TOWARD}|{_AWAY})[^.;,]*?(?P<sign2>{_SIGN})",
     re.IGNORECASE,
@@ -272,7 +272,7 @@ def toward_in_words(text: str) -> bool | None:
     True
     """
     senses = set()
-    for match in _SAID.finditer(text):
+    for match in _SIGN_CONVENTION.finditer(text):
         sign, way = match["sign"] or match["sign2"], match["way"] or match["way2"]
         positive = sign.lower().startswith(("positive", "+", ">"))
         senses.add((re.match(_TOWARD, way, re.IGNORECASE) is not None) == positive)
