@@ -55,8 +55,8 @@ def title_of(key: str) -> str:
     whose = "standard error of " if quantity.endswith("_stderr") else ""
     quantity = quantity.removesuffix("_stderr")
     start, words = next((p for p in _KINDS if quantity.startswith(p[0])), ("", ""))
-    rest = quantity.removeprefix(start)
-    named = _QUANTITIES.get(rest, rest)
+    stem = quantity.removeprefix(start)
+    name = _QUANTITIES.get(stem, stem)
     origin = [_ORIGINS.get(place, place) for place in places if place != "all"]
-    texts = [whose + words + named, *origin]
+    texts = [whose + words + name, *origin]
     return ", ".join(texts).replace("_", " ")

@@ -52,7 +52,7 @@ def map_data(
     step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
     return {
         **place,
-        "seen": _seen(thin, place, numbers("v"), numbers("w")),
+        "alt_text": _alt_text(thin, place, numbers("v"), numbers("w")),
         "colour": colour,
         "step": step,
         "components": [
@@ -73,7 +73,7 @@ def map_data(
     }
 
 
-def _seen(
+def _alt_text(
     thin: xr.Dataset,
     place: Mapping[str, list[float]],
     v: Sequence[float | None],
@@ -82,11 +82,11 @@ def _seen(
     """How many vectors there are, and the longest of the valid ones."""
     speed = np.hypot(np.array(v, dtype=float), np.array(w, dtype=float))
     speed[thin["flag"].values.ravel() != 0] = np.nan
-    known = int(np.isfinite(speed).sum())
-    if not known:
+    valid = int(np.isfinite(speed).sum())
+    if not valid:
         return f"none of {speed.size} vectors is valid"
     k = int(np.nanargmax(speed))
     return (
-        f"{known} of {speed.size} vectors are valid, the longest is {speed[k]:.3g} m/s at "
+        f"{valid} of {speed.size} vectors are valid, the longest is {speed[k]:.3g} m/s at "
         f"y = {place['y'][k]:g} m, z = {place['z'][k]:g} m"
     )

@@ -64,8 +64,8 @@ def _decay_time(pair: VortexPair, wake: WakeInTime) -> float | None:
 
 def described_pair(pair: VortexPair, encounter: Encounter) -> list[tuple[str, str]]:
     """The analytic wake in words: a name and a line for each of its properties."""
-    wake, found = encounter.wake, analytic_wake(pair, encounter)
-    aged = found.pair if isinstance(found, FilamentsAlongPath) else found
+    wake, analytic = encounter.wake, analytic_wake(pair, encounter)
+    aged = analytic.pair if isinstance(analytic, FilamentsAlongPath) else analytic
     left_by = "" if pair.aircraft is None else f"of an {pair.aircraft}, "
     rows = [
         (
@@ -76,13 +76,13 @@ def described_pair(pair: VortexPair, encounter: Encounter) -> list[tuple[str, st
     ]
     if aged.decay_time is not None:
         rows.append(("decay of the vortices", f"to 1/e in {aged.decay_time:.3g} s"))
-    if isinstance(found, FilamentsAlongPath) and wake.crow.amplitude:
+    if isinstance(analytic, FilamentsAlongPath) and wake.crow.amplitude:
         age = linking_age(wake.crow.amplitude, pair.circulation, pair.separation)
         since = wake.age + aged.t_c - age
         text = (
             f"rings since {since:.3g} s"
-            if found.rings
-            else f"waves of {found.amplitude:.3g} m, linking in {-since:.3g} s"
+            if analytic.rings
+            else f"waves of {analytic.amplitude:.3g} m, linking in {-since:.3g} s"
         )
-        rows.append(("Crow instability", f"{text}, {found.wavelength:.3g} m long"))
+        rows.append(("Crow instability", f"{text}, {analytic.wavelength:.3g} m long"))
     return rows
