@@ -29,7 +29,7 @@ Controller = Callable[[Preview, AircraftState], Commands]
 """Commands from the preview, of no loads while nothing is known, and the state."""
 
 Transfer = Callable[[Preview | None, AircraftState], Preview]
-"""The preview to steer by, from the present one (None: there is none) and the state."""
+"""The preview to steer by, from the present one, or None, and the state."""
 
 RATE_TIME = 0.5
 """A roll rate counts as much as the bank angle that it makes in this time, s."""
@@ -74,7 +74,7 @@ def _fraction_of(preview: Preview, fraction: float) -> Preview:
 
 
 def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
-    """Levelling alone: the roll rate -roll / time (s) is asked for; without a time nothing steers.
+    """Levelling: commands the roll rate -roll / time (s); without a time nothing steers.
 
     The aileron deflects by L_p / L_da roll / time. Without limits and slow against the roll mode,
     a bank angle decays with this time.

@@ -49,7 +49,7 @@ def identical(
 ) -> str:
     """Which images, counted from a start, are the same as the one before, in words; empty: none.
 
-    Two exposures never are: there is one image where two were meant.
+    Two exposures never are: one image was given twice.
     """
     same = [
         f"{first} and {first + 1}"

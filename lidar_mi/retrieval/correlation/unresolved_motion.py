@@ -135,7 +135,7 @@ def unresolved(
 
 
 def _significant(terms: torch.Tensor, square: torch.Tensor, visible: float) -> np.ndarray:
-    """Factors (2,) of the last two terms by least squares, as far as they are not by chance.
+    """Factors (2,) of the last two terms by least squares, as far as they are significant.
 
     With the least values, k and 0, the sum of squares is larger by F variances. By chance F is 2 in
     the mean, as two factors are fitted: of the difference from the least values the fraction

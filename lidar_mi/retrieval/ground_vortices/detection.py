@@ -264,7 +264,7 @@ def _scores(
 def _merged_patterns(which: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Numbers of patterns of usable cells, of which there are at most `_MOST_PATTERNS`.
 
-    Of rarer ones, those that lack the same rows or columns have one pattern: what all of them have.
+    Rarer patterns that lack the same rows or columns are replaced by their common part.
     """
     number = np.bincount(which)
     if len(number) <= _MOST_PATTERNS:

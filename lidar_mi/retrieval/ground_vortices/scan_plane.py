@@ -149,7 +149,7 @@ def _passes(angle: np.ndarray, time: np.ndarray) -> list[slice]:
 def _clock(steps: np.ndarray) -> float:
     """Resolution of times in which several lines are equal, s; 0: none are.
 
-    Lines that are there twice are not: a clock repeats a fifth of all times or more.
+    Lines stored twice do not count: a clock repeats a fifth of all times or more.
     """
     positive = steps[steps > 0]
     if not positive.size or np.mean(steps == 0) < 0.2:

@@ -296,7 +296,7 @@ def _explains(pattern: Pattern, noise: float) -> bool:
 def _rings_alone(sectors: Sectors, spacing: float | None) -> Pattern | None:
     """Lines of the strongest period where they explain the profile, of a longer one where not.
 
-    None where neither does: nothing is hidden of rings that are not there.
+    None where neither does: without rings nothing is hidden.
     """
     profile, noise = _profile(sectors)
     if spacing is None:

@@ -102,7 +102,7 @@ def _options(method: Method, given: PairInput, validation: VectorValidation) -> 
 
 
 def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str, Any]:
-    """Remarks on the images; none where there is nothing to remark."""
+    """Remarks on the images, without empty ones."""
     pattern = vectors.pattern
     patterns = [str(part) for part in (clean.defects.pattern, pattern) if str(part)]
     remarks = {
