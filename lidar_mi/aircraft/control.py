@@ -48,8 +48,8 @@ def bumpless_transfer() -> Transfer:
     """From a preview that is lost to no loads, over the `HORIZON` of the plan.
 
     Loads that a lost preview expects are weighted by a factor that falls linearly from 1 to 0. So
-    an aileron that holds against a wake does not let go at once, and what is extrapolated from a
-    track that has ended counts less and less. Before the first preview no loads are expected.
+    an aileron held against a wake returns gradually, and the extrapolation of an ended track loses
+    its weight. Before the first preview no loads are expected.
     """
     last: Preview = no_loads
     last_time = -np.inf

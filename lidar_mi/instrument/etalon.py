@@ -292,8 +292,8 @@ def coated_transmission(
 ) -> np.ndarray:
     """Transmittance of perfectly even coated plates, by transfer matrices.
 
-    With all dispersion of the coatings and their dependence on angle and polarisation, which the
-    series leaves out.
+    It has the dispersion of the coatings and their dependence on angle and polarisation, which the
+    series neglects.
 
     Parameters
     ----------

@@ -23,8 +23,8 @@ def checked_stack(
 ) -> tuple[list[xr.DataArray], float | xr.DataArray | None]:
     """All images, and the noise if it is an image, with these dims on one uniform grid.
 
-    Noise need not be known where image 1 is not finite either, as outside of the beams of a
-    resampled scan: it is the median there, and counts for nothing.
+    Where image 1 is not finite either, as outside of the beams of a resampled scan, unknown noise
+    is replaced by the median, which has no effect.
 
     Raises
     ------

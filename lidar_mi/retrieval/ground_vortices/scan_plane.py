@@ -243,8 +243,8 @@ def _azimuth(azimuth: np.ndarray, elevation: np.ndarray) -> float:
 def _noise_variance(velocity: np.ndarray) -> np.ndarray:
     """Variance of independent noise from second differences of three lines, each gate its own.
 
-    Robust, by the median of their absolute values; the air adds to it what differs from line to
-    line.
+    It is robust, from the median of their absolute values; differences of the air from line to line
+    add to it.
     """
     second = velocity[:-2] - 2 * velocity[1:-1] + velocity[2:]
     known = np.isfinite(second).any(0)

@@ -144,8 +144,8 @@ def mean_wind(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Average wind over the path of a level (3,), m/s, and its covariance (3, 3).
 
-    Under each model by universal kriging (Cressie, Statistics for Spatial Data, 1993, section 3.4);
-    the spread of the models is part of the error.
+    Both are by universal kriging under each model (Cressie, Statistics for Spatial Data, 1993,
+    section 3.4); the spread of the models is part of the error.
     """
     path = level.path[:: math.ceil(len(level.path) / _MOST_PLACES)]
     means = level.averaged(level.design)

@@ -27,9 +27,9 @@ def wind_bound(
 
     The Cramer-Rao bound, see `bound.displacement_bound`. Grid and parameters are those of
     `retrieve_wind`, as is the time difference of a vector, which is that of air at rest. Infinite
-    without texture, NaN near non-finite pixels. A field that is fitted
-    to the images as a whole uses more than a template and may be better. Noise below 0.001 of the
-    median of a map is raised to that.
+    without texture, NaN near non-finite pixels. A field that is fitted to the images as a whole
+    uses more than a template and may be better. Noise below 0.001 of the map's median is raised to
+    that value.
 
     Returns
     -------
