@@ -91,12 +91,12 @@ def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
 def feedforward(aircraft: AircraftModel) -> Controller:
     """The aileron planned against the roll by the wake ahead; the other controls cancel moments.
 
-    Where the wake has more moment than the ailerons, cancelling leaves the difference. An aircraft
-    with a preview banks a little to the other side before. The deflections of the next `HORIZON`
-    minimise the sum of roll^2 + (`RATE_TIME` roll rate)^2 of the linear roll mode, from the state
-    flown and the moments expected, within the limits of deflection and rate; the first is
-    commanded, and all are planned again at the next call. Elevator and rudder cancel, as in
-    `cancelling`; the rudder's rolling moment is part of the plan.
+    Where the wake has more moment than the ailerons, cancelling is incomplete. An aircraft with a
+    preview first banks a little to the other side. The deflections of the next `HORIZON` minimise
+    the sum of roll^2 + (`RATE_TIME` roll rate)^2 of the linear roll mode, from the state flown and
+    the moments expected, within the limits of deflection and rate; the first is commanded, and all
+    are planned again at the next call. Elevator and rudder cancel, as in `cancelling`; the rudder's
+    rolling moment is part of the plan.
 
     Of a `RisingAircraft` elevator and symmetric ailerons are planned against loads (`load_plan`),
     with the travel of the ailerons that the plan of roll leaves.

@@ -118,8 +118,8 @@ def combined(
 class _Geometry:
     """Estimate from one line of the shared part of the instrument.
 
-    ``information`` is the inverse of its covariance, ``determined`` that of its
-    frames without the prior, which all lines have in common.
+    ``information`` is the inverse of its covariance, ``determined`` that of its frames without the
+    prior, as all lines share the prior.
     """
 
     places: list[int]  # in `Calibration.systematic`
