@@ -120,13 +120,13 @@ def _fail_usage(error: Any) -> NoReturn:
 def _raised_signals() -> Iterator[None]:
     """Terminating signals raise `Stopped`, except ignored ones (nohup)."""
     before = {number: signal.getsignal(number) for number in STOPPING}
-    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    signals = [number for number, handler in before.items() if handler != signal.SIG_IGN]
     try:
-        for number in caught:
+        for number in signals:
             signal.signal(number, _raise_stopped)
         yield
     finally:
-        for number in caught:
+        for number in signals:
             signal.signal(number, before[number])
 
 

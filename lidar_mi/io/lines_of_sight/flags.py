@@ -260,8 +260,8 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
     usable = np.where(bad, np.nan, snr)
     for line in np.flatnonzero(low):
         bright = 10 ** (HARD_TARGET_DB / 10) * _median_before(usable[line], width)
-        still = np.abs(velocity[line]) < HARD_TARGET_SPEED
-        (gates,) = np.nonzero(still & (usable[line] > bright))
+        at_rest = np.abs(velocity[line]) < HARD_TARGET_SPEED
+        (gates,) = np.nonzero(at_rest & (usable[line] > bright))
         if gates.size:
             blocked[line, max(gates[0] - width, 0) :] = True
     return blocked
