@@ -89,7 +89,7 @@ class WindFlag(enum.IntFlag):
     OUTLIERS = 4
     """More than a third of the lines are outliers."""
     ERROR_UNKNOWN = 8
-    """No residual and no stated noise tells the error."""
+    """Neither residuals nor a stated noise give an error."""
     UNCERTAIN = 16
     """The standard error of the horizontal wind is above `MAX_STDERR`."""
     FOLDED = 32

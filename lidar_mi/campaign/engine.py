@@ -188,7 +188,7 @@ def connected(
     """
     if isinstance(client, Client):
         _make_ready(client, threads, own_cache=True)
-        # the caller's: it is theirs to close
+        # the caller closes it
         yield client
         return
     if client is not None:
@@ -206,12 +206,12 @@ def connected(
         "distributed.scheduler.allowed-failures": 10**6,
         "distributed.scheduler.worker-saturation": 1.1,
         "distributed.worker.multiprocessing-method": "spawn",
-        # without dask's limit to what malloc keeps, with which every large array is mapped anew
+        # without dask's limit for malloc, by which every large array is mapped anew
         "distributed.nanny.pre-spawn-environ": dict.fromkeys(_ONE_THREAD, threads)
-        # points run in a thread of their own, whose memory is otherwise mapped anew every time
+        # points run in separate threads, whose memory is otherwise mapped anew every time
         | {"MALLOC_ARENA_MAX": 1},
         "distributed.logging.distributed": "critical",
-        # its profiler looks at the workers a hundred times a second: a fifth of a short point
+        # its profiler samples the workers a hundred times a second: a fifth of a short point's time
         "distributed.worker.profile.enabled": False,
         "distributed.worker.memory.monitor-interval": "1s",
         "distributed.admin.tick.interval": "1s",
@@ -229,7 +229,7 @@ def connected(
                 silence_logs=50,
             )
             open_until_the_end.enter_context(cluster)
-            # the default client is that of the user's own code
+            # the default client belongs to the user's code
             cluster_client = open_until_the_end.enter_context(Client(cluster, set_as_default=False))
             cluster_client.wait_for_workers(1, timeout=60)
         _make_ready(cluster_client, threads, own_cache=False)
@@ -319,7 +319,7 @@ class _Dispatch:
 
     def _submit(self, number: int) -> None:
         first, ready = self._renderings(number)
-        # a key of its own: dask returns the old result of a key that it knows
+        # a new key: dask returns the old result of a known key
         future = self.client.submit(
             carry_out,
             self.path,
@@ -377,7 +377,7 @@ class _Dispatch:
             return
         except InputError:  # the folder, not the point
             raise
-        except Exception as error:  # a point's own failure is an outcome
+        except Exception as error:  # a failed point is an outcome
             raise InputError(
                 f"the scheduler or its workers are lost ({one_line(error)[:100]}); start the "
                 "campaign again to complete it"

@@ -84,14 +84,14 @@ def _message(error: BaseException) -> str | None:
     if isinstance(error, OSError):
         names = [str(name) for name in (error.filename, error.filename2) if name is not None]
         return ": ".join([*names, error.strerror or str(error)])
-    # torch has no type of its own for it
+    # torch has no exception type for it
     no_memory = isinstance(error, RuntimeError) and "allocate memory" in str(error)
     if isinstance(error, MemoryError) or no_memory:
         return (
             f"not enough memory ({one_line(error, 100) or 'in all'}); expected fewer beams, gates "
             "or samples, or a larger machine"
         )
-    # numpy, scipy and torch each have their own
+    # numpy, scipy and torch each have their own type
     if type(error).__name__.lstrip("_") == "LinAlgError":
         reason = one_line(error, 100)
         return f"equations without a solution ({reason}); expected data that determine it"
@@ -117,7 +117,7 @@ def _fail_usage(error: Any) -> NoReturn:
 
 @contextmanager
 def _raised_signals() -> Iterator[None]:
-    """Let terminating signals raise `Stopped`, except those that are ignored (nohup)."""
+    """Terminating signals raise `Stopped`, except ignored ones (nohup)."""
     before = {number: signal.getsignal(number) for number in STOPPING}
     caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
     try:

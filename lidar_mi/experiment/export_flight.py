@@ -36,7 +36,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
         # parameters with their covariances, and vectors, are for a replay
         track = read_netcdf(files["track"]).drop_dims(_FOR_A_REPLAY, errors="ignore")
         if placed:
-            yield from ((f"vortices_{name}", _points(track, name)) for name in _sources(track))
+            sources = map(str, track["source"].values)
+            yield from ((f"vortices_{name}", _points(track, name)) for name in sources)
         else:
             yield "track", track
     if files["slabs"].is_file():
@@ -52,10 +53,6 @@ def _of_slabs(slabs: xr.Dataset, *axes: str) -> xr.Dataset:
     names = [name for name, value in slabs.data_vars.items() if {"x", *axes} == set(value.dims)]
     chosen = slabs[names]
     return chosen.drop_vars([name for name in chosen.coords if name not in ("x", *axes)])
-
-
-def _sources(track: xr.Dataset) -> list[str]:
-    return [str(name) for name in track["source"].values]
 
 
 def _points(track: xr.Dataset, source: str) -> xr.Dataset:

@@ -1,7 +1,7 @@
 """Boxes of wind for wind turbines: TurbSim's full fields (.bts), Mann boxes of HAWC2 (.bin).
 
-Both become a volume at rest in its mean wind, on (x, y, z): x along the wind, y to the left of who
-looks along it, z up.
+Both become a volume at rest in its mean wind, on (x, y, z): x along the wind, y to the left facing
+along it, z up.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""Scene files, looked at before Mitsuba parses them."""
+"""Scene files, checked before Mitsuba parses them."""
 
 from pathlib import Path
 from xml.parsers import expat
@@ -10,9 +10,9 @@ DEEPEST = 64
 
 
 def check_scene_file(path: str | Path) -> None:
-    """Refuse a scene that would take the process down, before anything parses it as a whole.
+    """Refuse a scene that would crash the process, before it is parsed as a whole.
 
-    Files that it includes are looked at, too.
+    Included files are checked, too.
 
     Raises
     ------

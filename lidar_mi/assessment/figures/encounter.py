@@ -305,7 +305,7 @@ def _track(track: xr.Dataset) -> Captioned:
     for row, (name, label) in zip(panels, _ROWS, strict=True):
         for axes, (side, colour) in zip(row, SIDES.items(), strict=True):
             key = f"{side}_{name}"
-            # along the path places change by far more than they are wrong
+            # along the path, places change by far more than their errors
             zero = truth[key].values if name in "yz" else 0.0
             spread = TWO_SIGMA * tracked[f"{key}_stderr"].values
             middle, single = tracked[key].values - zero, estimate[key].values - zero

@@ -1,6 +1,7 @@
 """The flight as a film in real time: the last slab delivered, the wings, where the aircraft is.
 
-States are interpolated from frame to frame. What rests is drawn once, what moves on top of it.
+States are interpolated from frame to frame. The background is drawn once, moving parts on top of
+it.
 """
 
 from collections.abc import Iterator

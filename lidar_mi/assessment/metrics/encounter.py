@@ -144,11 +144,11 @@ def felt_from(series: xr.Dataset) -> float:
 def measured_in_flight(
     series: xr.Dataset, track: xr.Dataset, slab_depth: float
 ) -> dict[str, float]:
-    """Rows of a requirement table in flight: range from the time from an estimate to its slab.
+    """Rows of a requirement table, as measured in flight.
 
-    The range is what the aircraft flies from the moment at which an estimate is there to its slab;
-    errors are those of valid vectors and of lines of sight against the truth; u and lines of sight
-    are absent without a Doppler lidar.
+    The range is the distance flown from the delivery of an estimate to its slab; errors are those
+    of valid vectors and of lines of sight against the truth; u and lines of sight are absent
+    without a Doppler lidar.
     """
     measured = track.where(track["vectors"] > 0, drop=True)
     # as the flight begins: the wake changes it

@@ -1,7 +1,7 @@
 """Whether a cross-flow can be that of a wake: its sense of rotation, its divergence.
 
-A velocity or an axis of the wrong sign makes a flow that no air has, or one that rises where wakes
-descend. Every number of a run is then computed without complaint.
+A velocity or an axis of the wrong sign gives an impossible flow, or a wake that rises, and no error
+message.
 """
 
 from collections.abc import Sequence

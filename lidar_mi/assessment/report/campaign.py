@@ -127,7 +127,7 @@ def _axis(dataset: xr.Dataset, name: str) -> Axis:
     at = dataset[name]
     if not numbers.is_numeric(dataset, name):
         return Axis(name, label_of(at, name), False, tuple(str(value) for value in at.values))
-    # the description of a list does not say
+    # the description of a list does not state its scale
     guess = "log" if numbers.spaced_by_factors(at.values) else "linear"
     return Axis(name, label_of(at, name), at.attrs.get("scale", guess) == "log")
 

@@ -96,7 +96,7 @@ def _limit_of_u(metrics: Mapping[str, float]) -> list[str]:
 
 
 def _not_stated(errors: PlatformErrors) -> list[str]:
-    """That the platform has errors which standard errors do not include."""
+    """A sentence on errors of the platform that standard errors do not include."""
     if errors == PlatformErrors():
         return []
     text = (

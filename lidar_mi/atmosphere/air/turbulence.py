@@ -68,8 +68,8 @@ def energy_spectrum(k: ArrayLike, sigma: float, length: float, spectrum: Spectru
 class Turbulence:
     """One realisation of turbulence: a Gaussian field without divergence.
 
-    u(x, t) = sum over modes of a cos(k x - w t) + b sin(k x - w t) with a and b normal to k. Each
-    octave of wavenumbers has as many modes as any other; they hold the energy of the spectrum.
+    u(x, t) = sum over modes of a cos(k x - w t) + b sin(k x - w t) with a and b normal to k. Every
+    octave of wavenumbers has the same number of modes, with the energy of the spectrum.
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ class FilamentsAlongPath:
 
     @property
     def wavelength(self) -> float:
-        """m."""
+        """Wavelength, m."""
         return self.pair.crow_wavelength or CROW_WAVELENGTH * self.pair.separation
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Rendered images in a folder, finished and unfinished, each signed by what it was made from."""
+"""Rendered images in a folder, finished and unfinished, each with a signature of its inputs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,8 +23,7 @@ BATCHES = "_batches.npz"
 class ImageStore:
     """Images of both lidars, by the names of the parts of their stages.
 
-    Rendered images are read back, so that they have the same float32 values whether they were
-    rendered just now or found.
+    Rendered images are read back, so that new and stored ones have the same float32 values.
 
     Attributes
     ----------

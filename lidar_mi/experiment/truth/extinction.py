@@ -24,7 +24,7 @@ from lidar_mi.schema.wake import ExtinctionMapping
 
 
 class Later(Sequence[xr.DataArray]):
-    """A field at t1 and t2; that at t2 is advected when it is first asked for.
+    """A field at t1 and t2; that at t2 is advected on first use.
 
     Advection of a volume takes seconds, and nothing that is checked before a run needs it.
     """

@@ -52,7 +52,7 @@ def mean_flow(flows: Flows) -> xr.Dataset:
 def advection_by(observation: Observation, flows: Flows) -> Advection:
     """From a field to the field after dt in the frame of the gates; trajectories are followed once.
 
-    They are followed when they are first needed: a field of one value stays.
+    They are computed on first use: a uniform field needs none.
     """
     flow, dt = mean_flow(flows), observation.platform.dt
 
@@ -212,7 +212,7 @@ def _advected_along(flow: xr.Dataset, platform: Platform, scan: Scan) -> Flows:
 def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
     """Variables that the extinction needs of a wake's file; names of all in the file.
 
-    Tracers of the extinction have our names once they are read.
+    Tracers of the extinction have our names after reading.
     """
     mapping = wake.extinction
     in_file = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}

@@ -42,7 +42,7 @@ class MeanWind:
         return self.along + math.cos(towards) * speed, self.left + math.sin(towards) * speed
 
     def to_the_left(self, height: np.ndarray) -> np.ndarray:
-        """The second alone."""
+        """The component to the left alone."""
         return self.at(height)[1]
 
 

@@ -25,7 +25,7 @@ _LARGEST_GATES = 100_000
 
 
 def read_halo(path: Path) -> Scan:
-    """The rays of a file, as many as there are, whatever the header promises.
+    """All rays of a file, whatever number the header states.
 
     Gates are adjacent, (gate + 1/2) gate lengths away, but for scans that are called overlapping:
     these begin at every sample, gate length over points apart.
@@ -123,7 +123,7 @@ def _start(head: dict[str, str], path: Path) -> datetime:
 
 
 def _times(hours: np.ndarray, start: datetime) -> np.ndarray:
-    """Times of decimal hours, which begin again at midnight: a step back by half a day is one."""
+    """Times of decimal hours, which restart at midnight: a step back by more than half a day."""
     midnight = datetime(start.year, start.month, start.day)
     first = (start - midnight).total_seconds() / 3600
     days = np.cumsum(np.diff(hours, prepend=first) < -12)
@@ -188,7 +188,7 @@ def _gates(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
 def _numbers_of(text: str) -> np.ndarray:
     """Numbers of a text, (n,); none if there is a word that is no number."""
     with warnings.catch_warnings():
-        # by the version of numpy, what is no number ends the reading or is an error
+        # by the version of numpy, a word that is no number ends the reading or is an error
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
             return np.fromstring(text, sep=" ")

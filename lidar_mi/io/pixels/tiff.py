@@ -17,7 +17,7 @@ from lidar_mi.io.size import check_size
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
-# what the library only logs, and goes on with part of the file
+# faults that the library only logs before it reads part of the file
 _LOSSES = re.compile(
     r"invalid (page )?offset|invalid next page|corrupted (tag list|file)|circular|"
     r"missing (\d+ )?(frames|pages|files|data|ByteCounts)|series metadata|failed to read|"
@@ -73,7 +73,7 @@ def read_tiff(path: Path) -> Frames:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The file; what the library says or raises becomes one line."""
+    """The file; messages and exceptions of the library become one line."""
     import tifffile
 
     logger, lost = logging.getLogger("tifffile"), _Lost()
@@ -169,7 +169,7 @@ def _pixels(path: Path, page: "TiffPage") -> np.ndarray:
 
 
 def _check(path: Path, page: "TiffPage", count: int = 1) -> int:
-    """Refuse what is no light, or not there; the number of channels of transparency."""
+    """Refuse pixels that are no light or are missing; the number of transparency channels."""
     import tifffile
 
     samples, photometric = page.samplesperpixel, int(page.photometric)
@@ -221,7 +221,7 @@ def _is_ramp(colours: np.ndarray | None) -> bool:
         return False
     first = np.asarray(colours[0], float)
     ideal = np.linspace(0, first[-1], len(first))
-    # of 8 bits in 16: within one step of them
+    # 8 bits scaled to 16: equal within one step
     return bool((colours == colours[0]).all() and first[-1] and abs(first - ideal).max() <= 256)
 
 

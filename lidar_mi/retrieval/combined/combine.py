@@ -148,7 +148,7 @@ def combine(
     jets, 80 to 90 and 97 %.
     """
     if time is None and "time" in crossflow:
-        # variables: with their coordinates this takes ten times as long
+        # variables, as with coordinates this takes ten times as long
         times, flags = (crossflow.variables[name] for name in ("time", "flag"))
         time = float(times.where(flags == 0).mean())
     crossflow, scan = at_common_time(
@@ -183,7 +183,7 @@ def combine(
     spacing = line_spacing(lines, z, y)
     relative_stds = relative_std(field, lines, z, y, spacing, u_power)
     known = u_std, u_length, u_exponent
-    found, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, known)
+    drawn, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, known)
     valid = field.valid
     wind = np.zeros((*valid.shape, 3))
     covariance = np.zeros((*valid.shape, 3, 3))
@@ -192,7 +192,7 @@ def combine(
     for start in range(0, len(z), rows):
         chunk = slice(start, start + rows)
         wind[chunk], covariance[chunk] = _posterior(
-            chunk, field, lines, overlap, found, relative_stds, residual, shared, z, y
+            chunk, field, lines, overlap, drawn, relative_stds, residual, shared, z, y
         )
     wind[..., 1:] += slope * wind[..., :1]
     shear = np.zeros((*valid.shape, 3, 3)) + np.eye(3)
@@ -219,7 +219,7 @@ def combine(
     if ROTATION in crossflow:
         combined[ROTATION] = crossflow[ROTATION]
     if field.common.any():
-        combined = _with_common(combined, field, *_common(field, found, residual, shared))
+        combined = _with_common(combined, field, *_common(field, drawn, residual, shared))
     return combined
 
 

@@ -31,15 +31,15 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
     for name in _NAMES:
         if name not in scan:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
-    # variables: their coordinates take longer to attach than all checks
+    # variables, as attaching coordinates takes longer than all checks
     variables = scan.variables
-    own = {"line"} & set(variables["platform_velocity"].dims)
+    each_line = {"line"} & set(variables["platform_velocity"].dims)
     for name, dims in (
         ("v_los", {"line"}),
         ("v_los_std", {"line"}),
         ("range", {"line"}),
         ("direction", {"line", "axis"}),
-        ("platform_velocity", {"axis"} | own),
+        ("platform_velocity", {"axis"} | each_line),
         ("origin", {"line", "axis"}),
     ):
         if name in variables and set(variables[name].dims) != dims:
@@ -117,7 +117,7 @@ def solve_lines(
     """
     matrix = directions / std[..., None]
     left, values, right = np.linalg.svd(matrix, full_matrices=False)
-    # of the directions themselves: errors may differ by orders of magnitude
+    # unweighted, as errors may differ by orders of magnitude
     unweighted = np.linalg.svd(directions, compute_uv=False)
     flat = unweighted[:, -1] <= _COPLANAR * unweighted[:, 0]
     inverse = 1 / np.where(flat[:, None], np.nan, values)
@@ -228,7 +228,7 @@ def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str
     shared = shared_covariance(scan)
     if shared is not None:
         shared = np.nan_to_num(shared[lines[:, :, None], lines[:, None]])
-    # any number will do: the results are replaced by NaN below
+    # a placeholder: these results become NaN below
     wind, covariance, chi_square = solve_lines(
         directions,
         np.where(missing[:, None], 0.0, values),
@@ -275,7 +275,7 @@ def error_variables(
 ) -> dict[str, tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]]:
     """Standard errors and correlations of u, v, w from covariances (..., 3, 3), as variables."""
     stderr = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    found = {
+    variables = {
         f"{name}_stderr": (
             dims,
             stderr[..., index],
@@ -284,12 +284,12 @@ def error_variables(
         for index, name in enumerate(COMPONENTS)
     }
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        both = stderr[..., i] * stderr[..., j]
+        product = stderr[..., i] * stderr[..., j]
         correlation = np.divide(
-            covariance[..., i, j], both, out=np.zeros_like(both), where=both > 0
+            covariance[..., i, j], product, out=np.zeros_like(product), where=product > 0
         )
-        correlation[np.isnan(both)] = np.nan
+        correlation[np.isnan(product)] = np.nan
         first, second = COMPONENTS[i], COMPONENTS[j]
         text = {"units": "1", "long_name": f"correlation of the errors of {first} and {second}"}
-        found[f"{first}{second}_correlation"] = (dims, correlation, text)
-    return found
+        variables[f"{first}{second}_correlation"] = (dims, correlation, text)
+    return variables

@@ -65,13 +65,13 @@ def cross_correlation(
     # before the conversion to the working precision, which hides how the numbers were rounded
     floors = [_rounding(image) for image in (image1, image2)]
     image1, image2 = working(filled(image1)), working(filled(image2))
-    found = Displacement.empty(windows, image1)
+    displacement = Displacement.empty(windows, image1)
     for tile in windows.tiles(_bytes_per_window(windows, chosen)):
         coefficient = _correlate(image1[tile.pixels], image2[tile.pixels], windows, chosen, floors)
-        found.fill(_peak(coefficient, windows, min_correlation), tile.vectors)
-    found.d[:, bad] = torch.nan
-    found.flag[bad] |= Flag.NON_FINITE_INPUT.value
-    return found
+        displacement.fill(_peak(coefficient, windows, min_correlation), tile.vectors)
+    displacement.d[:, bad] = torch.nan
+    displacement.flag[bad] |= Flag.NON_FINITE_INPUT.value
+    return displacement
 
 
 def correlate(

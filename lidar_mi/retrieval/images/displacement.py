@@ -49,7 +49,7 @@ class Displacement(NamedTuple):
         return self.d[-1]
 
     def medians(self) -> "Displacement":
-        """Of 3 vectors along each axis, without chance peaks; NaN where no vector is known."""
+        """Medians of 3 vectors along each axis; NaN where no vector is known."""
         dims = len(self.d)
         around = pad(self.d, (1, 1) * dims, value=torch.nan)
         for axis in range(1, dims + 1):

@@ -23,9 +23,9 @@ def check_between(name: str, value: float, low: float, high: float) -> None:
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
 # noise: (1/2) from the difference times (1 + 4 + 1) / 16 from the smoothing across it.
 _SOBEL_NOISE = 3 / 16
-# By which texture exceeds its thresholds that exceeds them clearly.
+# Factor by which clear texture exceeds its thresholds.
 _MARGIN = 1.5
-# Standard error, px, that is no reason to reject a vector in any wind.
+# Standard error, px, up to which no vector is rejected.
 SMALL = 0.05
 
 
@@ -74,10 +74,10 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
     squares = eigenvalues(along_y, across, along_z)
     weakest, strongest = (square.clamp(min=0).sqrt() for square in squares)
     mean = windows.of_templates(image)
-    some = weakest > 0
+    textured = weakest > 0
     return Texture(
-        torch.where(some, weakest / mean.abs(), 0.0),
-        torch.where(some, weakest / strongest, 0.0),
+        torch.where(textured, weakest / mean.abs(), 0.0),
+        torch.where(textured, weakest / strongest, 0.0),
         mean,
     )
 
@@ -106,7 +106,7 @@ def low_texture(
         raise InputError(f"min_texture: {min_texture!r} px^-1 is not >= 0")
     check_between("min_isotropy", min_isotropy, 0, 1)
     image = working(image)
-    found = texture(image, windows)
+    textures = texture(image, windows)
     sigma = torch.as_tensor(noise, dtype=image.dtype, device=image.device)
     if sigma.ndim and sigma.shape != image.shape:
         raise InputError(
@@ -116,13 +116,13 @@ def low_texture(
     if not bool((sigma >= 0).all()):
         raise InputError("noise: not a standard deviation >= 0 everywhere")
     variance = windows.of_templates((sigma**2).expand_as(image))
-    squared = (found.slope * found.mean) ** 2
+    squared = (textures.slope * textures.mean) ** 2
     low = (
-        (found.slope <= min_texture)
-        | (found.isotropy < min_isotropy)
+        (textures.slope <= min_texture)
+        | (textures.isotropy < min_isotropy)
         | (squared < 2 * _SOBEL_NOISE * variance)
     )
-    return found, low
+    return textures, low
 
 
 def clearly_textured(
