@@ -52,14 +52,14 @@ def bumpless_transfer() -> Transfer:
     track that has ended counts less and less. Before the first preview no loads are expected.
     """
     last: Preview = no_loads
-    seen = -np.inf
+    last_time = -np.inf
 
     def transfer(preview: Preview | None, state: AircraftState) -> Preview:
-        nonlocal last, seen
+        nonlocal last, last_time
         if preview is not None:
-            last, seen = preview, state.time
+            last, last_time = preview, state.time
             return preview
-        fraction = 1 - (state.time - seen) / HORIZON
+        fraction = 1 - (state.time - last_time) / HORIZON
         return _fraction_of(last, fraction) if fraction > 0 else no_loads
 
     return transfer
@@ -68,7 +68,7 @@ def bumpless_transfer() -> Transfer:
 def _fraction_of(preview: Preview, fraction: float) -> Preview:
     def expected(time: ArrayLike) -> Loads:
         loads = preview(time)
-        return Loads(*(fraction * one for one in (loads.force, loads.moment, loads.bending)))
+        return Loads(*(fraction * part for part in (loads.force, loads.moment, loads.bending)))
 
     return expected
 

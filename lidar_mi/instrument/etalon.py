@@ -275,8 +275,8 @@ def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> floa
     amplitudes = harmonics(etalon, wavelength, line)
 
     def above_half(order: float) -> float:
-        both = series(amplitudes, [order, 0.0])
-        return float(both[0] - both[1] / 2)
+        transmitted = series(amplitudes, [order, 0.0])
+        return float(transmitted[0] - transmitted[1] / 2)
 
     if above_half(0.5) >= 0:
         raise InputError("etalon: no finesse; its fringes nowhere fall to half their height")

@@ -30,7 +30,8 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
         try:
             return render()
         except Exception as error:
-            if not _is_full(error):
+            # Dr.Jit has no exception of its own for this
+            if not any("out of memory" in str(cause).lower() for cause in causes(error)):
                 raise
             if integrator.samples_per_pass <= LEAST:
                 raise InputError(
@@ -42,8 +43,3 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
         gc.collect()
         dr.flush_malloc_cache()
         integrator.samples_per_pass = max(LEAST, integrator.samples_per_pass // _SMALLER)
-
-
-def _is_full(error: BaseException) -> bool:
-    """Whether Dr.Jit got no memory: it has no type for it."""
-    return any("out of memory" in str(one).lower() for one in causes(error))

@@ -35,8 +35,8 @@ def checked_stack(
     others = {f"{name}{n}": image for n, image in enumerate(stack[1:], 2)}
     if isinstance(noise, xr.DataArray):
         noise = others["noise"] = checked_image("noise", noise, axes)
-    for other, image in others.items():
-        same_grid(stack[0], image, other, f"{name}1")
+    for label, image in others.items():
+        same_grid(stack[0], image, label, f"{name}1")
     if isinstance(noise, xr.DataArray):
         unknown = np.isnan(noise) & ~np.isfinite(stack[0])
         if bool(unknown.any()):
@@ -53,8 +53,8 @@ def identical(
     """
     same = [
         f"{first} and {first + 1}"
-        for first, (one, other) in enumerate(pairwise(iter(images)), start)
-        if np.array_equal(np.asarray(one), np.asarray(other), equal_nan=True)
+        for first, (image, following) in enumerate(pairwise(iter(images)), start)
+        if np.array_equal(np.asarray(image), np.asarray(following), equal_nan=True)
     ]
     more = f" and {len(same) - 3} more pairs" if len(same) > 3 else ""
     return f"{name} {', '.join(same[:3])}{more} are the same, bit for bit" if same else ""
@@ -126,9 +126,9 @@ def same_grid(
         axes = " x ".join(map(str, image1.dims))
         raise InputError(f"{name}: sizes {sizes} {unit} ({axes}) differ; both must have one grid")
     for axis in image1.dims:
-        one, other = (i.coords.variables[axis].values.astype(float) for i in (image1, image2))
-        off = np.abs(one - other).max()
-        if off > 1e-3 * np.diff(one).mean():
+        nodes1, nodes2 = (i.coords.variables[axis].values.astype(float) for i in (image1, image2))
+        off = np.abs(nodes1 - nodes2).max()
+        if off > 1e-3 * np.diff(nodes1).mean():
             raise InputError(
                 f"{name}.{axis}: up to {off:g} m off {first}'s; resample both onto one grid"
             )

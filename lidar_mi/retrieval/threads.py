@@ -64,10 +64,10 @@ def in_turn(
     if number < 2:
         yield from map(function, parts)
         return
-    # modes are of a thread
-    alike = torch.inference_mode(torch.is_inference_mode_enabled())(function)
+    # inference mode is local to a thread
+    in_mode = torch.inference_mode(torch.is_inference_mode_enabled())(function)
     try:
         with ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            yield from pool.map(alike, parts)
+            yield from pool.map(in_mode, parts)
     finally:
         torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""What a coherent Doppler lidar measures of the wind: range weighting along a line of sight."""
+"""Range weighting of a coherent Doppler lidar along a line of sight."""
 
 import math
 from collections.abc import Callable

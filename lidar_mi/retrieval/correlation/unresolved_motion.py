@@ -43,7 +43,7 @@ class Residuals(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The known motion on pixels, and what windows make of it.
+    """The known motion on pixels, and its averages over windows.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Motion(NamedTuple):
 
 
 class Unresolved(NamedTuple):
-    """Displacement that the vectors lack, and what they absorb of differences of the images.
+    """Displacement that the vectors lack, and the leverage of the images' differences.
 
     Attributes
     ----------
@@ -117,19 +117,19 @@ def unresolved(
         for part in (lost, motion.response * motion.by_errors)
     )
     if int(use.sum()) < fewest * windows.template**windows.dims:
-        return Unresolved(_less(total, by_errors), 1.0)
+        return Unresolved(_without_errors(total, by_errors), 1.0)
     linear, visible = _visible(residuals, motion.within, windows, valid, width, centred)
     weight = residuals.level[use].square().reciprocal()
-    # of the known motion the windows leave a known part
+    # the residual of the known motion contains a part that is known
     known = (residuals.known + linear * (slopes * lost).sum(0))[use].square()
     added = residuals.added[use].square()
     leverage = max(1.0, float((added * weight).sum() / _positive((known * weight).sum())))
-    resolved = _less(total, leverage * by_errors)
+    resolved = _without_errors(total, leverage * by_errors)
     same = torch.eye(windows.dims).to(total)
     same = same.reshape(*same.shape, *[1] * windows.dims).expand_as(total)
     square = (residuals.given[use].square() - leverage * known) * weight
-    seen = [_seen(slopes, m, windows)[use] * weight for m in (resolved, same)]
-    terms = torch.stack([torch.ones_like(weight), *seen])
+    by_motion = [_variance_by_motion(slopes, m, windows)[use] * weight for m in (resolved, same)]
+    terms = torch.stack([torch.ones_like(weight), *by_motion])
     b, c = _significant(terms, square, visible) / visible
     return Unresolved(b * resolved + c * same, leverage)
 
@@ -170,48 +170,50 @@ def _visible(
     """
     slopes, use = residuals.slopes, residuals.use
     square = _products(windows.of_centres(within), valid, width / windows.stride)
-    level = _between(_trace(square), windows) / windows.dims
+    level = _on_pixels(_trace(square), windows) / windows.dims
     fine = within / _positive(level).sqrt()
     weight = residuals.level.square().reciprocal() * use
     difference = (slopes * fine).sum(0)
     matrix = of_windows((slopes[:, None] * slopes * weight).flatten(0, 1), windows, centred)
     matrix = matrix.unflatten(0, (windows.dims,) * 2).movedim((0, 1), (-2, -1))
-    # windows with nothing in them follow nothing
+    # windows without texture follow no motion
     least = 1e-3 * matrix.diagonal(dim1=-2, dim2=-1).mean()
     matrix = matrix + _positive(least) * torch.eye(windows.dims).to(matrix)
     means = of_windows(slopes * difference * weight, windows, centred).movedim(0, -1)
     followed = torch.linalg.solve(matrix, means[..., None])[..., 0].movedim(-1, 0)
     followed = followed - of_windows(fine, windows, centred)
-    left = difference - (slopes * followed).sum(0)
-    part = difference[use], left[use]
+    remaining = difference - (slopes * followed).sum(0)
+    part = difference[use], remaining[use]
     weight = weight[use]
     linear = float((part[0] * part[1] * weight).sum() / _positive((part[0] ** 2 * weight).sum()))
     steep = slopes.square().sum(0)[use] * weight
     terms = torch.stack([torch.ones_like(steep), steep])
-    whole, seen = (_least_squares(terms, p.square() * weight, -np.inf)[1] for p in part)
-    if not 0 < seen <= whole:
+    whole, visible = (_least_squares(terms, p.square() * weight, -np.inf)[1] for p in part)
+    if not 0 < visible <= whole:
         return 1.0, 1.0
-    return linear, float(seen / whole)
+    return linear, float(visible / whole)
 
 
 def _products(field: torch.Tensor, valid: torch.Tensor, width: float) -> torch.Tensor:
     """Local means (axes, axes, ...) of the products of a field's components, where valid."""
-    rows = [[averaged(one * other, valid, width) for other in field] for one in field]
+    rows = [[averaged(a * b, valid, width) for b in field] for a in field]
     return torch.stack([torch.stack(row) for row in rows])
 
 
-def _less(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
-    """A covariance by the fraction of its trace that is not by errors."""
+def _without_errors(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
+    """A covariance times the fraction of its trace that is not due to errors."""
     part = 1 - _trace(by_errors) / _positive(_trace(total))
     return total * part.clamp(min=0.0)
 
 
-def _seen(slopes: torch.Tensor, covariance: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _variance_by_motion(
+    slopes: torch.Tensor, covariance: torch.Tensor, windows: Windows
+) -> torch.Tensor:
     """Variance of the images' difference by motion of some covariance at the vectors."""
-    return torch.einsum("i...,j...,ij...->...", slopes, slopes, _between(covariance, windows))
+    return torch.einsum("i...,j...,ij...->...", slopes, slopes, _on_pixels(covariance, windows))
 
 
-def _between(field: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _on_pixels(field: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Values (..., *windows.count) of windows on pixels, linearly."""
     weights = [
         linear_weights(windows.centres(axis).to(field), torch.arange(n).to(field))

@@ -111,7 +111,7 @@ def few_levels(image: np.ndarray) -> str:
     step = float(np.diff(values).min()) if values.size > 1 else 0.0
     # of neighbours along rows and columns, by second differences: slopes of rings cancel
     square = [np.diff(image, 2, axis).clip(-1e6 * step, 1e6 * step) ** 2 / 6 for axis in (0, 1)]
-    noise = float(np.mean([one.mean() for one in square]))
+    noise = float(np.mean([along.mean() for along in square]))
     counted = step * float((image - values[0]).mean())
     if noise >= min((step / 2) ** 2, 0.5 * counted):
         return ""

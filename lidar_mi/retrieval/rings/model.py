@@ -146,7 +146,7 @@ class RingModel:
                     f"priors: {name}: {mean!r} +- {std!r} is not allowed; expected a parameter, a "
                     "finite mean and a standard deviation above 0"
                 )
-        # degrees that cannot be
+        # raises for impossible degrees
         term_names("light", self.light_degree)
         term_names("background", self.background_degree)
 
