@@ -265,16 +265,9 @@ def execute(
 class _Dispatch:
     """Submits points in their order, after the renderings that they share.
 
-    Attributes
-    ----------
-    numbers : dict of Future to int
-        Points that the scheduler has.
-    shared : dict of str to Future
-        Renderings by their signature.
-    needed : dict of str to int
-        Number of unfinished points that need the images of a signature.
-    longest : float
-        Duration of the longest point, s.
+    ``numbers`` are the points that the scheduler has, ``shared`` the renderings by signature,
+    ``needed`` the numbers of unfinished points that need these images; ``longest`` is the duration
+    of the longest point, s.
     """
 
     def __init__(
@@ -334,14 +327,7 @@ class _Dispatch:
         self.pending.add(future)
 
     def _renderings(self, number: int) -> tuple[list[int], list[Future[int]]]:
-        """Tasks that render what this point shares with others, each submitted once.
-
-        Returns
-        -------
-        first : list of int
-            Which of them were submitted for this point.
-        tasks : list of Future
-        """
+        """Renderings that this point shares: indices of those that it submits, and all tasks."""
         images = self.folder.index[number].images
         # most points share nothing: their experiment need not be made here
         if all(self.needed[image] < 2 for image in images):

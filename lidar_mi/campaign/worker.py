@@ -274,13 +274,7 @@ def _signatures(experiment: Experiment, search_path: Path) -> dict[str, str]:
 
 
 def _count_attempt(place: Path, session: str) -> None:
-    """Count an attempt.
-
-    Raises
-    ------
-    InputError
-        `MOST_ATTEMPTS` earlier ones of this session killed their worker.
-    """
+    """Count an attempt; InputError if `MOST_ATTEMPTS` of this session killed their worker."""
     # counted in a file, as a killed worker cannot count
     path = place / ATTEMPTS
     lines = read_text(path, "attempts").splitlines() if path.is_file() else []

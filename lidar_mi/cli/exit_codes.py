@@ -71,10 +71,9 @@ def end_without_result(reason: str, flag: "xr.DataArray") -> NoReturn:
 
 def flags_in_words(flag: "xr.DataArray") -> str:
     """How many vectors have each flag, from the CF attributes; empty: all are valid."""
-    masks, names = flag.attrs["flag_masks"], flag.attrs["flag_meanings"].split()
-    counts = (
-        (name, int((flag & int(mask) != 0).sum())) for name, mask in zip(names, masks, strict=True)
-    )
+    from lidar_mi.flags import masks_of
+
+    counts = ((name, int((flag & mask != 0).sum())) for name, mask in masks_of(flag.attrs).items())
     return ", ".join(f"{name} {count}" for name, count in counts if count)
 
 
@@ -120,13 +119,13 @@ def _fail_usage(error: Any) -> NoReturn:
 def _raised_signals() -> Iterator[None]:
     """Terminating signals raise `Stopped`, except ignored ones (nohup)."""
     before = {number: signal.getsignal(number) for number in STOPPING}
-    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    signals = [number for number, handler in before.items() if handler != signal.SIG_IGN]
     try:
-        for number in caught:
+        for number in signals:
             signal.signal(number, _raise_stopped)
         yield
     finally:
-        for number in caught:
+        for number in signals:
             signal.signal(number, before[number])
 
 

@@ -171,7 +171,7 @@ def retrieve(
             device=device,
         )
     wind = wind.assign_attrs(software=f"lidar-mi {__version__}")
-    lost = write_wind(out, wind, wind.attrs["pixel_size"])
+    omitted = write_wind(out, wind, wind.attrs["pixel_size"])
     _print_file_remarks(wind, by_default=layer is None, from_headers=dt is None and not pixels)
     if pairs is not None:
         _print_series(wind)
@@ -182,8 +182,8 @@ def retrieve(
     if drawn is not None:
         _draw(wind, drawn, colours.value, lines.value)
         output.print(f"picture  {drawn}")
-    if lost:
-        output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
+    if omitted:
+        output.print(f"lost     {omitted}; .nc has them", soft_wrap=True)
     if not (wind["flag"] == 0).any():
         end_without_result(f"no valid vector of {wind['flag'].size}", wind["flag"])
 

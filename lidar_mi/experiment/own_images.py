@@ -102,8 +102,8 @@ def retrieve_files(
     layer = layer or _layer(inputs)
     frames_by_file = _frames(inputs, layer, frame, pairs)
     paths = [path for path, numbers in frames_by_file for _ in numbers]
-    more = len(paths) > 2 and pairs is None
-    if more and "more" not in method_of(method).options:
+    burst = len(paths) > 2 and pairs is None
+    if burst and "more" not in method_of(method).options:
         raise InputError(
             f"{len(paths)} images are not allowed with method {method}; expected two, pairs all "
             "(a wind from each pair), or variational (one wind from all)"
@@ -123,7 +123,7 @@ def retrieve_files(
     levels = [read_noise(path, layer, spacing) if noise is None else noise for path in noisy]
     beams = [read_beams(path, spacing) for path in paths]
     images, levels, beams = _on_nodes(images, levels, beams, steps)
-    beam_times = [when["beam_time"] for when in beams if when is not None and not when.frozen_air]
+    beam_times = [scan["beam_time"] for scan in beams if scan is not None and not scan.frozen_air]
     timed = len(beam_times) == len(paths)
     grid = images[0]
     if pairs is not None:
@@ -168,9 +168,9 @@ def _on_nodes(
     """Images, noise and beams, those of beams that miss the nodes resampled onto them."""
     images, levels, beams = list(images), list(levels), list(beams)
     scans: dict[int, xr.Dataset] = {}
-    for number, when in enumerate(beams):
-        if when is not None and "y_reported" in when:
-            scans[number] = when.assign(image=images[number])
+    for number, scan_beams in enumerate(beams):
+        if scan_beams is not None and "y_reported" in scan_beams:
+            scans[number] = scan_beams.assign(image=images[number])
             level = levels[number] if number < len(levels) else None
             if isinstance(level, xr.DataArray):
                 scans[number] = scans[number].assign(image_stderr=level)

@@ -238,20 +238,10 @@ def _receiver(
     pixels: float | np.ndarray = 1.0,
     ratio: bool = False,
 ) -> Receiver:
-    """A receiver of channels with these harmonics of the frequency.
+    """A receiver from complex harmonics (channels, harmonics) of the transmission of its channels.
 
-    Parameters
-    ----------
-    harmonics : array, shape (channels, harmonics)
-        Of the transmission, complex.
-    delay : float
-        Inverse of its period, s.
-    modes : float
-        Of the speckle in a channel.
-    pixels : float or array, shape (channels,)
-        Of the detector in a channel.
-    ratio : bool
-        Whether speeds are read from the ratio of two signals.
+    Their period is 1 / ``delay`` (s); a channel has so many ``modes`` of speckle and ``pixels``;
+    with ``ratio``, speeds are read from the ratio of two signals.
     """
     times = np.arange(harmonics.shape[1]) * delay
     _, usual = air_of(lidar)

@@ -116,10 +116,10 @@ def prepare(
         raise InputError(
             f"encounter: {experiment.name} is a flight, not a run; expected lidar-mi fly (lm.fly)"
         )
-    beside = experiment.folder if beside is None else beside
-    experiment = in_air_of_its_site(on_its_device(experiment), Path(beside))
+    search_path = Path(experiment.folder if beside is None else beside)
+    experiment = in_air_of_its_site(on_its_device(experiment), search_path)
     graph, log = stages_of(experiment), Log(notice)
-    prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
+    prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=search_path)
     for text in unusual(experiment):
         log.remark(text)
     # results first: a check may take those of any stage of the preflight

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lidar_mi.flags import masks_of
 from lidar_mi.io.text import write_text
 
 
@@ -48,10 +49,9 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
 
 def _in_words(flags: np.ndarray, attributes: dict[str, Any]) -> list[str]:
     """Reasons of every flag, ``valid`` where there is none."""
-    masks = np.atleast_1d(attributes["flag_masks"]).astype(int)
-    names = attributes["flag_meanings"].split()
+    masks = masks_of(attributes)
     words = {
-        int(flag): " ".join(n for n, mask in zip(names, masks, strict=True) if int(flag) & mask)
+        int(flag): " ".join(name for name, mask in masks.items() if int(flag) & mask)
         for flag in np.unique(flags)
     }
     return [words[int(flag)] or "valid" for flag in flags]

@@ -35,9 +35,9 @@ def steps_of(paths: Sequence[str | Path]) -> list[float] | None:
 def _step(earlier: dict[str, Any], later: dict[str, Any]) -> float:
     """The time between two images of a run; negative if the telescope moves backwards."""
     dt = _rounded(earlier["dt"])
-    way = later["telescope_position"] - earlier["telescope_position"]
+    path = later["telescope_position"] - earlier["telescope_position"]
     backwards = -earlier["platform_speed"] * dt
-    return -dt if way and abs(way - backwards) < _TOLERANCE * abs(backwards) else dt
+    return -dt if path and abs(path - backwards) < _TOLERANCE * abs(backwards) else dt
 
 
 def _rounded(seconds: float) -> float:

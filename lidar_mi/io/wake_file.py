@@ -367,12 +367,11 @@ def _read(
     present = [name for name in _VARIABLES if table[name] in data.data_vars]
     spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}
     dims_of = {name: _spatial_dims(data, table, name, spatial) for name in present}
-    odd = [name for name in present if not dims_of[name]]
-    if odd:
+    if unplaced := [table[name] for name in present if not dims_of[name]]:
         missing = next((n for n in ("time", "x", "y", "z") if table[n] not in data.dims), "x")
         raise InputError(
-            f"{path}: variable {table[odd[0]]!r} has the dimensions "
-            f"({', '.join(map(str, data[table[odd[0]]].dims))}); allowed: {', '.join(spatial)} "
+            f"{path}: variable {unplaced[0]!r} has the dimensions "
+            f"({', '.join(map(str, data[unplaced[0]].dims))}); allowed: {', '.join(spatial)} "
             f"and, at choice, {table['time']}, in any order, one of them staggered; expected "
             f"wake.names of the others, such as {{{missing}: its name there}}"
         )
@@ -446,9 +445,11 @@ def _read(
         along = {dims_of[name][theirs]: file_nodes[theirs] for theirs in dims}
         nodes = [along.get(d, axes[d]) for d in "xyz"]
         values = _numbers(variable, path).reshape([n.size for n in nodes]) * scale
-        amount = name in needed and name in ("tracer", "aerosol")
+        nonnegative = name in needed and name in ("tracer", "aerosol")
         where = dict(zip("xyz", nodes, strict=True))
-        _check_values(values, where, table[name], path, not amount, valid_range(variable, path))
+        _check_values(
+            values, where, table[name], path, not nonnegative, valid_range(variable, path)
+        )
         low, high = values.min(), values.max()
         values, errors[name] = interpolated(values, nodes, [axes[d] for d in "xyz"])
         if name in ("tracer", "aerosol"):

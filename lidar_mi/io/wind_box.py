@@ -42,8 +42,8 @@ def read_bts(path: str | Path) -> xr.Dataset:
     kind, nz, ny, tower, steps, dz, dy, dt, mean, _, bottom, *scales, text = _BTS_HEAD.unpack_from(
         data
     )
-    sane = kind in _BTS_KINDS and min(nz, ny, steps) > 0 and tower >= 0 and 0 <= text <= 10_000
-    if not sane or not min(dz, dy, dt) > 0:
+    plausible = kind in _BTS_KINDS and min(nz, ny, steps) > 0 and tower >= 0 and 0 <= text <= 10_000
+    if not plausible or not min(dz, dy, dt) > 0:
         raise InputError(f"{path}: no header of a TurbSim field; expected a .bts file")
     if not mean > 0:
         raise InputError(f"{path}: mean wind at the hub of {mean:g} m/s; expected above 0")

@@ -352,8 +352,8 @@ def _fit_limits(axes: Axes, truth: np.ndarray, estimates: np.ndarray, spread: np
     inside = np.isfinite(estimates)
     values = np.concatenate([truth[inside], estimates[inside]]) if inside.any() else truth
     # the band of a track that begins is many times as wide as later
-    wide = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
-    margin = max(0.3 * float(np.ptp(values)), 2 * wide, 0.05)
+    band = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
+    margin = max(0.3 * float(np.ptp(values)), 2 * band, 0.05)
     if np.isfinite([values.min(), values.max(), margin]).all():
         axes.set_ylim(values.min() - margin, values.max() + margin)
 

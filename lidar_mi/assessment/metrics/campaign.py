@@ -233,8 +233,8 @@ def boundaries(margin: Interval, logarithmic: bool) -> list[Boundary]:
         if np.isfinite(curves[1]).any():
             # met above: the upper curve crosses first
             sides = (ends[1], ends[0]) if above else (ends[0], ends[1])
-            before = [at for at, way in sides[0] if way == above and at <= value]
-            after = [at for at, way in sides[1] if way == above and at >= value]
+            before = [at for at, positive in sides[0] if positive == above and at <= value]
+            after = [at for at, positive in sides[1] if positive == above and at >= value]
             span = [max(before, default=-math.inf), min(after, default=math.inf)]
         at, low, high = (
             math.exp(k) if logarithmic and math.isfinite(k) else k for k in (value, *span)

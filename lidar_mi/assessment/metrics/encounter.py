@@ -84,8 +84,8 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
             added = float(fraction_added(before, ours, best, least))
             metrics[f"encounter.removed_beyond_autopilot.{quantity}"] = added
     if track is not None:
-        more = _tracking(series, track) | wind_ahead_metrics(track)
-        metrics |= {f"encounter.{k}": v for k, v in more.items()}
+        tracking = _tracking(series, track) | wind_ahead_metrics(track)
+        metrics |= {f"encounter.{k}": v for k, v in tracking.items()}
     return {key: value for key, value in metrics.items() if np.isfinite(value)}
 
 
@@ -260,8 +260,8 @@ def _latencies(track: xr.Dataset) -> dict[str, float]:
 
 def _errors(track: xr.Dataset, slabs: np.ndarray) -> dict[str, float]:
     """Largest errors of circulations (relative) and cores (m) of the track; fraction in 2 sigma."""
-    some = track.isel(slab=slabs)
-    ours, truth = some.sel(source="track"), some.sel(source="truth")
+    part = track.isel(slab=slabs)
+    ours, truth = part.sel(source="track"), part.sel(source="truth")
     relative = [np.abs(ours[q] / truth[q] - 1) for q in _CIRCULATIONS]
     cores = [
         np.hypot(ours[f"{side}_y"] - truth[f"{side}_y"], ours[f"{side}_z"] - truth[f"{side}_z"])

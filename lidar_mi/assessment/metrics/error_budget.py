@@ -235,7 +235,7 @@ def moved_rigidly(
     truth : xr.Dataset
         v, w on (z, y).
     retrieve : callable
-        Retrieves the wind from a pair by found's method, with windows so many pixels apart.
+        Retrieves the wind from a pair by the method of `wind`, with windows so many pixels apart.
 
     Returns
     -------

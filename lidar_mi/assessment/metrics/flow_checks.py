@@ -27,10 +27,10 @@ def relative_divergence(wind: xr.Dataset) -> float:
     v, w = (wind[name].transpose("z", "y").values.astype(float) for name in ("v", "w"))
     if min(v.shape) < 2:
         return float("nan")
-    along = np.gradient(v, spacing["y"], axis=1) + np.gradient(w, spacing["z"], axis=0)
-    turning = np.gradient(w, spacing["y"], axis=1) - np.gradient(v, spacing["z"], axis=0)
-    rms = np.sqrt((turning**2).mean())
-    return float(np.sqrt((along**2).mean()) / rms) if rms > 0 else float("nan")
+    divergence = np.gradient(v, spacing["y"], axis=1) + np.gradient(w, spacing["z"], axis=0)
+    vorticity = np.gradient(w, spacing["y"], axis=1) - np.gradient(v, spacing["z"], axis=0)
+    rms = np.sqrt((vorticity**2).mean())
+    return float(np.sqrt((divergence**2).mean()) / rms) if rms > 0 else float("nan")
 
 
 def rises(cores: Sequence[Core]) -> bool:

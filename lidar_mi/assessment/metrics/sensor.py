@@ -54,7 +54,7 @@ def vector_metrics(wind: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, 
     if wind is None:
         return {"sensor.valid_fraction": 0.0, "sensor.vectors": 0}
     # with torch, which `check` does without
-    from lidar_mi.retrieval.combined.combine import CombinedFlag
+    from lidar_mi.flags import CombinedFlag
 
     valid = wind["flag"].values == 0
     z, y = np.meshgrid(wind["z"], wind["y"], indexing="ij")

@@ -73,7 +73,7 @@ def skill(wind: xr.Dataset) -> dict[str, float]:
     `no_skill`. ``no_skill_fraction``: 1 where they equal the rms of the true wind or exceed it,
     else the fraction of all vectors with that flag.
     """
-    from lidar_mi.retrieval.images.quality import Flag
+    from lidar_mi.flags import Flag
 
     flag = wind["flag"].values
     # no flag, or this one alone

@@ -212,8 +212,8 @@ def simulated(
                 f"{percent(rotor.turbulence)}"
             )
         else:
-            when = "" if wake.time is None else f" at {wake.time:.15g} s"
-            flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
+            time = "" if wake.time is None else f" at {wake.time:.15g} s"
+            flow = f"{wake.file}{time}, {wake.spacing:g} m grid"
         texture = "no texture added"
         if wake.texture.rms:
             scale = f"outer scale {wake.texture.outer_scale:g} m"

@@ -141,8 +141,8 @@ def _rate(metrics: Mapping[str, float], name: str) -> str:
     rate, power, beams = (
         metrics[f"sensor.{name}.{key}"] for key in ("pulses_per_second", "average_power", "beams")
     )
-    at_once = f", {beams} directions at a time" if beams > 1 else ""
-    return f"{three(rate)} pulses per second{at_once}, {three(power)} W of light"
+    parallel = f", {beams} directions at a time" if beams > 1 else ""
+    return f"{three(rate)} pulses per second{parallel}, {three(power)} W of light"
 
 
 def _numbers(metrics: Mapping[str, float]) -> NumberTable:

@@ -99,10 +99,10 @@ class AirVolume:
     @cached_property
     def mean_wind(self) -> tuple[float, float]:
         """Mean u and v of the volume at the height, m/s, over all states."""
-        over = [name for name in ("time", "x", "y") if name in self.flow.dims]
-        level = self.flow[["u", "v"]].mean(over).interp(z=self.height)
+        averaged = [name for name in ("time", "x", "y") if name in self.flow.dims]
+        level = self.flow[["u", "v"]].mean(averaged).interp(z=self.height)
         # beyond the lowest and highest nodes, the nearest
-        nearest = self.flow[["u", "v"]].mean(over).sel(z=self.height, method="nearest")
+        nearest = self.flow[["u", "v"]].mean(averaged).sel(z=self.height, method="nearest")
         wind = level.where(np.isfinite(level), nearest)
         return float(wind["u"]), float(wind["v"])
 
@@ -159,10 +159,10 @@ class AirVolume:
         """u, v, w (m/s) at places (m) and times (s), which broadcast."""
         places = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
         shape = places[0].shape
-        at_x, at_y, at_z, when = (part.ravel() for part in places)
-        wind, count = np.zeros((3, when.size)), len(self.times)
+        at_x, at_y, at_z, times = (part.ravel() for part in places)
+        wind, count = np.zeros((3, times.size)), len(self.times)
         # as an index: halfway between the states 1 and 2 is 1.5
-        position = np.interp(when, self.times, np.arange(count)) if count > 1 else 0.0 * when
+        position = np.interp(times, self.times, np.arange(count)) if count > 1 else 0.0 * times
         mean_u, mean_v = self.mean_wind
         for index in np.unique([np.floor(position), np.ceil(position)]).astype(int):
             weight = np.clip(1 - np.abs(position - index), 0, None)

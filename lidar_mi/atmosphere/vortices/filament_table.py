@@ -127,12 +127,12 @@ class FilamentTable:
         quarter = self._filaments.velocity(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
         # about the plane between the vortices l is odd; about that of a crest s is odd
         left = quarter[:, :0:-1] * np.array([1.0, -1.0, 1.0])
-        whole = np.concatenate([left, quarter], axis=1)
-        behind = whole[-2:0:-1] * np.array([-1.0, 1.0, 1.0])
-        whole = np.concatenate([whole, behind], axis=0)
+        period_values = np.concatenate([left, quarter], axis=1)
+        behind = period_values[-2:0:-1] * np.array([-1.0, 1.0, 1.0])
+        period_values = np.concatenate([period_values, behind], axis=0)
         splines = []
         for k in range(3):
-            values = scipy.ndimage.spline_filter1d(whole[..., k], axis=0, mode="grid-wrap")
+            values = scipy.ndimage.spline_filter1d(period_values[..., k], axis=0, mode="grid-wrap")
             for axis in (1, 2):
                 values = scipy.ndimage.spline_filter1d(values, axis=axis, mode="mirror")
             splines.append(

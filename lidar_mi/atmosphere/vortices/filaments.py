@@ -88,13 +88,13 @@ class Filaments:
         shifts = [j * self.period for j in range(-self.images, self.images + 1)]
         size = max(1, _CHUNK // len(nodes))
         for first in range(0, len(flat), size):
-            some = flat[first : first + size]
+            chunk = flat[first : first + size]
             # the core matters only near a line; neighbouring points are far from most nodes
-            near = self._within(some, nodes, _FAR * self._sigma)
+            near = self._within(chunk, nodes, _FAR * self._sigma)
             wind[first : first + size] += (
-                self._sum(some, nodes[near], steps[near], [0.0], self._kernel, self._nearby)
-                + self._sum(some, nodes[~near], steps[~near], [0.0], self._far, self._nearby)
-                + self._sum(some, far_nodes, far_steps, shifts, self._far, self._beyond)
+                self._sum(chunk, nodes[near], steps[near], [0.0], self._kernel, self._nearby)
+                + self._sum(chunk, nodes[~near], steps[~near], [0.0], self._far, self._nearby)
+                + self._sum(chunk, far_nodes, far_steps, shifts, self._far, self._beyond)
             )
         return wind.reshape(np.shape(places))
 

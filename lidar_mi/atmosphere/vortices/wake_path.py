@@ -191,8 +191,8 @@ class PairAlongPath:
             above = speed * (self.t_c - time)
         else:
             ages = (self.age + time, self.age + self.t_c)
-            now, met = (np.exp(-np.asarray(age) / self.decay_time) for age in ages)
-            above = speed * self.decay_time * (now - met)
+            now, at_arrival = (np.exp(-np.asarray(age) / self.decay_time) for age in ages)
+            above = speed * self.decay_time * (now - at_arrival)
         arrival, wind = (self.x_c, *self.miss), (0.0, *self.mean_wind)
         x, y, z = (
             place + speed * (time - self.t_c) + axis * above

@@ -116,8 +116,8 @@ def sections(
 
         notice("timing a few samples and a retrieval", None)
         # with the chosen number: another choice would cost pilots
-        whole = with_number(experiment, chosen.number) if chosen else experiment
-        rows = [*_time(whole, results, preparation), _memory(experiment, results)]
+        sampled_experiment = with_number(experiment, chosen.number) if chosen else experiment
+        rows = [*_time(sampled_experiment, results, preparation), _memory(experiment, results)]
         yield "cost of the run, to a factor of 2", rows
     else:
         yield "cost of the run", [_memory(experiment, results)]

@@ -55,10 +55,11 @@ def air_along_path(experiment: Experiment) -> WakeAlongPath:
         parts = (volume, *parts)
     if not air.wake:
         return AirAlongPath(None, parts, frame)
-    met = path.start / path.speed
+    arrival = path.start / path.speed
     # no gusts: they are shorter than the wake and do not move it as a whole
-    wide = [part for part in parts if not isinstance(part, Gust)]
-    return AirAlongPath(wake, parts, frame, _drift(wake, wide, frame, path.start, met), met)
+    lasting = [part for part in parts if not isinstance(part, Gust)]
+    drift = _drift(wake, lasting, frame, path.start, arrival)
+    return AirAlongPath(wake, parts, frame, drift, arrival)
 
 
 def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir, ...]:

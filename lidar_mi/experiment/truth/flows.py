@@ -157,21 +157,10 @@ def _flows(observation: Observation, seed: int, most: int, search_path: Path) ->
 def _air_of_gates(
     wake: Wake, platform: Platform, scan: Scan, flow: xr.Dataset, middle: float, name: str
 ) -> tuple[float, float]:
-    """Ends along x of the air that is in the gates at t1 or at t2, with `_EDGE`, in a file, m.
+    """Ends along x (m, of the file) of the air that is in the gates at t1 or at t2, with `_EDGE`.
 
-    Parameters
-    ----------
-    flow : xr.Dataset
-        As it is in the file.
-    middle : float
-        Place in it that is put in the middle of the gates, m.
-    name : str
-        Of the file.
-
-    Raises
-    ------
-    InputError
-        A file without u, or whose planes do not hold that air.
+    ``middle`` (m) is put into the middle of the gates. A file without u, or whose planes do not
+    hold that air, is refused.
     """
     if "u" not in flow:
         raise InputError(

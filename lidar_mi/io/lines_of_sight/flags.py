@@ -1,10 +1,10 @@
 """Why a value of a line of sight is not to be used: blind range, weak signal, hard targets."""
 
-import enum
 import math
 
 import numpy as np
 
+from lidar_mi.flags import LineFlag
 from lidar_mi.io.lines_of_sight.scan import Scan
 
 MIN_CNR = {"WindCube": -27.0, "": -21.0}
@@ -36,23 +36,6 @@ _GATES_BEFORE = 5  # gates whose median is the signal before a target
 # a reflection of the outgoing pulse has the same speed in all directions, to this, m/s
 _SAME_SPEED = 0.1
 _LONGEST_PULSES = 4  # gate lengths that a reflection may cover
-
-
-class LineFlag(enum.IntFlag):
-    """Reasons not to use a velocity of a line of sight; 0: valid."""
-
-    MISSING = 1
-    """No value, or no such gate of this line."""
-    BLIND_RANGE = 2
-    """The outgoing pulse, or its reflection in the lidar, is in the gate."""
-    LOW_CNR = 4
-    """The signal is too weak."""
-    HARD_TARGET = 8
-    """A target that stands, such as a building, is in the gate or before it."""
-    REJECTED = 16
-    """The lidar's own software rejects the value."""
-    REPEATED = 32
-    """The same number in all gates of the line, or in many cells: no measurement."""
 
 
 EXCESS = 4.0
@@ -260,8 +243,8 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
     usable = np.where(bad, np.nan, snr)
     for line in np.flatnonzero(low):
         bright = 10 ** (HARD_TARGET_DB / 10) * _median_before(usable[line], width)
-        still = np.abs(velocity[line]) < HARD_TARGET_SPEED
-        (gates,) = np.nonzero(still & (usable[line] > bright))
+        at_rest = np.abs(velocity[line]) < HARD_TARGET_SPEED
+        (gates,) = np.nonzero(at_rest & (usable[line] > bright))
         if gates.size:
             blocked[line, max(gates[0] - width, 0) :] = True
     return blocked

@@ -137,17 +137,17 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
     starts = [k for k, line in enumerate(lines) if not line.split(None, 1)[0].isdigit()]
     if not starts:
         raise InputError(f"{path}: has no ray below its header; expected one or more")
-    lost = starts[0]
-    rays, values, odd = [], [], 0
+    stray = starts[0]
+    rays, values, invalid = [], [], 0
     partial: list[int] = []
     for begin, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         ray = _floats([lines[begin].split()], 5)
         if not np.isfinite(ray[0, :3]).all():
-            lost += end - begin
+            stray += end - begin
             continue
         number, table = _gates(lines[begin + 1 : end])
         inside = number < gates
-        odd += int((~inside).sum()) + int((~np.isfinite(table[:, :2])).any(1).sum())
+        invalid += int((~inside).sum()) + int((~np.isfinite(table[:, :2])).any(1).sum())
         ray_values = np.full((gates, 4), np.nan)
         ray_values[number[inside]] = table[inside]
         rays.append(ray[0])
@@ -162,10 +162,10 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
             f"{len(partial)} of {len(rays)} rays have fewer than {gates} gates, ray {partial[0]} "
             "the first: what is missing is flagged"
         )
-    if odd:
-        remarks.append(f"{odd} gates are no numbers or beyond the {gates} of the header")
-    if lost:
-        remarks.append(f"{lost} lines belong to no ray with a time and two angles")
+    if invalid:
+        remarks.append(f"{invalid} gates are no numbers or beyond the {gates} of the header")
+    if stray:
+        remarks.append(f"{stray} lines belong to no ray with a time and two angles")
     return np.array(rays), np.array(values), remarks
 
 

@@ -216,12 +216,12 @@ def _moving(data: xr.Dataset, names: Mapping[str, str], time: np.ndarray, path: 
         return []
     north = _EARTH_RADIUS * (latitude[finite] - latitude[finite[0]])
     east = _EARTH_RADIUS * np.cos(latitude[finite]) * (longitude[finite] - longitude[finite[0]])
-    way = float(np.hypot(np.ptp(north), np.ptp(east)))
+    distance = float(np.hypot(np.ptp(north), np.ptp(east)))
     seconds = float((time[finite[-1]] - time[finite[0]]) / np.timedelta64(1, "s"))
-    if way < _MOVED or seconds <= 0:
+    if distance < _MOVED or seconds <= 0:
         return []
     return [
-        f"the lidar moves by {way:.0f} m ({np.hypot(north[-1], east[-1]) / seconds:.2g} m/s): "
+        f"the lidar moves by {distance:.0f} m ({np.hypot(north[-1], east[-1]) / seconds:.2g} m/s): "
         "winds are off by its velocity unless that was subtracted, and of the place in the middle "
         "of the scan"
     ]
@@ -306,8 +306,8 @@ def _flat(
             values = _numbers(data[file_names[name]], name, path)
             if name == "snr":
                 unit = str(data[file_names[name]].attrs.get("units", ""))
-                values, more = ratio_of_powers(values, unit, file_names[name])
-                remarks += more
+                values, more_remarks = ratio_of_powers(values, unit, file_names[name])
+                remarks += more_remarks
             if ragged is not None:
                 fields[name] = ragged.full(values)
             elif velocity.ndim == 2:
@@ -343,7 +343,7 @@ def _flat(
         attributes["gate_length"] = float(
             np.ravel(load_variable(data["range_gate_length"], path))[0]
         )
-    time, more = _times(data, file_names["time"], reference, path)
+    time, more_remarks = _times(data, file_names["time"], reference, path)
     scan = Scan(
         time,
         angles,
@@ -352,7 +352,7 @@ def _flat(
         dict(place),
         _rejected(data, velocity, path),
         attributes,
-        remarks + more + _moving(data, names, time, path),
+        remarks + more_remarks + _moving(data, names, time, path),
     )
     return _sweeps(scan, data, path)
 

@@ -132,11 +132,11 @@ def _level(scan: Scan) -> None:
         front * np.cos(pitch) - up * np.sin(pitch),
         front * np.sin(pitch) + up * np.cos(pitch),
     )
-    over = scan.angles["elevation"] > 90
+    beyond_zenith = scan.angles["elevation"] > 90
     slope = np.arctan2(up, np.hypot(right, front))
-    scan.angles["elevation"] = np.rad2deg(np.where(over, np.pi - slope, slope))
-    turn = np.arctan2(right, front) + np.where(over, np.pi, 0.0)
-    scan.angles["azimuth"] = np.rad2deg(turn)
+    scan.angles["elevation"] = np.rad2deg(np.where(beyond_zenith, np.pi - slope, slope))
+    rotated = np.arctan2(right, front) + np.where(beyond_zenith, np.pi, 0.0)
+    scan.angles["azimuth"] = np.rad2deg(rotated)
     scan.remarks.append(
         f"pitch and roll of up to {tilt:.2f} degrees are applied, with the front of the "
         "platform at azimuth 0"

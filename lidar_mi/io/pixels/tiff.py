@@ -159,12 +159,12 @@ def _contiguous(path: Path, file: "TiffFile", count: int) -> np.ndarray:
 
 def _pixels(path: Path, page: "TiffPage") -> np.ndarray:
     """One number a pixel of a page."""
-    more = _check(path, page)
+    extra = _check(path, page)
     axes, image = page.axes, page.asarray()
     if set(axes) - set("YXS"):
         raise InputError(f"{path}: a page with the axes {axes}; expected height and width")
     image = np.moveaxis(image, axes.index("S"), -1) if "S" in axes else image[..., None]
-    image = grey(path, image, page.samplesperpixel - more, more)
+    image = grey(path, image, page.samplesperpixel - extra, extra)
     return _without_gaps(page, _upright(image, page.tags.valueof(_ORIENTATION, 1)))
 
 

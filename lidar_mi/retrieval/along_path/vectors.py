@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import masks_of
 from lidar_mi.retrieval.common_error import common_rotation, common_stderr
 
 ACROSS = ("v", "w")
@@ -85,7 +86,7 @@ def slab_vectors(wind: xr.Dataset) -> SlabVectors:
     arms = np.stack(np.broadcast_arrays(z[:, None] - centre[1], y - centre[0]))
     shared = np.hypot(rotation * arms, np.reshape(common, (2, 1, 1)))
     independent = np.sqrt(np.maximum(stderr**2 - shared**2, (_LEAST_INDEPENDENT * stderr) ** 2))
-    flag = values("flag").astype(int) & ~_mask_of(wind["flag"], _ONLY_U)
+    flag = values("flag").astype(int) & ~masks_of(wind["flag"].attrs).get(_ONLY_U, 0)
     good = (flag == 0) & (np.isfinite(components) & (stderr > 0) & np.isfinite(stderr)).all(0)
     known, errors = (np.where(good, array, np.nan) for array in (components, independent))
     return SlabVectors(y, z, known, errors, wind.attrs["window"], common, rotation, centre)
@@ -109,10 +110,3 @@ def _separate(axis: np.ndarray, window: float) -> np.ndarray:
     """Indices of nodes a window apart, one of them the nearest to the path."""
     step = max(1, round(window / (axis[1] - axis[0])))
     return np.arange(int(np.abs(axis).argmin()) % step, len(axis), step)
-
-
-def _mask_of(flag: xr.DataArray, meaning: str) -> int:
-    """The bit of a meaning; 0: the flag does not have it."""
-    names = str(flag.attrs.get("flag_meanings", "")).split()
-    masks = np.ravel(flag.attrs.get("flag_masks", []))
-    return int(dict(zip(names, masks, strict=True)).get(meaning, 0)) if len(masks) else 0

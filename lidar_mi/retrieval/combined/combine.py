@@ -5,7 +5,6 @@ estimate from both (generalised least squares, also called optimal interpolation
 components on the images' grid, with their covariance.
 """
 
-import enum
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ import scipy
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import REJECTED, CombinedFlag, flag_attributes
 from lidar_mi.retrieval.combined.common_time import at_common_time
 from lidar_mi.retrieval.combined.crossflow import (
     Crossflow,
@@ -38,21 +38,12 @@ from lidar_mi.retrieval.combined.u_prior import (
     probable_statistics,
     relative_std,
 )
-from lidar_mi.retrieval.combined.vectors import COMPONENTS, error_variables, flag_attributes
+from lidar_mi.retrieval.combined.vectors import COMPONENTS, error_variables
 from lidar_mi.retrieval.common_error import ROTATION
 from lidar_mi.retrieval.threads import threads_for
 
 # Prior standard deviation of the mean of u, m/s.
 _MEAN_STD = 100.0
-
-
-class CombinedFlag(enum.IntFlag):
-    """Why a vector is rejected, one bit per reason; 0: valid."""
-
-    NO_CROSSFLOW = 1
-    """The images gave no valid vector here: u alone."""
-    BEYOND_LINES = 2
-    """Outside the lines of sight: u is extrapolated from the nearest."""
 
 
 @threads_for(0)
@@ -360,7 +351,7 @@ def _dataset(
                 for index, name in enumerate(COMPONENTS)
             },
             **error_variables(dims, covariance),
-            "flag": (dims, flag.astype(np.uint8), flag_attributes(CombinedFlag)),
+            "flag": (dims, flag.astype(np.uint16), flag_attributes(CombinedFlag, REJECTED)),
             **at,
         },
         coords={axis: crossflow.variables[axis] for axis in dims},

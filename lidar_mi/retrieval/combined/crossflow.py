@@ -6,9 +6,9 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.checks import checked_image
 from lidar_mi.retrieval.common_error import common_stderr, own_errors
-from lidar_mi.retrieval.images.quality import Flag
 
 # Standard deviation of v and w where the images gave no vector, over that of the valid ones:
 # vectors are rejected where the wind varies most.

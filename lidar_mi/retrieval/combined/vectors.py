@@ -1,12 +1,11 @@
 """Wind vectors from line-of-sight velocities: triples of neighbours, and larger neighbourhoods."""
 
-import enum
-
 import numpy as np
 import scipy
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import REJECTED, VectorFlag, flag_attributes
 
 COMPONENTS = ("u", "v", "w")
 _NAMES = ("v_los", "v_los_std", "direction", "range", "platform_velocity")
@@ -15,15 +14,6 @@ _NAMES = ("v_los", "v_los_std", "direction", "range", "platform_velocity")
 _COPLANAR = 1e-8
 # Altitude over longest side of a triangle of lines, over that of the median one.
 _THINNEST = 0.1
-
-
-class LineFlag(enum.IntFlag):
-    """Why a vector is rejected, one bit per reason; 0: valid."""
-
-    COPLANAR = 1
-    """The lines lie in one plane: the wind across it is undetermined. No vector."""
-    NO_VELOCITY = 2
-    """A line has no velocity. No vector."""
 
 
 def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
@@ -163,7 +153,7 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     -------
     xr.Dataset, dim vector
         `u`, `v`, `w` (m s-1), their standard errors and correlations, `x`, `y`, `z` (m), `lines`
-        (vector, corner), `flag` (bits of `LineFlag`).
+        (vector, corner), `flag` (bits of `VectorFlag`).
 
     Raises
     ------
@@ -247,7 +237,7 @@ def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str
     )
     flat = np.isinf(covariance[:, 0, 0])
     wind[missing], covariance[missing | flat] = np.nan, np.nan
-    flag = LineFlag.COPLANAR * flat + LineFlag.NO_VELOCITY * missing
+    flag = VectorFlag.COPLANAR * flat + VectorFlag.NO_VELOCITY * missing
     freedom = lines.shape[1] - 3
     misfit = {}
     if freedom:
@@ -263,7 +253,7 @@ def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str
             },
             **misfit,
             "lines": (("vector", "corner"), lines, {"long_name": "lines of sight, as counted"}),
-            "flag": ("vector", flag.astype(np.uint8), flag_attributes(LineFlag)),
+            "flag": ("vector", flag.astype(np.uint16), flag_attributes(VectorFlag, REJECTED)),
         },
         coords={
             name: ("vector", centre[:, index], {"units": "m", "long_name": f"{name} of the vector"})
@@ -303,13 +293,3 @@ def error_variables(
         text = {"units": "1", "long_name": f"correlation of the errors of {first} and {second}"}
         variables[f"{first}{second}_correlation"] = (dims, correlation, text)
     return variables
-
-
-def flag_attributes(flags: type[enum.IntFlag]) -> dict[str, str | np.ndarray]:
-    """CF attributes of a variable that holds bits of ``flags``."""
-    return {
-        "long_name": "reasons to reject the vector, 0 = valid",
-        "standard_name": "quality_flag",
-        "flag_masks": np.array([bit.value for bit in flags], dtype=np.uint8),
-        "flag_meanings": " ".join(str(bit.name).lower() for bit in flags),
-    }

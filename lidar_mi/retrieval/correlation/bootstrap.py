@@ -15,6 +15,7 @@ from functools import reduce
 
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.known_motion import (
     advected,
     at_mid_time,
@@ -29,7 +30,6 @@ from lidar_mi.retrieval.correlation.unresolved_motion import Motion, Residuals, 
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.intensity import normalised
 from lidar_mi.retrieval.images.noise_map import known_and_weight, variance_of_residual
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.images.spline import band_limited, likeliest
 from lidar_mi.retrieval.images.windows import (

@@ -17,8 +17,9 @@ import torch
 from kornia.contrib import extract_tensor_patches
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, check_between, filled, non_finite
+from lidar_mi.retrieval.images.quality import check_between, filled, non_finite
 from lidar_mi.retrieval.images.windows import (
     Windows,
     box_sum,

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import avg_pool3d, pad
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.cross_correlation import cross_correlation
 from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.images.inpainting import filled_in
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.spline import Spline
 from lidar_mi.retrieval.images.windows import Windows, averaged, separable, working
 from lidar_mi.retrieval.symmetric import largest_eigenvalue

@@ -14,13 +14,14 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import pad
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS, MultipassSettings
 from lidar_mi.retrieval.images import windows as geometry
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
-from lidar_mi.retrieval.images.quality import Flag, check_between, informative, non_finite
+from lidar_mi.retrieval.images.quality import check_between, informative, non_finite
 from lidar_mi.retrieval.images.spline import Spline, band_limited, nearest
 from lidar_mi.retrieval.images.windows import Windows, averaged, image_pair, window_sums, working
 

@@ -2,8 +2,9 @@
 
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, filled, non_finite
+from lidar_mi.retrieval.images.quality import filled, non_finite
 from lidar_mi.retrieval.images.windows import Windows, candidates, image_pair, strided, working
 
 

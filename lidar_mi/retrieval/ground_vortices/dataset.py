@@ -1,6 +1,5 @@
 """Vortices of scans as a CF data set."""
 
-import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.atmosphere.vortices.vortex import Model
+from lidar_mi.flags import VortexFlag, flag_attributes
 from lidar_mi.retrieval.ground_vortices.detection import Detection
 from lidar_mi.retrieval.ground_vortices.fit import Fit
 from lidar_mi.retrieval.ground_vortices.scan_plane import PlaneScan
@@ -23,25 +23,6 @@ _ABOUT = {
     "circulation": ("m2 s-1", "circulation, positive from y to z"),
     "core_radius": ("m", "radius of the largest tangential speed"),
 }
-
-
-class VortexFlag(enum.IntFlag):
-    """Reasons not to use the vortices of a scan; 0: valid."""
-
-    NO_WAKE = 1
-    """Turbulence alone gives such a scan more often than the limit of false alarms."""
-    NO_FIT = 2
-    """The fit did not converge."""
-    OUTSIDE = 4
-    """A vortex is outside of the scan."""
-    NOT_IDENTIFIED = 8
-    """The error is half of the circulation, or half a gate in place."""
-    MISFIT = 16
-    """The residuals are larger than noise and turbulence explain."""
-    AMBIGUOUS = 32
-    """Vortices elsewhere are nearly as likely."""
-    SAME_SENSE = 64
-    """Both vortices turn the same way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,17 +133,10 @@ def vortex_dataset(scans: Sequence[ScanVortices], about: Mapping[str, Any]) -> x
         ("score", [s.detection.score for s in scans], "1", "largest of the matched filters"),
     ):
         data[name] = _variable(("scan",), np.asarray(series, float), units, text)
-    masks = np.array([bit.value for bit in VortexFlag], np.uint16)
     data["flag"] = (
         ("scan",),
         np.array([s.flag for s in scans], np.uint16),
-        {
-            "long_name": "reasons not to use the vortices, 0 = valid",
-            "standard_name": "quality_flag",
-            "flag_masks": masks,
-            "flag_values": masks,
-            "flag_meanings": " ".join(str(bit.name).lower() for bit in VortexFlag),
-        },
+        flag_attributes(VortexFlag, "reasons not to use the vortices"),
     )
     names = [f"{name}_{k}" for k in range(number) for name in NUMBERS]
     coords = {

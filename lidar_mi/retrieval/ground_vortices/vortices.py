@@ -13,9 +13,10 @@ from threadpoolctl import threadpool_limits
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.errors import InputError
+from lidar_mi.flags import VortexFlag
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.progress import Notice
-from lidar_mi.retrieval.ground_vortices.dataset import ScanVortices, VortexFlag, vortex_dataset
+from lidar_mi.retrieval.ground_vortices.dataset import ScanVortices, vortex_dataset
 from lidar_mi.retrieval.ground_vortices.detection import SEPARATIONS, detect
 from lidar_mi.retrieval.ground_vortices.echo import at_the_echo
 from lidar_mi.retrieval.ground_vortices.fit import Air, Assumptions, Fit, fitted, residuals

@@ -1,12 +1,13 @@
 """Profiles of the wind as a CF data set."""
 
-import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
+
+from lidar_mi.flags import WindFlag, flag_attributes
 
 _COMPONENTS = {
     "u": ("eastward_wind", "wind to the east"),
@@ -29,23 +30,6 @@ Where most lines see nothing, those few that pass the threshold of the signal ar
 
 MAX_STDERR = 5.0
 """Largest standard error of the horizontal vector of a valid wind, m/s: as large as most winds."""
-
-
-class WindFlag(enum.IntFlag):
-    """Reasons not to use a wind; 0: valid."""
-
-    TOO_FEW_LINES = 1
-    """Fewer than three valid lines or than `MIN_FRACTION`, or lines in one plane."""
-    ILL_CONDITIONED = 2
-    """The lines hardly know one component: `MAX_CONDITION`."""
-    OUTLIERS = 4
-    """More than a third of the lines are outliers."""
-    ERROR_UNKNOWN = 8
-    """Neither residuals nor a stated noise give an error."""
-    UNCERTAIN = 16
-    """The standard error of the horizontal wind is above `MAX_STDERR`."""
-    FOLDED = 32
-    """Velocities fold, and another wind would give the same ones."""
 
 
 @dataclass(eq=False)
@@ -134,17 +118,10 @@ def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr
         values = full([getattr(p, name) for p in profiles], 0).astype(np.int32)
         data[name] = (("time", "height"), values, {"long_name": long_name, "units": "1"})
     missing = WindFlag.TOO_FEW_LINES.value
-    masks = np.array([bit.value for bit in WindFlag], np.uint16)
     data["flag"] = (
         ("time", "height"),
         full([p.flag for p in profiles], missing).astype(np.uint16),
-        {
-            "long_name": "reasons not to use the wind, 0 = valid",
-            "standard_name": "quality_flag",
-            "flag_masks": masks,
-            "flag_values": masks,
-            "flag_meanings": " ".join(str(bit.name).lower() for bit in WindFlag),
-        },
+        flag_attributes(WindFlag, "reasons not to use the wind"),
     )
     coords = {
         "time": (

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.flags import WindFlag
 from lidar_mi.retrieval.ground_winds.folding import ambiguous, unfolded
 from lidar_mi.retrieval.ground_winds.outliers import (
     LIMIT,
@@ -24,7 +25,6 @@ from lidar_mi.retrieval.ground_winds.profiles import (
     MAX_STDERR,
     MIN_FRACTION,
     Profile,
-    WindFlag,
     profile_dataset,
 )
 from lidar_mi.retrieval.ground_winds.source_name import source_name

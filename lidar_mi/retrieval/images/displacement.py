@@ -22,7 +22,7 @@ class Displacement(NamedTuple):
     score : torch.Tensor
         How well the windows match: correlation or mismatch, depending on the method.
     flag : torch.Tensor of int16
-        `quality.Flag` bits.
+        `flags.Flag` bits.
     covariance : torch.Tensor, shape (components, components, *windows.count), optional
         Of the components' errors, px^2, from methods that give it.
     quantities : mapping, optional

@@ -1,6 +1,5 @@
 """The quality of a displacement vector: flags, the texture of its window, its uncertainty."""
 
-import enum
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,48 +9,9 @@ from scipy.special import chdtri
 from torch.nn.functional import max_pool2d, max_pool3d
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.windows import Windows, working
 from lidar_mi.retrieval.symmetric import eigenvalues, largest_eigenvalue
-
-
-class Flag(enum.IntFlag):
-    """Why a vector is rejected, one bit per reason; 0 is a valid vector.
-
-    Names and values become the CF attributes `flag_meanings` and `flag_masks`.
-    """
-
-    PEAK_ON_RIM = 1
-    """Best match on the rim of the search range: the true one may lie outside. No displacement."""
-    LOW_CORRELATION = 2
-    """Correlation at the peak below the threshold (cross-correlation only)."""
-    LOW_TEXTURE = 4
-    """The template has too little structure in at least one direction (aperture problem)."""
-    MEDIAN_OUTLIER = 8
-    """Fails the normalised median test against its neighbours."""
-    NO_SUBPIXEL_FIT = 16
-    """A neighbour of the peak is not positive: the displacement is an integer."""
-    NON_FINITE_INPUT = 32
-    """NaN or infinity in the search region of one of the images. No displacement."""
-    NO_MATCH = 64
-    """No candidate could be compared (no contrast, no positive weight). No displacement."""
-    REPLACED = 128
-    """The previous pass found an outlier; this one began at its neighbours' median (multi-pass)."""
-    UNRELATED = 256
-    """The images around it correlate no better than unrelated textures (`relation`)."""
-    SATURATED = 512
-    """The template holds a saturated area at rest, or is saturated by a quarter (`rest`)."""
-    AT_REST = 1024
-    """Structure at rest or stray pixels in the template, or a pattern spoils all (`rest`).
-
-    Or one of the images is the one before it, bit for bit."""
-    NO_SKILL = 2048
-    """The standard error approaches the wind's own spread."""
-    RESAMPLED = 4096
-    """What resampling of scattered beams lost exceeds the noise (`resampling_error`)."""
-    ERROR_UNKNOWN = 8192
-    """Too few valid vectors around it, or too few clearly textured, to state one (`bootstrap`)."""
-    OTHER_MOTION = 16384
-    """Another displacement explains the images around it better (`other_motions`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:

@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from scipy.optimize import least_squares, nnls
 from scipy.spatial import KDTree
 
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 
 # Neighbours of a beam whose differences make the variogram, and bins along distance and time.
 _NEIGHBOURS, _BINS = 12, 12

@@ -9,8 +9,8 @@ import torch
 import xarray as xr
 
 import lidar_mi.plots  # noqa: F401 - data.lidar.plot()
+from lidar_mi.flags import REJECTED, Flag, flag_attributes
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 
 COMPONENTS = {"x": "u", "y": "v", "z": "w"}
@@ -109,12 +109,7 @@ def winds(
 
 def flags(displacement: Displacement, axes: Sequence[str]) -> Variable:
     """The flag with its CF attributes."""
-    about = {
-        "long_name": "reasons to reject the vector, 0 = valid",
-        "standard_name": "quality_flag",
-        "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint16),
-        "flag_meanings": " ".join(str(bit.name).lower() for bit in Flag),
-    }
+    about = flag_attributes(Flag, REJECTED)
     return tuple(axes), displacement.flag.cpu().numpy().astype(np.uint16), about
 
 

@@ -9,6 +9,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
@@ -21,13 +22,7 @@ from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.beam_times import vector_times
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import (
-    Flag,
-    clearly_textured,
-    low_texture,
-    of_bootstrap,
-    of_fit,
-)
+from lidar_mi.retrieval.images.quality import clearly_textured, low_texture, of_bootstrap, of_fit
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.wind.dataset import centres
@@ -108,7 +103,7 @@ def retrieve_wind(
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
         their correlation, `time` (s from image 1's reference time, the vector's mid-time),
         `displacement_y`, `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1),
-        `isotropy`, `flag` (bits of `quality.Flag`, 0 = valid). The auxiliary coordinates
+        `isotropy`, `flag` (bits of `flags.Flag`, 0 = valid). The auxiliary coordinates
         `y_vector`, `z_vector` are the position of the vector at mid-time: the centre and, with "cc"
         and "ws", half the displacement. "vortex_fit" adds the pair's numbers, see
         `VortexPairFit.quantities`. Rejected vectors keep their value, or NaN if there is none.

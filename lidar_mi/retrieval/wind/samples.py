@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.defects.sampling import Sampling
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.wind.options import WindowSizes
 
 

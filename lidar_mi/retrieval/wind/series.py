@@ -10,10 +10,10 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.checks import positive
 from lidar_mi.retrieval.device import device_of
 from lidar_mi.retrieval.images.common_grid import all_on_one_grid
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.threads import SMALL, in_turn, threads_for
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 

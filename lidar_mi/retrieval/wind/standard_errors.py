@@ -6,7 +6,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.windows import averaged
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind

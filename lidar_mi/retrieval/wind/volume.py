@@ -10,6 +10,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.checks import checked_stack, identical, on_device, positive
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance, enough_windows
 from lidar_mi.retrieval.correlation.multipass import multipass
@@ -24,7 +25,7 @@ from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, of_fit
+from lidar_mi.retrieval.images.quality import check_between, of_bootstrap, of_fit
 from lidar_mi.retrieval.images.windows import Windows, working
 from lidar_mi.retrieval.wind.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.wind.options import (
@@ -95,7 +96,7 @@ def retrieve_wind_volume(
     xr.Dataset, dims (x, z, y)
         At the windows' centres at mid-time: `u`, `v`, `w` and `u_stderr`, `v_stderr`, `w_stderr`
         (m s-1), `uv_correlation`, `uw_correlation`, `vw_correlation` of their errors,
-        `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
+        `correlation`, `flag` (bits of `flags.Flag`, 0 = valid; low texture means a standard error
         beyond half a voxel in some direction). Those of "correlation" are from `bootstrap` where
         there are enough windows. Rejected vectors keep their value, or NaN where
         there is none. `identical_images`, `sampling`, `copy_at_rest` and `defects` as of
