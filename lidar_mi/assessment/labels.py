@@ -52,11 +52,11 @@ def title_of(key: str) -> str:
     'rms error of v, backscatter with detector noise, variational retrieval'
     """
     *places, quantity = key.split(".")
-    whose = "standard error of " if quantity.endswith("_stderr") else ""
+    prefix = "standard error of " if quantity.endswith("_stderr") else ""
     quantity = quantity.removesuffix("_stderr")
     start, words = next((p for p in _KINDS if quantity.startswith(p[0])), ("", ""))
-    rest = quantity.removeprefix(start)
-    named = _QUANTITIES.get(rest, rest)
+    stem = quantity.removeprefix(start)
+    name = _QUANTITIES.get(stem, stem)
     origin = [_ORIGINS.get(place, place) for place in places if place != "all"]
-    texts = [whose + words + named, *origin]
+    texts = [prefix + words + name, *origin]
     return ", ".join(texts).replace("_", " ")

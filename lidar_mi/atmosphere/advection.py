@@ -11,9 +11,8 @@ from lidar_mi.errors import InputError
 # Cells of edge values added around a plane or a volume, for the spline's response to the edge (it
 # falls by a factor 0.43 per cell) and for inflow.
 _MARGIN = 12
-# Of the splines.
-_ORDER = 5
-# Nodes of the splines of a field per node of its own. On one, waves of 2 to 3 cells are damped, and
+_ORDER = 5  # of the splines
+# Nodes of a field's splines per node of the field. With one, waves of 2 to 3 cells are damped and
 # move too little: half way between nodes a wave of two cells stands still.
 _FINER = 2
 
@@ -60,11 +59,11 @@ def _departures(velocity: Sequence[np.ndarray], steps: Collection[float]) -> Ite
     """
     samplers = [_sampler(component) for component in velocity]
     place = np.indices(velocity[0].shape, dtype=float)
-    there = np.stack(velocity)  # of the nodes themselves nothing is to be interpolated
+    speed_at = np.stack(velocity)
     for number, h in enumerate(steps):
         if number:
-            there = np.stack([sample(place) for sample in samplers])
-        half = place - 0.5 * h * there
+            speed_at = np.stack([sample(place) for sample in samplers])
+        half = place - 0.5 * h * speed_at
         place = place - h * np.stack([sample(half) for sample in samplers])
         yield place
 
@@ -118,7 +117,7 @@ def advect(
         Other dims, unequal grids, uneven axes, values or dt not finite.
     """
     _check_step(dt, steps)
-    _check_grid(field, v, w, u)  # whose fault it would be of the field, of the velocities else
+    _check_grid(field, v, w, u)  # a fault of the field, or of the velocities
     return carrier(v, w, dt, steps, u)(field)
 
 
@@ -187,14 +186,14 @@ def _advected(
     w: xr.DataArray,
     u: xr.DataArray | None,
     steps: Collection[float],
-    wanted: Collection[int],
+    numbers: Collection[int],
 ) -> Iterator[xr.DataArray]:
-    """The field after successive steps (s), after those of the ``wanted`` numbers."""
+    """The field after each of the steps (s, successive) of these ``numbers``."""
     _check_grid(field, v, w, u)
     read = _reader(field, u is not None)
     paths = [_departures(speed, steps) for speed in zip(*_speeds(field, v, w, u), strict=True)]
     for number, places in enumerate(zip(*paths, strict=True)):
-        if number in wanted:
+        if number in numbers:
             yield read(places)
 
 
@@ -208,7 +207,7 @@ def _check_step(dt: float, steps: int) -> None:
 def _velocity(
     v: xr.DataArray, w: xr.DataArray, u: xr.DataArray | None
 ) -> dict[str, tuple[str, xr.DataArray]]:
-    """Names and components by the axis that they are along."""
+    """Names and components by axis."""
     along = {} if u is None else {"x": ("u", u)}
     return {**along, "y": ("v", v), "z": ("w", w)}
 
@@ -246,7 +245,7 @@ def _check_grid(
 
 
 def _pieces(field: xr.DataArray, whole: bool) -> np.ndarray:
-    """What moves as one: the ``whole`` volume, or every plane by itself."""
+    """Arrays that are advected together: the ``whole`` volume, or each plane."""
     order = [axis for axis in ("x", "y", "z") if axis in field.dims]
     values = field.transpose(*order).values.astype(float)
     return values.reshape(-1, *values.shape[-3 if whole else -2 :])
@@ -263,7 +262,7 @@ def _speeds(
 
 
 def _reader(field: xr.DataArray, whole: bool) -> Callable[[Sequence[np.ndarray]], xr.DataArray]:
-    """From places of the nodes of all `_pieces` (node indices) to the field there."""
+    """A function from places of the nodes of all `_pieces` (node indices) to the field there."""
     pieces = _pieces(field, whole)
     samplers = [_sampler(piece, _FINER) for piece in pieces]
     result = field.transpose(*(axis for axis in ("x", "y", "z") if axis in field.dims))

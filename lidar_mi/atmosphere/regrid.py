@@ -9,12 +9,12 @@ import scipy
 # Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
 # their origin reach 5e-4.
 _UNEVEN = 1e-3
-# An even axis has at most so many times the nodes of a stretched one.
+# Largest ratio of the nodes of an even axis to those of a stretched one.
 _DENSEST = 4
 
 
 def is_even(nodes: np.ndarray) -> bool:
-    """Whether an ascending axis has equal steps, to what single precision leaves of them."""
+    """Whether an ascending axis has equal steps, up to single precision."""
     steps = np.diff(nodes)
     return steps.size == 0 or bool(np.ptp(steps) <= 2 * _UNEVEN * steps.mean())
 
@@ -59,16 +59,16 @@ def interpolated(
         flow, the spline's error is smaller. 0: nothing was interpolated.
     """
     smooth, straight = values, values
-    for axis, (own, wanted) in enumerate(zip(nodes, targets, strict=True)):
-        if own.size == wanted.size and np.allclose(own, wanted, rtol=0, atol=1e-3 * _step(own)):
+    for axis, (old, new) in enumerate(zip(nodes, targets, strict=True)):
+        if old.size == new.size and np.allclose(old, new, rtol=0, atol=1e-3 * _step(old)):
             continue
-        smooth = scipy.interpolate.CubicSpline(own, smooth, axis=axis)(wanted)
-        straight = _linear(own, straight, wanted, axis)
+        smooth = scipy.interpolate.CubicSpline(old, smooth, axis=axis)(new)
+        straight = _linear(old, straight, new, axis)
     return smooth, float(np.sqrt(np.mean((smooth - straight) ** 2)))
 
 
 def statement(errors: Mapping[str, float], units: Mapping[str, str]) -> str:
-    """What was interpolated and to which error, in a sentence; empty: nothing was."""
+    """A sentence on the interpolated variables and their errors; empty without any."""
     parts = [
         f"{name} to {error:.2g} {units[name]}".rstrip() for name, error in errors.items() if error
     ]
@@ -79,9 +79,9 @@ def _step(nodes: np.ndarray) -> float:
     return float(np.diff(nodes).min()) if nodes.size > 1 else 1.0
 
 
-def _linear(nodes: np.ndarray, values: np.ndarray, wanted: np.ndarray, axis: int) -> np.ndarray:
-    index = np.clip(np.searchsorted(nodes, wanted) - 1, 0, nodes.size - 2)
-    fraction = (wanted - nodes[index]) / (nodes[index + 1] - nodes[index])
+def _linear(nodes: np.ndarray, values: np.ndarray, targets: np.ndarray, axis: int) -> np.ndarray:
+    index = np.clip(np.searchsorted(nodes, targets) - 1, 0, nodes.size - 2)
+    fraction = (targets - nodes[index]) / (nodes[index + 1] - nodes[index])
     shape = [-1 if k == axis else 1 for k in range(values.ndim)]
     fraction = fraction.reshape(shape)
     before, behind = np.take(values, index, axis), np.take(values, index + 1, axis)

@@ -237,8 +237,8 @@ def turbine_flow(
     xarray.Dataset
         m s^-1 on (x, y, z).
     """
-    given = {"x": x, "y": y, "z": z}
-    axes = {name: np.atleast_1d(np.asarray(values, float)) for name, values in given.items()}
+    coordinates = {"x": x, "y": y, "z": z}
+    axes = {name: np.atleast_1d(np.asarray(values, float)) for name, values in coordinates.items()}
     lateral, vertical = np.meshgrid(axes["y"], axes["z"], indexing="ij")
     r = np.hypot(lateral, vertical)
     # v_t / r, which has no direction to choose on the axis

@@ -46,12 +46,12 @@ class Span(Description):
 
     @property
     def scale(self) -> str:
-        """Either linear or log."""
+        """Scale: linear or log."""
         return "linear" if self.linear else "log"
 
     @property
     def unit(self) -> str:
-        """The unit of both ends, as it stands."""
+        """The unit of both ends, as written."""
         return split_quantity(self._ends()[0])[1]
 
     def ends(self) -> tuple[float, float]:
@@ -73,15 +73,15 @@ class Span(Description):
     def at(self, fractions: list[float]) -> list[float]:
         """Values at fractions of the interval, in `unit`; ends without rounding."""
         first, last = self.ends()
-        found = []
+        values = []
         for fraction in fractions:
             if fraction in (0, 1):
-                found.append(last if fraction else first)
+                values.append(last if fraction else first)
             elif self.linear:
-                found.append(first + fraction * (last - first))
+                values.append(first + fraction * (last - first))
             else:
-                found.append(first * (last / first) ** fraction)
-        return found
+                values.append(first * (last / first) ** fraction)
+        return values
 
     def quantities(self, fractions: list[float]) -> list[Any]:
         """Values at fractions of the interval, as an experiment file has them."""
@@ -89,9 +89,9 @@ class Span(Description):
 
     def _ends(self) -> tuple[Any, Any]:
         """Both ends as they are written."""
-        found = self.linear or self.log
-        assert found is not None  # `_one_scale`
-        return found
+        ends = self.linear or self.log
+        assert ends is not None  # `_one_scale`
+        return ends
 
 
 class Range(Span):
@@ -175,7 +175,7 @@ class Campaign(Description):
     @field_validator("sweep", mode="before")
     @classmethod
     def _dimensions(cls, value: Any) -> Any:
-        """Dimensions as what they are, so that a fault in one is not that of another kind."""
+        """Dimensions parsed by kind, so that a fault is reported for the right kind."""
         if not isinstance(value, dict):
             raise ValueError(f"sweep: {value!r} is not allowed; expected keys with their values")
         return {str(key): _dimension(str(key), values) for key, values in value.items()}
@@ -219,13 +219,13 @@ def _dimension(key: str, values: Any) -> Range | list[Any] | dict[str, dict[str,
 
 
 def _check_list(place: str, values: list[Any]) -> None:
-    """Values must differ and be of one unit."""
+    """Refuse equal values, and values of different units."""
     # a list: values may be lists themselves, which no set holds
-    seen: list[Any] = []
+    unique: list[Any] = []
     for value in values:
-        if value in seen:
+        if value in unique:
             raise ValueError(f"{place}: {value!r} twice is not allowed; expected each once")
-        seen.append(value)
+        unique.append(value)
     units = []
     for value in values:
         try:
@@ -234,10 +234,10 @@ def _check_list(place: str, values: list[Any]) -> None:
             continue
         if math.isfinite(number):
             units.append(unit)
-    other = next((unit for unit in units if unit != units[0]), None)
-    if other is not None:
+    another = next((unit for unit in units if unit != units[0]), None)
+    if another is not None:
         raise ValueError(
-            f"{place}: values in {units[0] or 'no unit'} and in {other or 'no unit'} are not "
+            f"{place}: values in {units[0] or 'no unit'} and in {another or 'no unit'} are not "
             "allowed; expected one unit"
         )
 
@@ -275,13 +275,13 @@ def read_campaign(
         key, equals, value = override.partition("=")
         if not equals or not key.strip():
             raise InputError(f"--set {override}: expected KEY=VALUE, such as members=4")
-        section, _, rest = key.strip().partition(".")
+        section, _, inner_key = key.strip().partition(".")
         parsed = parse_yaml(value, key)
-        if rest:
+        if inner_key:
             inner = data.setdefault(section, {})
             if not isinstance(inner, dict):
                 raise InputError(f"--set {override}: {section} is a value, not a section")
-            inner[rest] = parsed
+            inner[inner_key] = parsed
         else:
             data[section] = parsed
     if quick:
@@ -295,16 +295,16 @@ def read_campaign(
 
 def _coarser(data: dict[str, Any], coarse: dict[str, Any]) -> dict[str, Any]:
     """A description with other values of some keys; a list of names selects named sets."""
-    found, scales = dict(data), {"linear", "log"}
+    changed, scales = dict(data), {"linear", "log"}
     for key, value in coarse.items():
         before = data.get(key)
         if isinstance(value, dict) and isinstance(before, dict) and not scales & set(value):
-            found[key] = _coarser(before, value)
+            changed[key] = _coarser(before, value)
         elif isinstance(value, list) and isinstance(before, dict) and set(value) <= set(before):
-            found[key] = {name: before[name] for name in value}
+            changed[key] = {name: before[name] for name in value}
         else:
-            found[key] = value
-    return found
+            changed[key] = value
+    return changed
 
 
 def checked_campaign(data: Mapping[str, Any], origin: str) -> Campaign:

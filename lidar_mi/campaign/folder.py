@@ -35,7 +35,7 @@ ATTEMPTS = "attempts.txt"
 RUN = "run"
 """Run folder in that of a point, with ``keep: everything``."""
 
-_SHORT = 20
+_HASH_LENGTH = 20
 """Characters of a hash that name a folder: 80 bits, for which 10^7 points collide never."""
 
 
@@ -98,7 +98,7 @@ class CampaignFolder:
 
     def images(self, signature: str) -> Path:
         """Folder of images of one signature."""
-        return self.path / IMAGES / signature[:_SHORT]
+        return self.path / IMAGES / signature[:_HASH_LENGTH]
 
     def metrics(self, number: int) -> dict[str, float | None] | None:
         """Metrics of a point; None: there are none yet, or their file is damaged."""
@@ -115,7 +115,7 @@ class CampaignFolder:
     def drop_images(self, signature: str) -> None:
         """Remove images that no point needs any more."""
         shutil.rmtree(self.images(signature), ignore_errors=True)
-        with suppress(OSError):  # it holds images of other signatures
+        with suppress(OSError):  # the folder holds images of other signatures
             (self.path / IMAGES).rmdir()
 
     def claimed(self) -> AbstractContextManager[None]:
@@ -130,22 +130,22 @@ class CampaignFolder:
 
 
 def _read_mapping(path: Path, expected: str) -> dict[str, Any] | None:
-    """Content of a JSON file; None: it is missing, or torn, so that its point is computed again."""
+    """Content of a JSON file; None: missing or torn, so that its point is computed again."""
     try:
-        found = read_json(path, expected) if path.is_file() else None
+        content = read_json(path, expected) if path.is_file() else None
     except InputError:
         return None
-    return found if isinstance(found, dict) else None
+    return content if isinstance(content, dict) else None
 
 
 def read_outcome(place: Path) -> Outcome | None:
     """The outcome of the point in a folder; None: there is none yet, or its file is damaged."""
     path = place / OUTCOME
-    found = _read_mapping(path, "outcome of a point")
-    if found is None:
+    content = _read_mapping(path, "outcome of a point")
+    if content is None:
         return None
     try:
-        return Outcome(**found)
+        return Outcome(**content)
     except TypeError:
         raise InputError(f"{path}: was not written by a campaign; expected its outcome") from None
 
@@ -172,7 +172,7 @@ def read_base(campaign: Campaign, origin: str | Path) -> tuple[dict[str, Any], P
             f"{origin}: base: {campaign.base} has variants; expected an experiment without, or the "
             "campaign of its variants: lidar-mi campaign run " + str(campaign.base)
         )
-    # a name in the base would only name its own run
+    # a name in the base names only its run
     return base, path.parent.resolve()
 
 
@@ -190,15 +190,19 @@ def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder
     record = _record(points)
     refuse_strangers(folder, RECORD, "campaign's folder")
     if (folder / RECORD).is_file():
-        found = open_folder(folder)
+        existing = open_folder(folder)
         old = read_yaml(folder / RECORD, "the record of a campaign")
-        other = next((key for key, value in record.items() if old.get(key) != value), None)
-        if other:
-            what = f"version {old.get(other)}" if other == "version" else f"another {other}"
-            raise InputError(
-                f"{folder}: holds a campaign with {what}; expected another folder (-o DIR)"
+        differing = next((key for key, value in record.items() if old.get(key) != value), None)
+        if differing:
+            difference = (
+                f"version {old.get(differing)}"
+                if differing == "version"
+                else f"another {differing}"
             )
-        return found
+            raise InputError(
+                f"{folder}: holds a campaign with {difference}; expected another folder (-o DIR)"
+            )
+        return existing
     rows = _checked(points, notice)
     make_folder(folder)
     # the record last: with it the folder is that of a campaign
@@ -257,20 +261,20 @@ def _record(points: Points) -> dict[str, Any]:
 def _checked(points: Points, notice: Notice) -> list[Row]:
     """The index of all points; each is a valid experiment, and no two are equal."""
     _check_keys(points)
-    seen: dict[str, int] = {}
+    first: dict[str, int] = {}
     rows = []
     for number in range(len(points)):
         if number % 100 == 0:
             notice(f"checking {len(points)} points", number / len(points))
         experiment = points.experiment(number)
         row = _row(experiment, points.search_path)
-        if row.point in seen:
+        if row.point in first:
             raise InputError(
-                f"{_differing(points, seen[row.point], number)}: changes nothing between "
-                f"{points.title(seen[row.point])} and {points.title(number)}; expected points that "
-                "differ"
+                f"{_differing(points, first[row.point], number)}: changes nothing between "
+                f"{points.title(first[row.point])} and {points.title(number)}; expected points "
+                "that differ"
             )
-        seen[row.point] = number
+        first[row.point] = number
         rows.append(row)
     return rows
 
@@ -279,7 +283,7 @@ def _row(experiment: Experiment, search_path: Path) -> Row:
     record = new_record(experiment, search_path)
     graph = stages_of(experiment)
     images = [made_by(record, graph.keys(stage)) for stage in storing_stages(graph)]
-    return Row(made_by(record)[:_SHORT], tuple(images))
+    return Row(made_by(record)[:_HASH_LENGTH], tuple(images))
 
 
 def _check_keys(points: Points) -> None:
@@ -298,24 +302,24 @@ def _check_keys(points: Points) -> None:
 
 def _section(settings: Mapping[str, Any], key: str) -> Mapping[str, Any] | None:
     for part in key.split(".") if key else ():
-        found = settings.get(part)
-        if not isinstance(found, Mapping):
+        section = settings.get(part)
+        if not isinstance(section, Mapping):
             return None
-        settings = found
+        settings = section
     return settings
 
 
-def _differing(points: Points, one: int, other: int) -> str:
+def _differing(points: Points, first: int, second: int) -> str:
     """The first dimension in which two points differ, as a key of the description."""
-    pairs = zip(points.index(one), points.index(other), strict=True)
+    pairs = zip(points.index(first), points.index(second), strict=True)
     names = [f"sweep.{dimension.name}" for dimension in points.dimensions] + ["members"]
     return next(name for name, (a, b) in zip(names, pairs, strict=True) if a != b)
 
 
 def signatures(rows: Sequence[Row], numbers: Iterable[int]) -> dict[str, int]:
     """How many of some points need the images of each signature."""
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for number in numbers:
         for signature in rows[number].images:
-            found[signature] = found.get(signature, 0) + 1
-    return found
+            counts[signature] = counts.get(signature, 0) + 1
+    return counts

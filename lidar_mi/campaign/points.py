@@ -12,6 +12,7 @@ from scipy.stats import qmc
 
 from lidar_mi.campaign.description import Campaign, Range
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.describe import value_at
 from lidar_mi.schema import reading
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import registry, split_quantity
@@ -64,7 +65,7 @@ class Points:
     def __init__(self, campaign: Campaign, base: dict[str, Any], search_path: str | Path) -> None:
         self.campaign, self.search_path = campaign, Path(search_path)
         self.dimensions = tuple(_dimensions(campaign))
-        # a name of a point is no part of what it is
+        # the name of a point does not change its results
         self.base = reading.merged(base, _nested(campaign.set))
         self.seed = campaign.seed if campaign.seed is not None else self.base.get("seed", 1)
         _refuse_overlaps(self.dimensions)
@@ -72,7 +73,7 @@ class Points:
     @cached_property
     def shape(self) -> tuple[int, ...]:
         """Number of values in each dimension; the last one is that of members."""
-        return (*(len(one.labels) for one in self.dimensions), self.campaign.members)
+        return (*(len(dimension.labels) for dimension in self.dimensions), self.campaign.members)
 
     def __len__(self) -> int:
         return math.prod(self.shape)
@@ -85,7 +86,8 @@ class Points:
         """A point by its values: "scan.range 150 m, case day, member 3"."""
         *index, member = self.index(number)
         words = [
-            f"{one.name} {one.labels[k]}" for one, k in zip(self.dimensions, index, strict=True)
+            f"{dimension.name} {dimension.labels[k]}"
+            for dimension, k in zip(self.dimensions, index, strict=True)
         ]
         return ", ".join(words + ([f"member {member}"] if self.campaign.members > 1 else []))
 
@@ -103,8 +105,8 @@ class Points:
             data = reading.merged(data, _nested(dimension.changes[k]))
         independent = self.campaign.sample and self.campaign.sample.random == "independent"
         data = data | {"seed": member_seed(self.seed, member, *(index if independent else ()))}
-        found = reading.check(data, self.title(number))
-        return found.read_from(self.search_path)
+        experiment = reading.check(data, self.title(number))
+        return experiment.read_from(self.search_path)
 
     def coordinates(self) -> dict[str, tuple[str, list[Any]]]:
         """Values of every key and name by the dimension along which they vary.
@@ -115,44 +117,44 @@ class Points:
             By name: the dimension, and numbers in SI units, text or numbers from 0 on. Units are
             those of `units`.
         """
-        found: dict[str, tuple[str, list[Any]]] = {}
+        coordinates: dict[str, tuple[str, list[Any]]] = {}
         for axis, dimension in enumerate(self.dimensions):
             if dimension.name == SAMPLE:
-                found[SAMPLE] = (SAMPLE, list(dimension.labels))
+                coordinates[SAMPLE] = (SAMPLE, list(dimension.labels))
                 for keys in self.campaign.sample.over if self.campaign.sample else ():
                     key = tied(keys)[0]
-                    found[key] = (SAMPLE, self._values(axis, key))
+                    coordinates[key] = (SAMPLE, self._values(axis, key))
             else:
                 if dimension.named:
                     values, _ = _quantities(dimension.labels)
                 else:
                     values = self._values(axis, dimension.name)
-                found[dimension.name] = (dimension.name, values)
-        return found
+                coordinates[dimension.name] = (dimension.name, values)
+        return coordinates
 
     def units(self) -> dict[str, str]:
         """SI units of the keys that vary, as far as they have one."""
-        found: dict[str, str] = {}
+        units: dict[str, str] = {}
         for dimension in self.dimensions:
             if dimension.named:
                 _, unit = _quantities(dimension.labels)
-                found |= {dimension.name: unit} if unit else {}
+                units |= {dimension.name: unit} if unit else {}
                 continue
             for key in dimension.changes[0]:
-                value = _at(reading.settings(self.experiment(0), si=True), key)
+                value = value_at(reading.settings(self.experiment(0), si=True), key)
                 if isinstance(value, str) and _number(value) is not None:
-                    found[key] = value.partition(" ")[2]
-        return found
+                    units[key] = value.partition(" ")[2]
+        return units
 
     def _values(self, axis: int, key: str) -> list[Any]:
         """Values of a key along a dimension, as the experiments have them."""
         # the first points along this dimension; of others the same values follow
         stride = math.prod(self.shape[axis + 1 :])
-        found = [
-            _at(reading.settings(self.experiment(k * stride), si=True), key)
+        values = [
+            value_at(reading.settings(self.experiment(k * stride), si=True), key)
             for k in range(self.shape[axis])
         ]
-        numbers = [_number(value) for value in found]
+        numbers = [_number(value) for value in values]
         if all(number is not None for number in numbers):
             return numbers
         return [str(value) for value in self.dimensions[axis].labels]
@@ -184,7 +186,7 @@ def _dimensions(campaign: Campaign) -> Iterator[Dimension]:
 def _sampled(campaign: Campaign) -> Dimension:
     """The points of a space-filling sample, scrambled by the campaign's seed."""
     sample = campaign.sample
-    assert sample is not None  # as `_dimensions` has asked
+    assert sample is not None  # checked by `_dimensions`
     kinds = {"sobol": qmc.Sobol, "latin_hypercube": qmc.LatinHypercube}
     # the same points at every start of the campaign
     random = np.random.default_rng(campaign.seed or 0)
@@ -208,14 +210,14 @@ def tied(keys: str) -> list[str]:
 def _quantities(labels: Sequence[str]) -> tuple[list[Any], str]:
     """Names of sets of changes; those that are all quantities of one kind as numbers in SI."""
     try:
-        found = [
+        quantities = [
             registry().Quantity(*split_quantity(_plain(label))).to_base_units() for label in labels
         ]
     except Exception:  # words; pint raises whatever its parser does
         return list(labels), ""
-    if len({one.units for one in found}) > 1:
+    if len({number.units for number in quantities}) > 1:
         return list(labels), ""
-    return [float(one.magnitude) for one in found], f"{found[0].units:~C}"
+    return [float(number.magnitude) for number in quantities], f"{quantities[0].units:~C}"
 
 
 def _plain(label: str) -> str | float:
@@ -239,37 +241,29 @@ def _refuse_overlaps(dimensions: Sequence[Dimension]) -> None:
         owner |= {key: dimension.name for changes in dimension.changes for key in changes}
 
 
-def _overlap(one: str, other: str) -> bool:
+def _overlap(first: str, second: str) -> bool:
     # a section overlaps its keys: the dots keep scan apart from scanner
-    return f"{one}.".startswith(f"{other}.") or f"{other}.".startswith(f"{one}.")
+    return f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}.")
 
 
 def _flat(changes: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     """Nested sections as dotted keys; an empty section is a value."""
-    found: dict[str, Any] = {}
+    dotted: dict[str, Any] = {}
     for key, value in changes.items():
         name = f"{above}{key}"
         nested = isinstance(value, Mapping) and value
-        found |= _flat(value, f"{name}.") if nested else {name: value}
-    return found
+        dotted |= _flat(value, f"{name}.") if nested else {name: value}
+    return dotted
 
 
 def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
     """Dotted keys as nested sections."""
-    found: dict[str, Any] = {}
+    sections: dict[str, Any] = {}
     for key, value in changes.items():
         for part in reversed(key.split(".")):
             value = {part: value}
-        found = reading.merged(found, value) if found else dict(value)
-    return found
-
-
-def _at(settings: Mapping[str, Any], key: str) -> Any:
-    """The value at a dotted key; None: there is none."""
-    value: Any = settings
-    for part in key.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value
+        sections = reading.merged(sections, value) if sections else dict(value)
+    return sections
 
 
 def _number(value: object) -> float | None:

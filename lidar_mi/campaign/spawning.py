@@ -1,7 +1,7 @@
 """Worker processes of this machine: whether they can start, and why not.
 
-A worker is a new interpreter that imports the main module of the program (``spawn``). What stops
-it shows in that process alone, and dask notices after a minute. So one process that does nothing
+A worker is a new interpreter that imports the main module of the program (``spawn``). Its faults
+appear only in that process, and dask notices them after a minute. So one process that does nothing
 is started first, with its output hidden from the terminal.
 """
 
@@ -24,7 +24,7 @@ _FILES, _FILES_EACH = 16, 11
 
 _GUARD = "the script needs if __name__ == '__main__': before what it starts"
 _TOO_FEW = "too few open files are allowed (ulimit -n); expected 64 and 16 for every worker"
-# multiprocessing's own words where a main module starts processes as it is imported
+# multiprocessing's message for a main module that starts processes on import
 _IMPORTING = "bootstrapping phase"
 
 
@@ -49,17 +49,17 @@ def check_spawning(count: int) -> None:
     with tempfile.TemporaryFile() as output:
         try:
             with _output_to(output.fileno()):
-                one = multiprocessing.get_context("spawn").Process(target=os.getpid)
-                # the child inherits the output: this process has its own back at once
-                one.start()
-            one.join(PATIENCE)
+                process = multiprocessing.get_context("spawn").Process(target=os.getpid)
+                # the child inherits the output: it is restored here at once
+                process.start()
+            process.join(PATIENCE)
         except (OSError, RuntimeError, ValueError) as error:
             raise _not_started(error) from None
-        if one.exitcode == 0:
+        if process.exitcode == 0:
             return
-        if one.exitcode is None:
-            one.kill()
-            one.join()
+        if process.exitcode is None:
+            process.kill()
+            process.join()
             raise _refused(f"the first had not started after {PATIENCE:g} s")
         output.seek(0)
         text = output.read().decode(errors="replace").strip()
@@ -69,12 +69,12 @@ def check_spawning(count: int) -> None:
     if not os.access(interpreter, os.X_OK):
         raise _refused(f"{interpreter} may not be executed")
     # the last line of a traceback is the exception
-    raise _refused(text.splitlines()[-1] if text else f"exit code {one.exitcode}")
+    raise _refused(text.splitlines()[-1] if text else f"exit code {process.exitcode}")
 
 
 @contextmanager
 def workers_started() -> Iterator[None]:
-    """Turn whatever stops workers from starting into one line."""
+    """Report any failure to start workers in one line."""
     try:
         yield
     except InputError:
@@ -85,16 +85,16 @@ def workers_started() -> Iterator[None]:
 
 @contextmanager
 def quiet_loggers() -> Iterator[None]:
-    """Without the tracebacks that dask and what it builds on log of what they then raise."""
+    """Suppress tracebacks that dask and its libraries log before they raise."""
     loggers = [logging.getLogger(name) for name in ("asyncio", "tornado", "distributed")]
-    levels = [one.level for one in loggers]
+    levels = [logger.level for logger in loggers]
     try:
-        for one in loggers:
-            one.setLevel(logging.CRITICAL)
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
         yield
     finally:
-        for one, level in zip(loggers, levels, strict=True):
-            one.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _may_open(number: int) -> bool:
@@ -106,8 +106,8 @@ def _may_open(number: int) -> bool:
     except OSError:
         return False
     finally:
-        for one in opened:
-            os.close(one)
+        for descriptor in opened:
+            os.close(descriptor)
     return True
 
 
@@ -115,7 +115,7 @@ def _not_started(error: BaseException) -> InputError:
     numbers = [getattr(cause, "errno", None) for cause in causes(error)]
     if errno.EMFILE in numbers or errno.ENFILE in numbers or not _may_open(_FILES_EACH):
         return _refused(_TOO_FEW)
-    # dask puts exceptions of its own over the cause
+    # dask wraps the cause in its own exceptions
     first = list(causes(error))[-1]
     return _refused(one_line(first, 150) or type(first).__name__)
 
@@ -127,13 +127,13 @@ def _refused(reason: str) -> InputError:
 @contextmanager
 def _output_to(target: int) -> Iterator[None]:
     """Standard output and error of processes that start meanwhile, to a file descriptor."""
-    own = {}
+    saved = {}
     try:
         for number in (1, 2):
-            own[number] = os.dup(number)
+            saved[number] = os.dup(number)
             os.dup2(target, number)
         yield
     finally:
-        for number, before in own.items():
+        for number, before in saved.items():
             os.dup2(before, number)
             os.close(before)

@@ -75,11 +75,11 @@ class Status(Tabular):
             rows.append(
                 ("time left", f"{self.remaining():.3g} s, divided by the number of workers")
             )
-        found = [Table(f"campaign {self.name}", rows)]
+        tables = [Table(f"campaign {self.name}", rows)]
         if self.failures:
             heads = ("failed point", "message", "folder")
-            found.append(Table("", self.failures[:20], heads))
-        return found
+            tables.append(Table("", self.failures[:20], heads))
+        return tables
 
 
 def campaign_status(folder: str | Path) -> Status:

@@ -112,14 +112,14 @@ def carry_out(
     campaign = _opened(folder, (Path(folder) / RECORD).stat().st_mtime_ns)
     place = campaign.place(number)
     # the outcome is written before the metrics, by which the point is done
-    if campaign.is_done(number) and (found := campaign.outcome(number)) is not None:
-        return found
+    if campaign.is_done(number) and (recorded := campaign.outcome(number)) is not None:
+        return recorded
     make_folder(place)
     log = Log(path=place / records.LOG)
     start = time.perf_counter()
     store: PointStore | None = None
     try:
-        # before anything that could kill the worker
+        # first, as anything later may kill the worker
         _count_attempt(place, session)
         experiment = campaign.points.experiment(number)
         store = PointStore(campaign, number, experiment)
@@ -133,7 +133,7 @@ def carry_out(
             _compute(campaign, run, store)
             seconds, metrics = run.seconds, run.metrics
         seconds = {"total": time.perf_counter() - start, **seconds}
-        # rendered for this point by a task of its own, so that the store found them there
+        # rendered for this point by another task, so that the store has them
         shared = sum(ready[k] for k in first)
         rounded = {step: round(value, 4) for step, value in seconds.items()}
         outcome = Outcome("done", "", rounded, store.rendered + shared, store.reused - shared)
@@ -147,7 +147,7 @@ def carry_out(
         message = one_line(error) or type(error).__name__
         outcome = Outcome("failed", message, {"total": time.perf_counter() - start}, *counts)
         write_outcome(place, outcome)
-    # it has ended by itself: attempts count killed workers only
+    # only killed workers count as attempts
     (place / ATTEMPTS).unlink(missing_ok=True)
     return outcome
 
@@ -163,7 +163,7 @@ def render_shared(folder: str, number: int, name: str, session: str) -> int:
     experiment = campaign.points.experiment(number)
     store, graph = PointStore(campaign, number, experiment), stages_of(experiment)
     pairs = zip(storing_stages(graph), campaign.index[number].images, strict=True)
-    stage, signature = next((stage, one) for stage, one in pairs if stage.name == name)
+    stage, signature = next((stage, image) for stage, image in pairs if stage.name == name)
     images = campaign.images(signature)
     make_folder(images)
     try:
@@ -183,9 +183,9 @@ def run_point(folder: CampaignFolder, number: int) -> Outcome:
     """
     use_threads(1)
     outcome = carry_out(str(folder.path.resolve()), number, uuid.uuid4().hex[:12])
-    needed = signatures(folder.index, range(len(folder.points)))
+    counts = signatures(folder.index, range(len(folder.points)))
     for signature in folder.index[number].images:
-        if needed[signature] == 1:
+        if counts[signature] == 1:
             folder.drop_images(signature)
     return outcome
 
@@ -201,15 +201,15 @@ class PointStore:
         self._experiment, self.signature = experiment.name, campaign.index[number].point
         graph = stages_of(experiment)
         pairs = zip(storing_stages(graph), campaign.index[number].images, strict=True)
-        of = {part: one for stage, one in pairs for part in graph.parts(stage)}
+        of = {part: signature for stage, signature in pairs for part in graph.parts(stage)}
         self.images = ImageStore(lambda part: campaign.images(of[part]), of.__getitem__)
         self.rendered = self.reused = 0
 
     def stored(self, part: str) -> xr.Dataset | None:
         """An image of this content, rendered by any point."""
-        found = self.images.stored(part)
-        self.reused += found is not None
-        return found
+        image = self.images.stored(part)
+        self.reused += image is not None
+        return image
 
     def unfinished(self, part: str) -> dict[str, Any] | None:
         """As of `ImageStore`."""
@@ -239,7 +239,7 @@ def _compute(campaign: CampaignFolder, run: Run, store: PointStore) -> None:
         return
     record = resumable_folder.new_record(run.experiment, campaign.points.search_path)
     write_text(store.place / records.RECORD, to_yaml(record))
-    # without a report figures have no use
+    # figures are only for the report
     finish(run, store, with_figures=False)
 
 
@@ -252,10 +252,10 @@ def _prepared(experiment: Experiment, search_path: Path) -> Run:
     global _last
     signatures = _signatures(experiment, search_path)
     last_signatures, results = _last
-    known = {
+    reusable = {
         name: results[name] for name in results if last_signatures[name] == signatures.get(name)
     }
-    run = prepare(experiment, search_path, known=known)
+    run = prepare(experiment, search_path, known=reusable)
     results = cast(dict[str, Any], run.results)
     shared = {name: results[name] for name in signatures if name in results}
     _last = ({name: signatures[name] for name in shared}, shared)
@@ -274,14 +274,8 @@ def _signatures(experiment: Experiment, search_path: Path) -> dict[str, str]:
 
 
 def _count_attempt(place: Path, session: str) -> None:
-    """Count an attempt.
-
-    Raises
-    ------
-    InputError
-        `MOST_ATTEMPTS` earlier ones of this session killed their worker.
-    """
-    # a file: a worker that is killed can count nothing after it
+    """Count an attempt; InputError if `MOST_ATTEMPTS` of this session killed their worker."""
+    # counted in a file, as a killed worker cannot count
     path = place / ATTEMPTS
     lines = read_text(path, "attempts").splitlines() if path.is_file() else []
     ended = lines.count(session)

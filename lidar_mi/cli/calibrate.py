@@ -76,9 +76,9 @@ def calibrate(
 
     figure = out.with_suffix(".png")
     lamps = _lines(line or [])
-    given = [*frames, *(flat or []), *(path for paths in lamps.values() for path in paths)]
-    check_target(out, given, overwrite=overwrite, suffixes=(".nc",))
-    check_target(figure, given, overwrite=overwrite)
+    inputs = [*frames, *(flat or []), *(path for paths in lamps.values() for path in paths)]
+    check_target(out, inputs, overwrite=overwrite, suffixes=(".nc",))
+    check_target(figure, inputs, overwrite=overwrite)
     experiment = load(experiment_file(instrument), list(changes or []))
     ccd, counts = doppler_of(experiment, "--instrument").ccd, not electrons
     values = read_electrons(frames, ccd, counts=counts, layer=layer)
@@ -87,7 +87,7 @@ def calibrate(
     white = None
     if flat:
         white = read_electrons(flat, ccd, counts=counts, layer=layer).mean(0)
-    found = calibrate_etalon(
+    fit = calibrate_etalon(
         values,
         experiment,
         flat=white,
@@ -102,23 +102,23 @@ def calibrate(
         background_degree=background_degree,
         max_chi_square=max_chi_square,
     )
-    write_netcdf(found.to_dataset().assign_attrs(software=f"lidar-mi {__version__}"), out)
-    write_png(draw_calibration(found), figure)
-    for table in found.tables():
+    write_netcdf(fit.to_dataset().assign_attrs(software=f"lidar-mi {__version__}"), out)
+    write_png(draw_calibration(fit), figure)
+    for table in fit.tables():
         print_table(table)
     output.print(f"calibration {out}")
     output.print(f"figure      {figure}")
 
 
-def _lines(given: list[str]) -> dict[float, list[Path]]:
+def _lines(texts: list[str]) -> dict[float, list[Path]]:
     """Files by the wavelength (m) of their line."""
-    found: dict[float, list[Path]] = {}
-    for text in given:
+    files: dict[float, list[Path]] = {}
+    for text in texts:
         wavelength, equals, path = text.partition("=")
         if not (equals and path):
             raise InputError(
                 f"--line: {text!r} is not allowed; expected WAVELENGTH=FILE, such as "
                 "'404.7708 nm=lamp.tif'"
             )
-        found.setdefault(quantity("--line", wavelength, "m", "404.7708 nm"), []).append(Path(path))
-    return found
+        files.setdefault(quantity("--line", wavelength, "m", "404.7708 nm"), []).append(Path(path))
+    return files

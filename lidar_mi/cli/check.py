@@ -40,29 +40,29 @@ def check(
     from lidar_mi.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
-    asked = reading.load_variants(path, changes) or {"": reading.load(path, changes)}
+    experiments = reading.load_variants(path, changes) or {"": reading.load(path, changes)}
     with progress() as notice:
-        found = [
+        tables = [
             section
-            for one in asked.values()
-            for section in _sections(one.read_from(path.parent), notice, forecast)
+            for checked in experiments.values()
+            for section in _sections(checked.read_from(path.parent), notice, forecast)
         ]
-    for title, rows in found:
+    for title, rows in tables:
         print_rows(title, rows)
-    warned = sum(len(rows) for title, rows in found if ": warnings" in title)
+    warned = sum(len(rows) for title, rows in tables if ": warnings" in title)
     verdict = "all checks passed"
     if warned:
         verdict = f"it can be run; {warned} warning{'s' * (warned > 1)} above"
     output.print(verdict, highlight=False)
 
 
-def _sections(asked: "Experiment", notice: Notice, forecast: bool) -> Iterator["Section"]:
+def _sections(experiment: "Experiment", notice: Notice, forecast: bool) -> Iterator["Section"]:
     """Tables of a run or of a flight."""
-    notice(f"checking {asked.name}", None)
-    if asked.encounter:
+    notice(f"checking {experiment.name}", None)
+    if experiment.encounter:
         from lidar_mi.encounter.check import sections as flight_sections
 
-        return flight_sections(asked, notice, timed=forecast)
+        return flight_sections(experiment, notice, timed=forecast)
     from lidar_mi.experiment.preflight.check import sections
 
-    return sections(asked, asked.folder, notice, timed=forecast, sampled=forecast)
+    return sections(experiment, experiment.folder, notice, timed=forecast, sampled=forecast)

@@ -37,23 +37,23 @@ def explain(
         print_rows("keys of an experiment file", rows)
         output.print("of one: lidar-mi explain KEY")
         return
-    found = keys.explain(key.strip())
+    entry = keys.explain(key.strip())
     facts = (
-        ("meaning", found.meaning),
-        ("unit", found.unit),
-        ("default", found.default),
-        ("allowed", found.allowed),
-        ("of each in", found.listed_in),
-        ("example", found.example),
+        ("meaning", entry.meaning),
+        ("unit", entry.unit),
+        ("default", entry.default),
+        ("allowed", entry.allowed),
+        ("of each in", entry.listed_in),
+        ("example", entry.example),
     )
-    print_rows(found.name, [fact for fact in facts if fact[1]])
-    for paragraph in found.more:
-        if paragraph.removesuffix(".") != found.meaning:
+    print_rows(entry.name, [fact for fact in facts if fact[1]])
+    for paragraph in entry.more:
+        if paragraph.removesuffix(".") != entry.meaning:
             output.print(f"\n{paragraph}", highlight=False)
-    if found.keys:
+    if entry.keys:
         output.print()
-        inner = [keys.explain(name) for name in found.keys]
+        inner = [keys.explain(name) for name in entry.keys]
         print_rows(
-            f"keys of {found.name}: default, meaning",
+            f"keys of {entry.name}: default, meaning",
             [(key.name.rpartition(".")[2], key.default or "section", key.meaning) for key in inner],
         )

@@ -63,7 +63,7 @@ def info(
             print_answer([campaign_answer(what)])
         return
     with progress() as notice:
-        found = list(
+        tables = list(
             sections(
                 what,
                 quantity("--wavelength", wavelength, "m", "532 nm"),
@@ -73,13 +73,13 @@ def info(
         )
     folder = Path(what)
     if folder.is_dir():
-        _show_folder(folder, found)
+        _show_folder(folder, tables)
         return
-    for title, rows in found:
+    for title, rows in tables:
         print_rows(title, rows)
 
 
-def _show_folder(folder: Path, found: Sequence["Section"]) -> None:
+def _show_folder(folder: Path, tables: Sequence["Section"]) -> None:
     """The answer, the contents and the numbers of a run or of a study."""
     from lidar_mi.experiment.folder.records import (
         STUDY,
@@ -96,7 +96,7 @@ def _show_folder(folder: Path, found: Sequence["Section"]) -> None:
         if part:
             output.print(f"\n{part}", style="bold")
         print_answer(answer)
-    for title, rows in found:
+    for title, rows in tables:
         print_rows(title, rows)
     if reason:
         output.print(f"failed: {reason}", soft_wrap=True)
@@ -124,6 +124,6 @@ def _results(
         return encounter_summary(metrics, about.get(CONTROLLER, ""))
     from lidar_mi.assessment.report.summary import summary
 
-    asked = value_at(experiment, "doppler.retrieval.averaged")
-    averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()
+    numbers = value_at(experiment, "doppler.retrieval.averaged")
+    averaged = [n for n in numbers if isinstance(n, int)] if isinstance(numbers, list) else ()
     return summary(metrics, averaged)

@@ -50,19 +50,19 @@ def new(
     from lidar_mi.schema.shipped import experiments, flights, instrument_file, shipped_file
 
     path = Path(name if name.endswith(".yaml") else f"{name}.yaml")
-    own = path.stem
-    if not re.fullmatch(NAME, own):
+    stem = path.stem
+    if not re.fullmatch(NAME, stem):
         raise InputError(f"{name}: not allowed; expected {A_NAME}")
-    if own in experiments():
+    if stem in experiments():
         raise InputError(f"{name}: a shipped experiment has this name; expected another one")
     source = shipped_file(shipped) if like is None else instrument_file(like)
     if path.exists():
         raise InputError(f"{path}: is there already; expected a new name")
     if like is None:
         command = "fly" if source.stem in flights() else "run"
-        text = new_file(own, source.stem, source, command)
+        text = new_file(stem, source.stem, source, command)
     else:
-        text = re.sub(r"(?m)^name: .*", f"name: {own}", read_text(source, "an instrument"))
+        text = re.sub(r"(?m)^name: .*", f"name: {stem}", read_text(source, "an instrument"))
     write_text(path, text)
     output.print(f"file     {path}", soft_wrap=True)
     output.print(f"next     lidar-mi check {path}", soft_wrap=True)

@@ -10,12 +10,14 @@ from lidar_mi.errors import InputError
 
 
 def starting(incomplete: str, names: Iterable[str], *patterns: str) -> list[str]:
-    """What a shell may complete: names, then files of some patterns and folders here."""
+    """Completions for a shell: names, then files of some patterns and folders here."""
     folder = incomplete.rpartition("/")[0]
-    here = Path(folder or ("/" if incomplete.startswith("/") else "."))
-    found = sorted(path for pattern in patterns for path in here.glob(pattern) if path.is_file())
-    found += sorted(p for p in here.glob("*/") if p.is_dir()) if patterns else []
-    files = [f"{path}/" if path.is_dir() else str(path) for path in found]
+    shown_folder = Path(folder or ("/" if incomplete.startswith("/") else "."))
+    paths = sorted(
+        path for pattern in patterns for path in shown_folder.glob(pattern) if path.is_file()
+    )
+    paths += sorted(p for p in shown_folder.glob("*/") if p.is_dir()) if patterns else []
+    files = [f"{path}/" if path.is_dir() else str(path) for path in paths]
     return [name for name in (*names, *files) if name.startswith(incomplete)]
 
 
@@ -194,13 +196,13 @@ LineNames = Annotated[
 
 def names_of(pairs: Sequence[str]) -> dict[str, str]:
     """The names of ``--name OURS=THEIRS``."""
-    found = {}
+    names = {}
     for pair in pairs:
         ours, sign, theirs = pair.partition("=")
         if not (ours and sign and theirs):
             raise InputError(f"--name: {pair!r} is not allowed; expected OURS=THEIRS")
-        found[ours] = theirs
-    return found
+        names[ours] = theirs
+    return names
 
 
 @overload

@@ -47,8 +47,8 @@ def render(
     """Render a Mitsuba scene of a `scanning_lidar` or a `ccd`, the plugins loaded.
 
     Pictures by other cameras: lidar_mi.register_plugins() and mi.render in Python. Writes an EXR,
-    and beside it a PNG of its brightness to look at, linear from black to white; which values these
-    are is said.
+    and beside it a PNG preview of its brightness, linear from black to white; the values of both
+    are printed.
     """
     from lidar_mi.instrument.products import untrusted_pixels
     from lidar_mi.io.images import read_pixels
@@ -59,9 +59,9 @@ def render(
 
     source, definitions = scene_file(scene), _definitions(define or [])
     near = source if Path(scene).is_file() else Path(source.name)
-    asked, read = out or near.with_suffix(".exr"), files_of(source, definitions)
-    check_target(asked, read, overwrite=overwrite)
-    path = _image(asked)
+    target, read = out or near.with_suffix(".exr"), files_of(source, definitions)
+    check_target(target, read, overwrite=overwrite)
+    path = _image(target)
     preview = path.with_suffix(".png")
     check_target(path, read, overwrite=overwrite)
     # made from the image: it is replaced together with it
@@ -76,8 +76,8 @@ def render(
             definitions,
             lambda fraction: notice(f"rendering {source.name}", fraction),
         )
-    if said := untrusted_pixels(image):
-        output.print(f"warning: {said}", soft_wrap=True)
+    if warning := untrusted_pixels(image):
+        output.print(f"warning: {warning}", soft_wrap=True)
     black, white = write_preview(preview, read_pixels(path))
     output.print(f"image    {path}")
     output.print(f"preview  {preview}: black is {black:.4g}, white {white:.4g}", soft_wrap=True)

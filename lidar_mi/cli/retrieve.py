@@ -171,8 +171,8 @@ def retrieve(
             device=device,
         )
     wind = wind.assign_attrs(software=f"lidar-mi {__version__}")
-    lost = write_wind(out, wind, wind.attrs["pixel_size"])
-    _print_found(wind, by_default=layer is None, from_headers=dt is None and not pixels)
+    omitted = write_wind(out, wind, wind.attrs["pixel_size"])
+    _print_file_remarks(wind, by_default=layer is None, from_headers=dt is None and not pixels)
     if pairs is not None:
         _print_series(wind)
     else:
@@ -182,8 +182,8 @@ def retrieve(
     if drawn is not None:
         _draw(wind, drawn, colours.value, lines.value)
         output.print(f"picture  {drawn}")
-    if lost:
-        output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
+    if omitted:
+        output.print(f"lost     {omitted}; .nc has them", soft_wrap=True)
     if not (wind["flag"] == 0).any():
         end_without_result(f"no valid vector of {wind['flag'].size}", wind["flag"])
 
@@ -210,10 +210,10 @@ def _numbers(text: str) -> list[int]:
 
 
 def _pairs(text: str) -> list[tuple[int, int]] | Literal["all"]:
-    """The pairs of images that --pairs names; whether they exist is for the retrieval to say."""
+    """The pairs of images that --pairs names; the retrieval checks that they exist."""
     if text.strip() == "all":
         return "all"
-    found = []
+    pairs = []
     for part in text.split(","):
         numbers = [number.strip() for number in part.split("-")]
         if len(numbers) != 2 or not all(n.isascii() and n.isdigit() for n in numbers):
@@ -221,20 +221,20 @@ def _pairs(text: str) -> list[tuple[int, int]] | Literal["all"]:
                 f"--pairs: {part.strip()!r} is not allowed; expected all, or pairs of numbers "
                 "such as 0-1,1-2"
             )
-        found.append((int(numbers[0]), int(numbers[1])))
-    return found
+        pairs.append((int(numbers[0]), int(numbers[1])))
+    return pairs
 
 
-def _print_found(wind: "xr.Dataset", *, by_default: bool, from_headers: bool) -> None:
-    """What the files said, and what contradicts it."""
+def _print_file_remarks(wind: "xr.Dataset", *, by_default: bool, from_headers: bool) -> None:
+    """Layer, time step and remarks from the files."""
     layer = wind.attrs["layer"]
     if layer and by_default:
         noisy = ", with the detector's noise (--layer Y: without it)" if layer == "Y_noisy" else ""
         output.print(f"layer    {layer}{noisy}")
     if from_headers:
         steps = wind["dt"].values.ravel() if "dt" in wind else [wind.attrs["dt"]]
-        said = ", ".join(dict.fromkeys(f"{step:g}" for step in steps))
-        output.print(f"dt       {said} s, by the headers of the files")
+        times = ", ".join(dict.fromkeys(f"{step:g}" for step in steps))
+        output.print(f"dt       {times} s, by the headers of the files")
     for remark in wind.attrs["remarks"].splitlines():
         output.print(f"warning: {remark}")
 
@@ -263,9 +263,11 @@ def _statistics(wind: "xr.Dataset", form: str = ".3g") -> tuple[float, list[tupl
     for name in ("v", "w"):
         values = wind[name].where(valid)
         error = wind[f"{name}_stderr"].where(valid) if f"{name}_stderr" in wind else values * np.nan
-        found = (values.mean(), np.sqrt((values**2).mean()), error.mean())
-        mean, rms, stated = ("-" if np.isnan(one) else f"{float(one):{form}}" for one in found)
-        columns.append((mean, rms, stated))
+        statistics = (values.mean(), np.sqrt((values**2).mean()), error.mean())
+        mean, rms, stderr = (
+            "-" if np.isnan(number) else f"{float(number):{form}}" for number in statistics
+        )
+        columns.append((mean, rms, stderr))
     return float(valid.mean()), columns
 
 
@@ -281,12 +283,12 @@ def _print_statistics(wind: "xr.Dataset") -> None:
 
 
 def _speed(wind: "xr.Dataset") -> str:
-    """The unit of v as one writes it: m/s, px/s or px/frame."""
+    """The unit of v: m/s, px/s or px/frame."""
     return re.sub(r" (\w+)-1", r"/\1", str(wind["v"].attrs["units"]))
 
 
 def _print_series(winds: "xr.Dataset") -> None:
-    """The statistics of each pair, a row each, and what was remarked on it."""
+    """Statistics and remarks of each pair, a row each."""
     rows = []
     for number in range(winds.sizes["time"]):
         wind = winds.isel(time=number)

@@ -96,15 +96,15 @@ def rings(
         return
     path = out or Path(f"{images[0].stem}_rings.png")
     check_target(path, images, overwrite=overwrite, suffixes=(".png",))
-    values = _one(images, layer, frame, average, saturation)
+    values = _chosen_frame(images, layer, frame, average, saturation)
     name = images[0] if len(images) == 1 else f"{images[0]} to {images[-1]}"
     try:
-        found = analyse_rings(values, centre, saturation if not average else None, spacing)
-        plates = gap_from_lines(found, lines, *expected) if lines else None
+        analysis = analyse_rings(values, centre, saturation if not average else None, spacing)
+        etalon = gap_from_lines(analysis, lines, *expected) if lines else None
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    write_png(draw_rings(values, found, images[0].name), path)
-    for table in found.tables() + (plates.tables() if plates else []):
+    write_png(draw_rings(values, analysis, images[0].name), path)
+    for table in analysis.tables() + (etalon.tables() if etalon else []):
         print_table(table)
     output.print(f"image    {path}")
 
@@ -125,14 +125,14 @@ def _frames(images: list[Path], layer: str | None) -> Iterator[tuple[str, "np.nd
             yield f"{path}[{number}]", frame.astype(float)
 
 
-def _one(
+def _chosen_frame(
     images: list[Path],
     layer: str | None,
     frame: int | None,
     average: bool,
     saturation: float | None,
 ) -> "np.ndarray":
-    """The frame that is asked for, or the mean of all."""
+    """The frame with the number, or the mean of all."""
     import torch
 
     from lidar_mi.io.images import frames_in, read_frames
@@ -140,13 +140,13 @@ def _one(
 
     if average:
         frames = list(_frames(images, layer))
-        for name, one in frames:
+        for name, pixels in frames:
             try:
-                checked(torch.from_numpy(one), saturation)
+                checked(torch.from_numpy(pixels), saturation)
             except InputError as error:
                 raise InputError(f"{name}: {error}") from None
-        _remark([one for _, one in frames])
-        return functools.reduce(operator.add, (one for _, one in frames)) / len(frames)
+        _remark([pixels for _, pixels in frames])
+        return functools.reduce(operator.add, (pixels for _, pixels in frames)) / len(frames)
     places = [(path, n) for path in images for n in range(frames_in(path, layer)[0])]
     if frame is None and len(places) > 1:
         raise InputError(
@@ -162,7 +162,7 @@ def _one(
 
 
 def _remark(frames: Sequence["np.ndarray"]) -> None:
-    """Frames that are there twice."""
+    """Warn of identical frames."""
     from lidar_mi.retrieval.checks import identical
 
     if same := identical(frames, "frames", start=0):

@@ -50,7 +50,7 @@ def run(
     loaded = next(iter(variants.values())) if variants else reading.load(path, changes)
     if variant:
         sections = {"render": loaded.imaged_wake, "doppler.render": loaded.fringes}
-        changes += [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
+        changes += [f"{key}.variant={variant}" for key, section in sections.items() if section]
     if variants:
         _run_study(reading.load_variants(path, changes), out, path, overwrite)
         return
@@ -91,9 +91,9 @@ def _run_study(
     for variant in metrics:
         output.print(f"\n{variant}", style="bold")
         print_answer(read_answer(folder / variant))
-    for variant, found in metrics.items():
+    for variant, numbers in metrics.items():
         output.print(f"\n{variant}", style="bold")
-        for table in summary(found, _averaged(variants[variant])):
+        for table in summary(numbers, _averaged(variants[variant])):
             print_table(table)
     output.print(f"report   {folder / 'report.html'}")
 

@@ -65,43 +65,45 @@ def v_los(
     frames = [*(frames or []), *(signal or [])]
     if not frames:
         raise InputError("frames: none is not allowed; expected files of the echo of air")
-    given = [*frames, *(reference or []), *([calibration] if calibration else [])]
+    inputs = [*frames, *(reference or []), *([calibration] if calibration else [])]
     if out is not None:
-        check_target(out, given, overwrite=overwrite, suffixes=(".nc",))
+        check_target(out, inputs, overwrite=overwrite, suffixes=(".nc",))
     experiment = load(experiment_file(instrument), list(changes or []))
     ccd, counts = doppler_of(experiment, "--instrument").ccd, not electrons
-    known = None
+    etalon = None
     if calibration is not None:
         try:
-            known = calibration_of(read_netcdf(calibration))
+            etalon = calibration_of(read_netcdf(calibration))
         except InputError as error:
             raise InputError(f"{calibration}: {error}") from None
     air = read_electrons(frames, ccd, counts=counts, layer=layer)
     if same := identical(air, "frames", start=0):
         output.print(f"warning: {same}")
     laser = read_electrons(reference, ccd, counts=counts, layer=layer) if reference else None
-    found = retrieve_v_los(air, laser, experiment, calibration=known, max_chi_square=max_chi_square)
+    speeds = retrieve_v_los(
+        air, laser, experiment, calibration=etalon, max_chi_square=max_chi_square
+    )
     rows: list[tuple[str, ...]] = []
-    for k in range(found.sizes["frame"]):
-        one = found.isel(frame=k)
-        speed, systematic = float(one["v_los"]), float(one["v_los_systematic"])
+    for k in range(speeds.sizes["frame"]):
+        frame = speeds.isel(frame=k)
+        speed, systematic = float(frame["v_los"]), float(frame["v_los_systematic"])
         rows.append(
             (
                 str(k),
-                with_error(speed, float(one["v_los_std"])),
+                with_error(speed, float(frame["v_los_std"])),
                 "" if math.isnan(speed) else f"{systematic:.2g}",
-                f"{float(one['chi_square']):.3f}",
-                str(one["status"].values),
+                f"{float(frame['chi_square']):.3f}",
+                str(frame["status"].values),
             )
         )
     refused = [row for row in rows if row[-1]]
     heads: tuple[str, ...] = ("frame", "v_los, m/s", "systematic", "chi-square", "refused")
     if not refused:
         rows, heads = [row[:-1] for row in rows], heads[:-1]
-    note = "" if known else "No calibration: the nominal instrument is taken as true."
+    note = "" if etalon else "No calibration: the nominal instrument is taken as true."
     print_table(Table("line-of-sight speeds", rows, heads, note))
     if out is not None:
-        write_netcdf(found, out)
+        write_netcdf(speeds, out)
         output.print(f"speeds   {out}")
     if len(refused) == len(rows):
         raise InputError("no frame has a speed; the reasons are in the table")

@@ -108,7 +108,7 @@ def vortices(
     lines = read_lines_of_sight(files, names=names_of(name or ()), min_cnr=min_cnr)
     print_remarks(lines.attrs["remarks"])
     with progress() as notice:
-        found = fit_vortices_to_lines(
+        fits = fit_vortices_to_lines(
             lines,
             kind=kind.value,
             profile=profile.value,
@@ -121,47 +121,45 @@ def vortices(
             false_alarm=false_alarm,
             notice=notice,
         )
-    print_remarks(found.attrs["remarks"])
-    if np.isfinite(found["y"]).any():
-        _show(found)
+    print_remarks(fits.attrs["remarks"])
+    if np.isfinite(fits["y"]).any():
+        _show(fits)
     if out.suffix.lower() == ".nc":
-        write_netcdf(found.assign_attrs(software=f"lidar-mi {__version__}"), out)
+        write_netcdf(fits.assign_attrs(software=f"lidar-mi {__version__}"), out)
     else:
-        write_csv(out, found.drop_dims(["number", "other_number"]))
+        write_csv(out, fits.drop_dims(["number", "other_number"]))
     output.print(f"vortices {out}")
-    write_png(draw_line_vortices(lines, found, files[0].name), figure)
+    write_png(draw_line_vortices(lines, fits, files[0].name), figure)
     output.print(f"figure   {figure}")
-    if not (found["flag"] == 0).any():
-        end_without_result(
-            f"no valid vortices, number of scans {found.sizes['scan']}", found["flag"]
-        )
+    if not (fits["flag"] == 0).any():
+        end_without_result(f"no valid vortices, number of scans {fits.sizes['scan']}", fits["flag"])
 
 
-def _show(found: "xr.Dataset") -> None:
+def _show(fits: "xr.Dataset") -> None:
     """A table of the scans with a wake, and how many there are."""
     import numpy as np
 
     from lidar_mi.tables import Table, shown_part, with_error
 
-    valid = (found["flag"] == 0).values
-    chosen = np.flatnonzero(np.isfinite(found["y"].values).all(1))
+    valid = (fits["flag"] == 0).values
+    chosen = np.flatnonzero(np.isfinite(fits["y"].values).all(1))
     rows = []
     step = max(1, -(-chosen.size // _ROWS))
     for k in chosen[::step]:
-        one = found.isel(scan=int(k))
-        for v in range(found.sizes["vortex"]):
+        scan = fits.isel(scan=int(k))
+        for v in range(fits.sizes["vortex"]):
             rows.append(
                 (
-                    str(one["time"].values)[11:21],
+                    str(scan["time"].values)[11:21],
                     *(
-                        with_error(float(one[n][v]), float(one[f"{n}_stderr"][v]))
+                        with_error(float(scan[n][v]), float(scan[f"{n}_stderr"][v]))
                         for n in ("y", "z", "circulation", "core_radius")
                     ),
                     "" if valid[k] else "not valid",
                 )
             )
     heads = ("time (UTC)", "y, m", "z, m", "circulation, m²/s", "core radius, m", "")
-    wakes = int((found["flag"].values & 1 == 0).sum())
+    wakes = int((fits["flag"].values & 1 == 0).sum())
     note = f"{wakes} of {valid.size} scans show a wake, {int(valid.sum())} have a valid fit."
     if step > 1:
         note += f" Shown: {shown_part(chosen.size, step, 'scan')}."

@@ -94,51 +94,54 @@ def winds(
         range_step=quantity("--range-step", range_step, "m", "3 m"),
     )
     print_remarks(lines.attrs["remarks"])
-    found = fit_winds_to_lines(
+    profiles = fit_winds_to_lines(
         lines,
         interval=quantity("--interval", interval, "s", "10 min"),
         height_step=quantity("--height-step", height_step, "m", "30 m"),
         noise=quantity("--noise", noise, "m/s", "0.1 m/s"),
         length_scale=quantity("--length-scale", length_scale, "m", "200 m"),
     )
-    valid = int((found["flag"] == 0).sum())
+    valid = int((profiles["flag"] == 0).sum())
     if valid:
-        _show(found)
-    written = in_actris_layout(found) if layout is Layout.ACTRIS else found
+        _show(profiles)
+    output_data = in_actris_layout(profiles) if layout is Layout.ACTRIS else profiles
     if out.suffix.lower() == ".nc":
-        write_netcdf(written.assign_attrs(software=f"lidar-mi {__version__}"), out)
+        write_netcdf(output_data.assign_attrs(software=f"lidar-mi {__version__}"), out)
     else:
-        write_csv(out, written)
+        write_csv(out, output_data)
     output.print(f"winds    {out}")
     if not valid:
-        end_without_result(f"no valid wind of {found['flag'].size}", found["flag"])
-    write_png(draw_wind_profiles(found, files[0].name), figure)
+        end_without_result(f"no valid wind of {profiles['flag'].size}", profiles["flag"])
+    write_png(draw_wind_profiles(profiles, files[0].name), figure)
     output.print(f"figure   {figure}")
 
 
-def _show(found: "xr.Dataset") -> None:
+def _show(winds: "xr.Dataset") -> None:
     """A table of valid winds, a few heights of the first profile, and how many there are."""
     import numpy as np
 
     from lidar_mi.tables import Table, shown_part, with_error
 
-    valid = (found["flag"] == 0).values
+    valid = (winds["flag"] == 0).values
     profile = int(np.argmax(valid.any(1)))
-    one = found.isel(time=profile)
+    profile_winds = winds.isel(time=profile)
     heights = np.flatnonzero(valid[profile])
     step = max(1, -(-heights.size // _ROWS))
     chosen = heights[::step]
     rows = [
         (
-            f"{float(one['height'][k]):.0f}",
-            *(with_error(float(one[c][k]), float(one[f"{c}_stderr"][k])) for c in "uvw"),
-            f"{float(one['residual'][k]):.2f}",
-            str(int(one["lines"][k])),
+            f"{float(profile_winds['height'][k]):.0f}",
+            *(
+                with_error(float(profile_winds[c][k]), float(profile_winds[f"{c}_stderr"][k]))
+                for c in "uvw"
+            ),
+            f"{float(profile_winds['residual'][k]):.2f}",
+            str(int(profile_winds["lines"][k])),
         )
         for k in chosen
     ]
     heads = ("height, m", "u (east), m/s", "v (north), m/s", "w (up), m/s", "residual", "lines")
-    time = str(one["time"].values)[:19].replace("T", " ")
+    time = str(profile_winds["time"].values)[:19].replace("T", " ")
     number = valid.shape[0]
     profiles = f"{number} profile{'s' if number > 1 else ''}"
     note = f"{int(valid.sum())} of {valid.size} winds are valid, of {profiles}."

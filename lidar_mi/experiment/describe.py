@@ -12,6 +12,7 @@ from lidar_mi.atmosphere.scattering.molecules import BANDS, molecular_scattering
 from lidar_mi.atmosphere.scattering.particle_scattering import Notice
 from lidar_mi.atmosphere.scattering.tables import ScatteringTable, describe
 from lidar_mi.errors import InputError
+from lidar_mi.flags import masks_of
 from lidar_mi.io.scattering_table import aerosol_table, read_table
 from lidar_mi.io.size import fits
 
@@ -45,10 +46,10 @@ def sections(
     """
     path = Path(what)
     # a file with the name of a scatterer comes first
-    named = not path.exists() and (what in AEROSOLS or what == MOLECULES)
-    if wavelength is not None and not named:
+    is_scatterer = not path.exists() and (what in AEROSOLS or what == MOLECULES)
+    if wavelength is not None and not is_scatterer:
         raise InputError(f"--wavelength: not allowed with {what}; expected a named scatterer")
-    if altitude is not None and (not named or what != MOLECULES):
+    if altitude is not None and (not is_scatterer or what != MOLECULES):
         raise InputError(f"--altitude: not allowed with {what}; expected {MOLECULES}")
     kinds = {
         ".exr": _image,
@@ -59,7 +60,7 @@ def sections(
         ".hpl": _lines_of_sight,
         ".csv": _lines_of_sight,
     }
-    if named:
+    if is_scatterer:
         wavelength = wavelength or 532e-9
         if what == MOLECULES:
             yield from _molecules(wavelength, altitude or 0.0)
@@ -186,16 +187,15 @@ def _lines_of_sight(path: Path) -> Iterator[Section]:
     for name in ("azimuth", "elevation", "range"):
         values = data[name].values
         span = _span(float(values.min()), float(values.max()))
-        one = f"{values[0]:.4g}" if np.ptp(values) < 0.05 else span
+        extent = f"{values[0]:.4g}" if np.ptp(values) < 0.05 else span
         unit = "degrees" if name != "range" else f"m, {values.size} gates"
-        rows.append((name, f"{one} {unit}"))
+        rows.append((name, f"{extent} {unit}"))
     values = data["radial_velocity"].values[flag == 0]
     if values.size:
         span = _span(float(values.min()), float(values.max()))
         rows.append(("radial velocity (valid)", f"{span} m/s, positive away"))
     rows.append(("valid", f"{100 * values.size / flag.size:.1f} %"))
-    words = data["flag"].attrs
-    for name, mask in zip(words["flag_meanings"].split(), words["flag_masks"], strict=True):
+    for name, mask in masks_of(data["flag"].attrs).items():
         if part := float(((flag & mask) > 0).mean()):
             rows.append((name.replace("_", " "), f"{100 * part:.1f} %"))
     rows += [("remark", text) for text in about["remarks"].splitlines()]
@@ -230,17 +230,17 @@ def _study(folder: Path) -> Iterator[Section]:
         key: flat(record["experiment"]) if record else {} for key, record in records.items()
     }
     # a variant that was not run would differ in every key
-    done = {key: one for key, one in settings.items() if one}
+    done = {key: variant_settings for key, variant_settings in settings.items() if variant_settings}
     for key, values in differences(done).items():
-        shown = dict(zip(done, map(setting, values), strict=True))
-        rows.append((key, *(shown.get(variant, "-") for variant in records)))
+        texts = dict(zip(done, map(setting, values), strict=True))
+        rows.append((key, *(texts.get(variant, "-") for variant in records)))
     yield f"{folder}: study {name}", rows
-    found = [
+    rows_of_results = [
         (f"{label} / {unit}" if unit else label, *values)
         for label, unit, values in results(metrics)
     ]
-    if found:
-        yield "results", [("", *metrics), *found]
+    if rows_of_results:
+        yield "results", [("", *metrics), *rows_of_results]
     # the folder of a variant is a run that can be described by itself
     yield _files(folder, without=records)
 
@@ -251,13 +251,13 @@ def _run_folder(folder: Path) -> Iterator[Section]:
 
     record = read_record(folder)
     experiment = record["experiment"]
-    asked = dict(_asked_first(experiment))
+    main = dict(_main_keys(experiment))
     # the number that was chosen is known only to the record
-    if asked.get("render.samples_per_beam") == "auto" and "samples_per_beam" in record:
-        asked["render.samples_per_beam"] = f"auto: {record['samples_per_beam']}"
+    if main.get("render.samples_per_beam") == "auto" and "samples_per_beam" in record:
+        main["render.samples_per_beam"] = f"auto: {record['samples_per_beam']}"
     yield (
         f"{folder}: experiment {experiment.get('name')}",
-        [(key, setting(value)) for key, value in asked.items()],
+        [(key, setting(value)) for key, value in main.items()],
     )
     yield "versions", [(name, str(number)) for name, number in record["versions"].items()]
     yield _files(folder)
@@ -284,7 +284,7 @@ _OF_A_FLIGHT = (
 )
 
 
-def _asked_first(experiment: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+def _main_keys(experiment: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
     """The main keys of an experiment, as far as it has them and they have an effect."""
     flies = value_at(experiment, "encounter") is not None
     for key in (

@@ -20,17 +20,17 @@ def on_its_device(experiment: Experiment) -> Experiment:
     """The experiment with the variants and the retrieval's device that its `device` asks for.
 
     Variants keep what follows llvm or cuda. Where rendering alone can be on the GPU, `auto` puts
-    retrieval on the processor. An experiment that is on its device stays as it is.
+    retrieval on the processor. It is idempotent.
 
     Raises
     ------
     InputError
         CUDA is asked for, and one of both does not compute there.
     """
-    asked = experiment.device
-    if asked is None:
+    device = experiment.device
+    if device is None:
         return experiment
-    rendering, retrieval = (CPU, CPU) if asked == CPU else _found(asked)
+    rendering, retrieval = (CPU, CPU) if device == CPU else _devices(device)
     update: dict[str, object] = {
         "device": retrieval if rendering == retrieval else None,
         "render": _of(experiment.render, rendering),
@@ -52,13 +52,13 @@ def devices_in_words(experiment: Experiment) -> str:
     return f"{rendering}retrieval on {experiment.device or CPU}"
 
 
-def _found(asked: str) -> tuple[str, str]:
+def _devices(device: str) -> tuple[str, str]:
     """Devices of rendering and of retrieval: CUDA's where they are there."""
-    # loaded where a device is asked for alone
+    # loaded only if a device is set
     import torch
 
     rendering, retrieval = has_cuda(), torch.cuda.is_available()
-    if asked == CUDA and not (rendering and retrieval):
+    if device == CUDA and not (rendering and retrieval):
         reason = (
             "this torch does not compute with CUDA"
             if rendering

@@ -101,10 +101,10 @@ def export(
     out = folder / format if out is None else Path(out)
     files = dict(_files(out, format, results))
     # before the first file is written: an existing one stops all
-    there = [path for path in files if path.exists()]
-    if there and not overwrite:
+    existing = [path for path in files if path.exists()]
+    if existing and not overwrite:
         raise InputError(
-            f"{there[0]}: exists; expected another folder (-o DIR), or --overwrite to replace it"
+            f"{existing[0]}: exists; expected another folder (-o DIR), or --overwrite to replace it"
         )
     make_folder(out)
     for write in files.values():
@@ -115,7 +115,7 @@ def export(
 def _files(
     out: Path, format: str, results: dict[str, xr.Dataset]
 ) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """Files to be, and what writes each."""
+    """Files to write, with their writers."""
     from lidar_mi.io.csv_file import write_csv
     from lidar_mi.io.mat_file import write_mat
     from lidar_mi.io.openfast import write_openfast
@@ -127,20 +127,20 @@ def _files(
         return
     write = {"vtk": write_vtk, "csv": write_csv, "mat": write_mat}[format]
     for name, data in results.items():
-        parts = _one_by_one(name, data) if format == "vtk" else [(name, data)]
+        parts = _separated(name, data) if format == "vtk" else [(name, data)]
         for stem, part in parts:
             path = out / f"{stem}{suffix(part) if format == 'vtk' else f'.{format}'}"
             yield path, partial(write, path, part)
 
 
-def _one_by_one(name: str, data: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:
+def _separated(name: str, data: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:
     """A data set for each source, method or fit."""
     labels = [dim for dim in ("source", "algorithm", "fit", "flight") if dim in data.dims]
     if not labels:
         yield name, data
         return
     for label in data[labels[0]].values:
-        yield from _one_by_one(f"{name}_{label}", data.sel({labels[0]: label}))
+        yield from _separated(f"{name}_{label}", data.sel({labels[0]: label}))
 
 
 def _results(folder: Path, record: Mapping[str, Any]) -> Iterator[tuple[str, xr.Dataset]]:
@@ -204,8 +204,8 @@ def _placed_scan(scan: xr.Dataset) -> xr.Dataset:
 def _placed_lines(lines: xr.Dataset) -> xr.Dataset:
     """Lines of sight with the middle of their range bins as place, a column a component."""
     direction = lines["direction"]
-    places = lines["range"] * direction  # from the telescope at rest in the first image
-    # other programs read numbers, not vectors: a variable for each component
+    places = lines["range"] * direction  # from the telescope at the first image
+    # other programs read scalars: a variable for each component
     split = lines.drop_vars([n for n in lines.variables if "axis" in lines[n].dims])
     for axis in ("x", "y", "z"):
         about = {"units": "m", "long_name": f"{axis} of the middle of the range bin"}
@@ -245,7 +245,7 @@ def _gates(lines: xr.Dataset) -> xr.Dataset:
         about = {"units": "m", "long_name": words}
         coordinates[name] = place.transpose("time", "range").assign_attrs(about)
     placed = lines.assign_coords(coordinates)
-    # what belongs to a vortex in place of a gate has no place in this list
+    # variables of vortices, not of gates, are omitted
     other = [name for name, field in placed.variables.items() if {*field.dims} - {"time", "range"}]
     return placed.drop_vars(other).stack(gate=("time", "range")).reset_index("gate")
 
@@ -256,19 +256,19 @@ def _vortices(fits: "dict[str, VortexPairFit]") -> xr.Dataset:
     pairs = []
     for fit in fits.values():
         variables: dict[str, tuple[Any, ...]] = {}
-        for name, found in fit.quantities.items():
-            about = {"units": found.units, "long_name": found.long_name}
-            side, _, own = name.partition("_")
+        for name, quantity in fit.quantities.items():
+            about = {"units": quantity.units, "long_name": quantity.long_name}
+            side, _, parameter = name.partition("_")
             # of the pair, not of one of its vortices
             if side not in sides:
-                variables[name] = (), found.value, about
-                variables[f"{name}_stderr"] = (), found.stderr, {"units": found.units}
+                variables[name] = (), quantity.value, about
+                variables[f"{name}_stderr"] = (), quantity.stderr, {"units": quantity.units}
             elif side == "port":
-                both = [fit.quantities[f"{one}_{own}"] for one in sides]
-                about["long_name"] = found.long_name.replace(" of the port vortex", "")
-                variables[own] = "vortex", [one.value for one in both], about
-                errors = [one.stderr for one in both]
-                variables[f"{own}_stderr"] = "vortex", errors, {"units": found.units}
+                of_sides = [fit.quantities[f"{label}_{parameter}"] for label in sides]
+                about["long_name"] = quantity.long_name.replace(" of the port vortex", "")
+                variables[parameter] = "vortex", [each.value for each in of_sides], about
+                errors = [each.stderr for each in of_sides]
+                variables[f"{parameter}_stderr"] = "vortex", errors, {"units": quantity.units}
         variables["accepted"] = (), int(fit.success), {"units": "1"}
         pairs.append(xr.Dataset(variables))
     joined = xr.concat(pairs, "fit").assign_coords(fit=list(fits), vortex=list(sides))

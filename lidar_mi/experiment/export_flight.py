@@ -36,7 +36,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
         # parameters with their covariances, and vectors, are for a replay
         track = read_netcdf(files["track"]).drop_dims(_FOR_A_REPLAY, errors="ignore")
         if placed:
-            yield from ((f"vortices_{name}", _points(track, name)) for name in _sources(track))
+            sources = map(str, track["source"].values)
+            yield from ((f"vortices_{name}", _points(track, name)) for name in sources)
         else:
             yield "track", track
     if files["slabs"].is_file():
@@ -54,24 +55,20 @@ def _of_slabs(slabs: xr.Dataset, *axes: str) -> xr.Dataset:
     return chosen.drop_vars([name for name in chosen.coords if name not in ("x", *axes)])
 
 
-def _sources(track: xr.Dataset) -> list[str]:
-    return [str(name) for name in track["source"].values]
-
-
 def _points(track: xr.Dataset, source: str) -> xr.Dataset:
     """The vortices that one source has, a point each."""
-    one = track.sel(source=source, drop=True)
-    names = [str(name).removeprefix("port_") for name in one if str(name).startswith("port_")]
-    shared = one[["x", "time"]].to_dataarray("name").values
-    found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    vortices = track.sel(source=source, drop=True)
+    names = [str(name).removeprefix("port_") for name in vortices if str(name).startswith("port_")]
+    shared = vortices[["x", "time"]].to_dataarray("name").values
+    parts_of: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for side in _SIDES:
         for name in names:
-            found[name].append(one[f"{side}_{name}"].values)
-    columns = {name: np.concatenate(parts) for name, parts in found.items()}
+            parts_of[name].append(vortices[f"{side}_{name}"].values)
+    columns = {name: np.concatenate(parts) for name, parts in parts_of.items()}
     columns |= {"x": np.tile(shared[0], 2), "time": np.tile(shared[1], 2)}
-    columns["side"] = np.repeat([1.0, -1.0], one.sizes["slab"])
-    there = np.isfinite(columns["y"]) & np.isfinite(columns["z"])
-    units = {name: one[f"port_{name}"].attrs.get("units", "1") for name in names}
+    columns["side"] = np.repeat([1.0, -1.0], vortices.sizes["slab"])
+    valid = np.isfinite(columns["y"]) & np.isfinite(columns["z"])
+    units = {name: vortices[f"port_{name}"].attrs.get("units", "1") for name in names}
     units |= {"x": "m", "time": "s", "side": "1"}
-    data = {name: ("point", v[there], {"units": units[name]}) for name, v in columns.items()}
+    data = {name: ("point", v[valid], {"units": units[name]}) for name, v in columns.items()}
     return xr.Dataset(data).set_coords(["x", "y", "z"])

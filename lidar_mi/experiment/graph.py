@@ -5,6 +5,7 @@ A stage is a function. Each of its parameters is, by its name,
 - the result of another stage (``truth``);
 - a section or a value of the experiment, with ``_`` for the dots (``scan``, ``doppler_camera``);
   None for a section of another kind than the parameter's, such as a Doppler lidar's;
+- by its type, a `bundle`: each of its fields is one of these;
 - what a run provides: ``log``, ``search_path`` (the folder in which files that an experiment names
   are searched first) and, for a stage that gives its result in parts, ``missing`` and ``store``.
 
@@ -18,7 +19,17 @@ import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Protocol, TypeVar, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+)
 
 from pydantic import BaseModel
 
@@ -55,8 +66,19 @@ class Guard:
     """Of an annotated parameter: it may stop a stage, but its result does not depend on it."""
 
 
+_BUNDLES: set[Any] = set()
+
+
+@dataclass_transform(frozen_default=True)
+def bundle(description: type[T]) -> type[T]:
+    """A frozen dataclass of what travels together, whose fields stages take as one parameter."""
+    frozen = dataclass(frozen=True)(description)
+    _BUNDLES.add(frozen)
+    return frozen
+
+
 class Parameter(NamedTuple):
-    """A parameter of a stage.
+    """A parameter of a stage, or a field of one that is a bundle.
 
     Attributes
     ----------
@@ -153,17 +175,20 @@ class Stage:
 
 @functools.cache
 def parameters(function: Callable[..., Any]) -> tuple[Parameter, ...]:
-    """The parameters of a stage's function that the graph provides.
+    """The parameters of a stage's function that the graph provides; of a bundle its fields.
 
     A type in quotes is that of a result, from a module that only the stage itself loads: it is read
     as text.
     """
-    found = []
+    found: list[Parameter] = []
     for name, given in inspect.signature(function).parameters.items():
         # their names stand for nothing that the graph could look up
         if given.kind in (given.VAR_POSITIONAL, given.VAR_KEYWORD):
             continue
         kind, marks = given.annotation, ()
+        if kind in _BUNDLES:
+            found += parameters(kind)
+            continue
         if isinstance(kind, str) and "Annotated" in kind:
             raise ValueError(f"{function.__name__}: {name}: marks in quotes are not read")
         if get_origin(kind) is Annotated:
@@ -224,13 +249,21 @@ def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
         experiment's folder.
     """
     provided = {"log": Log(), "search_path": experiment.folder} | given
-    arguments = {}
     for parameter in parameters(function):
-        if parameter.name in provided:
-            arguments[parameter.name] = provided[parameter.name]
-        elif parameter.path is not None:
-            arguments[parameter.name] = _given(experiment, parameter)
-    return function(**arguments)
+        if parameter.name not in provided and parameter.path is not None:
+            provided[parameter.name] = _given(experiment, parameter)
+    return function(**_bundled(function, provided))
+
+
+def _bundled(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of a function from the values of its `parameters`."""
+    arguments = {}
+    for name, given in inspect.signature(function).parameters.items():
+        if name in values:
+            arguments[name] = values[name]
+        elif given.annotation in _BUNDLES:
+            arguments[name] = given.annotation(**_bundled(given.annotation, values))
+    return arguments
 
 
 class Graph:
@@ -336,7 +369,7 @@ class Graph:
                     found[parameter.name] = None
             elif parameter.path is not None:
                 found[parameter.name] = _given(self.experiment, parameter)
-        return found
+        return _bundled(function, found)
 
     def call(self, function: Callable[..., T], results: Mapping[str, Any]) -> T:
         """A function that takes sections and results of the preflight."""

@@ -47,8 +47,10 @@ def measure(
     """All metrics of a run, flat, from the results and the duration (s) of its stages by name."""
     metrics: dict[str, float] = {}
     if experiment.imaged_wake and "images" in results:
-        taken = {"truth": results["truth"], "air": results["air"]}
-        fractions = call(backscatter_fractions, experiment, **taken, clear_air=results["clear_air"])
+        inputs = {"truth": results["truth"], "air": results["air"]}
+        fractions = call(
+            backscatter_fractions, experiment, **inputs, clear_air=results["clear_air"]
+        )
         metrics |= {
             f"backscatter.fraction.{name}": value for name, value in fractions._asdict().items()
         }
@@ -82,16 +84,16 @@ def measure(
 
 
 def _images(results: Results) -> dict[str, float]:
-    found, cores = results["wind"], results["cores"]
-    place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
+    winds, cores = results["wind"], results["cores"]
+    place = {axis: slice(winds[axis].min(), winds[axis].max()) for axis in ("y", "z")}
     noise, changes = results.get("detector_noise", {}), results.get("simulation_noise")
     true = results["truth"].wind.sel(place)
     if 0 in true.sizes.values():
         # a single row or column of vectors, between nodes
-        true = results["truth"].wind.sel(y=found["y"], z=found["z"], method="nearest")
+        true = results["truth"].wind.sel(y=winds["y"], z=winds["z"], method="nearest")
     return (
-        cross_flow_metrics(found, cores)
-        | ({} if changes is None else simulation_metrics(changes, found, cores))
+        cross_flow_metrics(winds, cores)
+        | ({} if changes is None else simulation_metrics(changes, winds, cores))
         | light_metrics(results["scans"][0])
         | sample_metrics(results["detected"])
         | core_metrics(cores)
@@ -103,14 +105,14 @@ def _images(results: Results) -> dict[str, float]:
 
 
 def _sensor(results: Results) -> dict[str, float]:
-    needed = results["pulses_needed"]
+    pulses = results["pulses_needed"]
     return (
         line_metrics(results["lines"])
         | vector_metrics(results["wind3d"], results["cores"])
         | limit_metrics(results["u_limits"])
         | doppler_alone_metrics(results["doppler_alone"], results["slab_wind"])
         | cost_metrics(results["costs"])
-        | ({} if needed is None else {"sensor.doppler.pulses_needed": needed})
+        | ({} if pulses is None else {"sensor.doppler.pulses_needed": pulses})
     )
 
 
@@ -123,7 +125,7 @@ def judged(
     component without skill, are not judged; nor are images by tables of velocities along lines of
     sight.
     """
-    found = []
+    verdicts = []
     for table in results.get("requirements", {}).values():
         along = any(row.quantity == "error_v_los" for row in table.rows)
         if experiment.sensor is not None:
@@ -136,8 +138,8 @@ def judged(
         else:
             measured, reasons = _of_images(experiment, results["wind"], metrics)
         measured["range"] = _nearest_range(experiment, table)
-        found.append((table, judge(table, measured, reasons)))
-    return found
+        verdicts.append((table, judge(table, measured, reasons)))
+    return verdicts
 
 
 def _nearest_range(experiment: Experiment, table: RequirementTable) -> float:
@@ -160,7 +162,7 @@ def _of_both_lidars(
     doppler, sensor = experiment.fringes, experiment.sensor
     assert doppler is not None and sensor is not None
     depth = doppler.lidar.range_bin
-    vectors = math.floor(_apart(experiment) * metrics["sensor.vectors"])
+    vectors = math.floor(_independent_fraction(experiment) * metrics["sensor.vectors"])
     return {
         "points_per_slab": metrics["sensor.lines_retrieved"] if along else vectors,
         "slabs_per_second": sensor.slabs_per_second,
@@ -186,7 +188,7 @@ def _of_images(
     measured: dict[str, float | None] = {
         "slab_depth": scan.thickness,
         "slabs_per_second": 1 / experiment.platform.dt,
-        "points_per_slab": math.floor(_apart(experiment) * vectors),
+        "points_per_slab": math.floor(_independent_fraction(experiment) * vectors),
     }
     reasons = {"error_u": "needs a Doppler lidar"}
     far = far_from_cores(metrics, "true_wind.", "rms_")
@@ -198,6 +200,6 @@ def _of_images(
     return measured, reasons
 
 
-def _apart(experiment: Experiment) -> float:
+def _independent_fraction(experiment: Experiment) -> float:
     """Fraction of the vectors whose windows do not overlap."""
     return min(1.0, experiment.retrieval.stride / experiment.retrieval.template) ** 2

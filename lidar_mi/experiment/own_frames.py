@@ -50,7 +50,7 @@ def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") ->
 
 
 def electrons(counts: np.ndarray, ccd: CCD) -> np.ndarray:
-    """Photoelectrons of a digitiser's counts: bias off, times the gain of digitiser and CCD."""
+    """Photoelectrons from counts: less the bias, times the gains of digitiser and CCD."""
     return (np.asarray(counts, float) - ccd.bias) * ccd.gain / ccd.multiplication_gain
 
 
@@ -70,7 +70,7 @@ def read_electrons(
         A file that is no image, frames of different sizes, a rendered image: its values are
         relative energies, from which neither a pulse nor its noise follows.
     """
-    found: list[np.ndarray] = []
+    frames: list[np.ndarray] = []
     for path in paths:
         if units := stated_units(path):
             raise InputError(
@@ -78,13 +78,13 @@ def read_electrons(
                 "counts or photoelectrons of a camera; `lidar-mi rings` measures its rings"
             )
         for frame in read_frames(path, layer):
-            if found and frame.shape != found[0].shape:
+            if frames and frame.shape != frames[0].shape:
                 raise InputError(
                     f"{path}: {frame.shape[1]} x {frame.shape[0]} px are not allowed; expected "
-                    f"{found[0].shape[1]} x {found[0].shape[0]} px as in {paths[0]}"
+                    f"{frames[0].shape[1]} x {frames[0].shape[0]} px as in {paths[0]}"
                 )
-            found.append(electrons(frame, ccd) if counts else np.asarray(frame, float))
-    return np.stack(found)
+            frames.append(electrons(frame, ccd) if counts else np.asarray(frame, float))
+    return np.stack(frames)
 
 
 @checked_arguments
@@ -170,34 +170,36 @@ is determined
     gap = etalon.tuned_gap(wavelength)
     # the gap that gives the laser's order_fraction is the same for all lines
     fixed = etalon.model_copy(update={"gap": gap, "order_fraction": None})
-    found = [first]
-    for one, images in lines.items():
-        name = f"line of {1e9 * one:.7g} nm"
-        _check_line(one, wavelength, name)
-        lamp = doppler.lidar.model_copy(update={"wavelength": one})
+    calibrations = [first]
+    for lamp_wavelength, images in lines.items():
+        name = f"line of {1e9 * lamp_wavelength:.7g} nm"
+        _check_line(lamp_wavelength, wavelength, name)
+        lamp = doppler.lidar.model_copy(update={"wavelength": lamp_wavelength})
         try:
             model = laser_rings(lamp, fixed, doppler.assumed.of(doppler.camera))
-            found.append(fitted("frames", images, model))
+            calibrations.append(fitted("frames", images, model))
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
     return combined(
-        found,
+        calibrations,
         etalon.index * gap,
         gap_tolerance,
-        # the phase of reflection depends on the wavelength, as a gap does not
-        mirror_orders=[mirrors(fixed, one).order_shift for one in (wavelength, *lines)],
+        # the phase of reflection depends on the wavelength, unlike a gap
+        mirror_orders=[
+            mirrors(fixed, lamp_wavelength).order_shift for lamp_wavelength in (wavelength, *lines)
+        ],
         wavelength_accuracy=wavelength_accuracy,
         achromatic=achromatic,
     )
 
 
-def _check_line(one: float, laser: float, name: str) -> None:
-    if not 0.5 * laser < one < 2 * laser:
+def _check_line(wavelength: float, laser: float, name: str) -> None:
+    if not 0.5 * laser < wavelength < 2 * laser:
         raise InputError(
             f"{name}: not allowed; expected {5e8 * laser:.4g} to {2e9 * laser:.4g} nm, half to "
             "twice the laser's"
         )
-    if math.isclose(one, laser, rel_tol=1e-9):
+    if math.isclose(wavelength, laser, rel_tol=1e-9):
         raise InputError(f"{name}: the laser's own; expected another line")
 
 
@@ -258,7 +260,7 @@ def retrieve_v_los(
     noise = pixel_noise(doppler.ccd)
 
     def fitted(name: str, images: torch.Tensor, model: RingModel) -> _Fits:
-        return _each(images, name, model, noise, response, limit, calibration is not None)
+        return _fit_each(images, name, model, noise, response, limit, calibration is not None)
 
     batch = _batch("frames", frames, doppler)
     received, status = fitted("frames", batch, air)
@@ -270,18 +272,18 @@ def retrieve_v_los(
             for fit in received
         ]
     else:
-        own = _batch("reference", reference, doppler)
-        if len(batch) % len(own):
+        shots = _batch("reference", reference, doppler)
+        if len(batch) % len(shots):
             raise InputError(
-                f"reference: {len(own)} frames are not allowed; expected as many as frames, "
+                f"reference: {len(shots)} frames are not allowed; expected as many as frames, "
                 f"{len(batch)}, or a divisor of that"
             )
-        emitted, faults = fitted("reference", own, laser)
+        emitted, faults = fitted("reference", shots, laser)
         # a frame of the laser is the zero of the frames that follow it
-        each = len(batch) // len(own)
+        frames_per_shot = len(batch) // len(shots)
         for k, fit in enumerate(received):
-            zero = emitted[k // each]
-            status[k] = status[k] or faults[k // each]
+            zero = emitted[k // frames_per_shot]
+            status[k] = status[k] or faults[k // frames_per_shot]
             parts.append(None if fit is None or zero is None else difference(fit, zero))
     columns = np.full((5, len(batch)), np.nan)
     for k, (part, fit) in enumerate(zip(parts, received, strict=True)):
@@ -315,17 +317,17 @@ _VARIABLES = (
 _Fits = tuple[list[RingFit | None], list[str]]
 
 
-def _each(
+def _fit_each(
     images: torch.Tensor,
     name: str,
     model: RingModel,
     noise: PixelNoise,
     response: torch.Tensor | None,
     limit: float,
-    known: bool,
+    centre_fixed: bool,
 ) -> _Fits:
     """The fit of every image, or None and why not."""
-    found: list[RingFit | None] = []
+    fits: list[RingFit | None] = []
     status = []
     # one by one: a frame that cannot be fitted must not stop the others
     for k, image in enumerate(images):
@@ -335,17 +337,17 @@ def _each(
                 model,
                 noise,
                 response=response,
-                centre=model.centre if known else None,
+                centre=model.centre if centre_fixed else None,
                 max_chi_square=limit,
             )
         except InputError as error:
-            found.append(None)
+            fits.append(None)
             # the fit sees one image, the user has a batch
             status.append(str(error).replace("images[0]", f"{name}[{k}]"))
         else:
-            found.append(fit)
+            fits.append(fit)
             status.append("")
-    return found, status
+    return fits, status
 
 
 def _batch(name: str, frames: Any, doppler: Doppler) -> torch.Tensor:

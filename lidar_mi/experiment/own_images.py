@@ -1,4 +1,4 @@
-"""The wind in images that a user has as files: which frames are meant, when, in what light."""
+"""Wind from image files of a user: selection of the frames, their times, their noise."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from lidar_mi.retrieval.wind.synchronised import synchronised
 
 Level = float | xr.DataArray | None
 
-_SAME = 1e-3
+_TOLERANCE = 1e-3
 """Relative difference between a time step given and one from headers that is rounding."""
 
 
@@ -90,8 +90,8 @@ def retrieve_files(
     >>> abs(wind["v"].median().item()).__round__()
     10
     """
-    given = [Path(one) for one in ([files] if isinstance(files, str | Path) else files)]
-    if not given:
+    inputs = [Path(file) for file in ([files] if isinstance(files, str | Path) else files)]
+    if not inputs:
         raise InputError("files: none; expected two images, or a file of two frames")
     if isinstance(pairs, str) and pairs != "all":
         raise InputError(f"pairs: {pairs!r} is not allowed; expected 'all' or pairs of numbers")
@@ -99,16 +99,20 @@ def retrieve_files(
     if pixels and spacing is not None:
         raise InputError("pixels, spacing: both; expected one of them")
     spacing = 1.0 if pixels else spacing
-    layer = layer or _layer(given)
-    asked = _frames(given, layer, frame, pairs)
-    paths = [path for path, numbers in asked for _ in numbers]
-    more = len(paths) > 2 and pairs is None
-    if more and "more" not in method_of(method).options:
+    layer = layer or _layer(inputs)
+    frames_by_file = _frames(inputs, layer, frame, pairs)
+    paths = [path for path, numbers in frames_by_file for _ in numbers]
+    burst = len(paths) > 2 and pairs is None
+    if burst and "more" not in method_of(method).options:
         raise InputError(
             f"{len(paths)} images are not allowed with method {method}; expected two, pairs all "
             "(a wind from each pair), or variational (one wind from all)"
         )
-    images = [one for path, numbers in asked for one in read_images(path, numbers, layer, spacing)]
+    images = [
+        image
+        for path, numbers in frames_by_file
+        for image in read_images(path, numbers, layer, spacing)
+    ]
     per_frame = pixels and dt is None
     remarks: list[str] = []
     if per_frame:
@@ -119,8 +123,8 @@ def retrieve_files(
     levels = [read_noise(path, layer, spacing) if noise is None else noise for path in noisy]
     beams = [read_beams(path, spacing) for path in paths]
     images, levels, beams = _on_nodes(images, levels, beams, steps)
-    seen = [when["beam_time"] for when in beams if when is not None and not when.frozen_air]
-    timed = len(seen) == len(paths)
+    beam_times = [scan["beam_time"] for scan in beams if scan is not None and not scan.frozen_air]
+    timed = len(beam_times) == len(paths)
     grid = images[0]
     if pairs is not None:
         chosen = list(pairwise(range(len(paths)))) if pairs == "all" else pairs
@@ -128,7 +132,7 @@ def retrieve_files(
             images,
             steps,
             chosen,
-            beam_times=seen if timed else None,
+            beam_times=beam_times if timed else None,
             notice=notice,
             noise=levels,
             **options,
@@ -146,7 +150,7 @@ def retrieve_files(
             dt=steps[0],
             noise=level,
             more=images[2:],
-            times=on_one_grid(*seen[:2]) if timed else None,
+            times=on_one_grid(*beam_times[:2]) if timed else None,
             **options,
         )
     if pixels:
@@ -164,9 +168,9 @@ def _on_nodes(
     """Images, noise and beams, those of beams that miss the nodes resampled onto them."""
     images, levels, beams = list(images), list(levels), list(beams)
     scans: dict[int, xr.Dataset] = {}
-    for number, when in enumerate(beams):
-        if when is not None and "y_reported" in when:
-            scans[number] = when.assign(image=images[number])
+    for number, scan_beams in enumerate(beams):
+        if scan_beams is not None and "y_reported" in scan_beams:
+            scans[number] = scan_beams.assign(image=images[number])
             level = levels[number] if number < len(levels) else None
             if isinstance(level, xr.DataArray):
                 scans[number] = scans[number].assign(image_stderr=level)
@@ -185,7 +189,7 @@ def _on_nodes(
 
 
 def _in_pixels(wind: xr.Dataset, *, per_frame: bool) -> xr.Dataset:
-    """The same numbers, of pixels of 1 m, with their units; ``per_frame``: and of frames of 1 s."""
+    """A wind of 1 m pixels in units of pixels; ``per_frame``: of 1 s frames in units of frames."""
     wind = wind.copy()
     for variable in wind.variables.values():
         if "units" in variable.attrs:
@@ -199,17 +203,17 @@ def _in_pixels(wind: xr.Dataset, *, per_frame: bool) -> xr.Dataset:
 def _frames(
     files: Sequence[Path], layer: str | None, numbers: Sequence[int] | None, pairs: object
 ) -> list[tuple[Path, Sequence[int]]]:
-    """Which frames of which files are meant; what is ambiguous is refused with the choices."""
+    """The selected frames of each file; an ambiguous selection is refused with the choices."""
     if len(files) == 1:
         return [(files[0], _of_one_file(files[0], layer, numbers, pairs))]
     if numbers is None:
         for path in files:
             count, _ = frames_in(path, layer)
             if count > 1:
-                shown = ",".join("0" for _ in files[:4])
+                example = ",".join("0" for _ in files[:4])
                 raise InputError(
                     f"{path}: {count} frames; expected frame with a number for each file, such "
-                    f"as {shown}, or this file alone"
+                    f"as {example}, or this file alone"
                 )
         numbers = [0]
     if len(numbers) not in (1, len(files)):
@@ -217,8 +221,8 @@ def _frames(
             f"frame: {len(numbers)} numbers are not allowed with {len(files)} files; expected "
             f"one, or {len(files)}"
         )
-    each = [*numbers] * len(files) if len(numbers) == 1 else numbers
-    return [(path, [number]) for path, number in zip(files, each, strict=True)]
+    numbers_of_files = [*numbers] * len(files) if len(numbers) == 1 else numbers
+    return [(path, [number]) for path, number in zip(files, numbers_of_files, strict=True)]
 
 
 def _of_one_file(
@@ -248,44 +252,46 @@ def _of_one_file(
 
 def _layer(paths: Sequence[Path]) -> str | None:
     """The layer that all files have by default; None: they have no names of layers."""
-    found = {path: default_layer(path) for path in paths}
-    names = set(found.values())
+    layers = {path: default_layer(path) for path in paths}
+    names = set(layers.values())
     if "Y_noisy" in names and len(names) > 1:
-        other = next(path for path, name in found.items() if name != "Y_noisy")
+        noiseless = next(path for path, name in layers.items() if name != "Y_noisy")
         raise InputError(
-            f"{other}: without the layer Y_noisy, which other images have; expected layer, such "
-            "as Y for all"
+            f"{noiseless}: without the layer Y_noisy, which other images have; expected layer, "
+            "such as Y for all"
         )
     return names.pop() if len(names) == 1 else None
 
 
 def _time_steps(
-    paths: Sequence[Path], given: float | None, *, equal: bool
+    paths: Sequence[Path], dt: float | None, *, equal: bool
 ) -> tuple[list[float], list[str]]:
-    """From each image to the next as given, else from the files; remarks on contradictions."""
-    stated = steps_of(paths)
+    """Time steps from image to image, as given or from the files; remarks on contradictions."""
+    from_headers = steps_of(paths)
     count = len(paths) - 1
-    if stated is None:
-        if given is None:
+    if from_headers is None:
+        if dt is None:
             raise InputError("dt: missing, and the files do not say it; expected seconds")
-        return [given] * count, []
-    said = ", ".join(f"{step:g}" for step in dict.fromkeys(stated))
-    unequal = any(abs(step - stated[0]) > _SAME * abs(stated[0]) for step in stated)
-    if given is not None:
+        return [dt] * count, []
+    text = ", ".join(f"{step:g}" for step in dict.fromkeys(from_headers))
+    unequal = any(
+        abs(step - from_headers[0]) > _TOLERANCE * abs(from_headers[0]) for step in from_headers
+    )
+    if dt is not None:
         remarks = []
-        if min(stated) <= 0:
+        if min(from_headers) <= 0:
             remarks.append(
-                f"by their headers ({said} s) an image is not later than the one before: v and w "
+                f"by their headers ({text} s) an image is not later than the one before: v and w "
                 "have the opposite sign if the images are swapped"
             )
-        elif unequal or abs(given - stated[0]) > _SAME * stated[0]:
-            remarks.append(f"dt is {given:g} s as given, but {said} s by the headers of the files")
-        return [given] * count, remarks
-    if min(stated) <= 0:
+        elif unequal or abs(dt - from_headers[0]) > _TOLERANCE * from_headers[0]:
+            remarks.append(f"dt is {dt:g} s as given, but {text} s by the headers of the files")
+        return [dt] * count, remarks
+    if min(from_headers) <= 0:
         raise InputError(
-            f"{paths[0]}: {said} s to the next image by the headers; expected images in the order "
+            f"{paths[0]}: {text} s to the next image by the headers; expected images in the order "
             "of their times, or dt"
         )
     if unequal and equal:
-        raise InputError(f"dt: {said} s by the headers; expected images of equal steps, or dt")
-    return stated, []
+        raise InputError(f"dt: {text} s by the headers; expected images of equal steps, or dt")
+    return from_headers, []

@@ -130,9 +130,9 @@ def has_vortices(experiment: Experiment) -> bool:
     """Whether vortex pairs are fitted."""
     if experiment.wake is None or experiment.sensor is None:
         return has_image_vortices(experiment)
-    asked = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
+    fitted = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
     # the wake of a turbine has no pair
-    return asked or experiment.wake.turbine is None
+    return fitted or experiment.wake.turbine is None
 
 
 def has_samples_by_noise(experiment: Experiment) -> bool:
@@ -141,7 +141,7 @@ def has_samples_by_noise(experiment: Experiment) -> bool:
 
 
 def has_given_samples(experiment: Experiment) -> bool:
-    """Whether it is not."""
+    """Whether the number of Monte Carlo samples is given."""
     return not has_samples_by_noise(experiment)
 
 
@@ -209,7 +209,7 @@ STAGES = (
 
 
 class Results(TypedDict, total=False):
-    """Results of the stages by name; of a stage that an experiment has not, there is none."""
+    """Results of the stages by name; absent for stages that an experiment lacks."""
 
     footprint: Footprint
     flows: Flows
@@ -259,7 +259,7 @@ class Results(TypedDict, total=False):
 
 
 def stages_of(experiment: Experiment) -> Graph:
-    """The stages of an experiment, each behind those it needs."""
+    """The stages of an experiment, each after those that it needs."""
     return Graph(STAGES, experiment)
 
 

@@ -1,8 +1,8 @@
 """Receivers for the same light: from a lidar and its receiver to the model of the signals.
 
 All receivers get the same photons (`lidar_mi.instrument.doppler.photons`, counted in front of
-them), line, sunlight and detector; each loses what its own optics lose. The rings of an etalon take
-part as annuli of equal steps of the order, so that aerosol is a parameter of theirs, too.
+them), line, sunlight and detector; each has the losses of its own optics. The rings of an etalon
+are annuli of equal steps of the order, so that aerosol is a parameter of them, too.
 """
 
 import math
@@ -37,10 +37,10 @@ from lidar_mi.retrieval.channels.model import ChannelModel, mean_and_jacobian, p
 from lidar_mi.retrieval.rings.model import PixelNoise
 
 # Annuli of a ring image, for each order: the tenth harmonic loses 1 % of its contrast.
-_STEPS = 128
+_ANNULI_PER_ORDER = 128
 # Speeds at which the response of two filters is examined.
 _SPEEDS = 4001
-# Pulse energies between which a required one is looked for, relative to the lidar's.
+# Range of a required pulse energy, relative to the lidar's.
 _ENERGIES = (1e-6, 1e6)
 
 
@@ -142,17 +142,17 @@ def ring_receiver(
     light = camera.illumination(r2)
     cosine = fabry_perot.cosine_inside(etalon, camera.cosine(r2))
     order = fabry_perot.fractional_order(etalon, lidar.wavelength, cosine)
-    # the order, not the radius: in it all rings have the same width
-    annulus = np.floor(order * _STEPS).astype(int)
+    # by the order, not the radius, as all rings have the same width in it
+    annulus = np.floor(order * _ANNULI_PER_ORDER).astype(int)
     # orders fall towards the rim, and bincount takes no negative numbers
     annulus -= annulus.min()
     pixels = np.bincount(annulus)
     used = pixels > 0
-    lit = np.bincount(annulus, light)[used]
-    middle = np.bincount(annulus, light * order)[used] / lit
+    annulus_light = np.bincount(annulus, light)[used]
+    middle = np.bincount(annulus, light * order)[used] / annulus_light
     # variance of the order over a pixel: r^2 varies by r^2 pixel^2 / 3
     slope = etalon.order_at_centre(lidar.wavelength) / 2 / (etalon.index * camera.focal_length) ** 2
-    spread = slope**2 * camera.pixel**2 / 3 * np.bincount(annulus, light * r2)[used] / lit
+    spread = slope**2 * camera.pixel**2 / 3 * np.bincount(annulus, light * r2)[used] / annulus_light
     amplitudes = fabry_perot.harmonics(etalon, lidar.wavelength)
     n = np.arange(len(amplitudes))
     # harmonics averaged over a pixel: by a Gaussian of the same variance of the order
@@ -160,7 +160,7 @@ def ring_receiver(
     return _receiver(
         lidar,
         detector or CCD(),
-        (lit / lit.sum())[:, None] * amplitudes * turns,
+        (annulus_light / annulus_light.sum())[:, None] * amplitudes * turns,
         1 / etalon.free_spectral_range(lidar.wavelength),
         modes=speckle_modes(lidar, camera, etalon, _line(lidar)),
         pixels=pixels[used].astype(float),
@@ -179,10 +179,10 @@ def standard_error(
     ``free`` and ``prior`` as in `lidar_mi.retrieval.channels.bound.cramer_rao`.
     """
     channels, noise, level, aerosol = receiver
-    found = cramer_rao(
+    bound = cramer_rao(
         channels, energy * level, noise, v_los=v_los, aerosol=aerosol, free=free, prior=prior
     )
-    return found["v_los"]
+    return bound["v_los"]
 
 
 def required_energy(receiver: Receiver, error: float, v_los: float = 0.0) -> float:
@@ -238,25 +238,15 @@ def _receiver(
     pixels: float | np.ndarray = 1.0,
     ratio: bool = False,
 ) -> Receiver:
-    """A receiver of channels with these harmonics of the frequency.
+    """A receiver from complex harmonics (channels, harmonics) of the transmission of its channels.
 
-    Parameters
-    ----------
-    harmonics : array, shape (channels, harmonics)
-        Of the transmission, complex.
-    delay : float
-        Inverse of its period, s.
-    modes : float
-        Of the speckle in a channel.
-    pixels : float or array, shape (channels,)
-        Of the detector in a channel.
-    ratio : bool
-        Whether speeds are read from the ratio of two signals.
+    Their period is 1 / ``delay`` (s); a channel has so many ``modes`` of speckle and ``pixels``;
+    with ``ratio``, speeds are read from the ratio of two signals.
     """
     times = np.arange(harmonics.shape[1]) * delay
     _, usual = air_of(lidar)
     temperatures = [usual * node for node in TEMPERATURE_NODES]
-    # of molecules alone: aerosol is a signal of its own
+    # of molecules alone: aerosol is a separate signal
     lines = [_line(lidar, kelvin, 0.0).characteristic(times) for kelvin in temperatures]
     laser = laser_line(lidar.wavelength, lidar.laser_width).characteristic(times)
     # in front of the receiver, so without an etalon
@@ -291,7 +281,7 @@ def _monotone(channels: ChannelModel, aerosol: float) -> tuple[float, float]:
     middle = _SPEEDS // 2
     if not steps[middle - 1] * steps[middle] > 0:
         raise InputError("double edge: the ratio of its signals does not depend on the speed at 0")
-    other = np.flatnonzero(steps * steps[middle] <= 0)
-    first = other[other < middle].max(initial=-1) + 1
-    last = other[other > middle].min(initial=_SPEEDS - 1)
+    falling = np.flatnonzero(steps * steps[middle] <= 0)
+    first = falling[falling < middle].max(initial=-1) + 1
+    last = falling[falling > middle].min(initial=_SPEEDS - 1)
     return float(speeds[first]), float(speeds[last])

@@ -43,17 +43,17 @@ def chapters(
     There is one chapter for each instrument; the drawing's duration (s) is by step. Metrics are
     those of `lidar_mi.experiment.measure.measure`.
     """
-    found: list[Chapter] = []
+    drawn_chapters: list[Chapter] = []
     seconds: dict[str, float] = defaultdict(float)
     log("drawing figures")
     # the wind behind a turbine is mostly u, which both lidars measure together
     first = "lines" if _behind_turbine(experiment) else None
-    for result, step, chapter in sorted(_CHAPTERS, key=lambda one: one[0] != first):
+    for result, step, chapter in sorted(_CHAPTERS, key=lambda row: row[0] != first):
         if results.get(result) is not None:
             start = time.perf_counter()
-            found.append(chapter(experiment, results, metrics, folder, log))
+            drawn_chapters.append(chapter(experiment, results, metrics, folder, log))
             seconds[step] += time.perf_counter() - start
-    return found, seconds
+    return drawn_chapters, seconds
 
 
 def _behind_turbine(experiment: Experiment) -> bool:
@@ -63,13 +63,13 @@ def _behind_turbine(experiment: Experiment) -> bool:
 def _backscatter(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
-    found, cores = results["wind"], results["cores"]
+    winds, cores = results["wind"], results["cores"]
     drawn = backscatter_figures.draw_all(
-        folder, results["truth"], results["scans"], found, cores, results["texture_sweep"], log
+        folder, results["truth"], results["scans"], winds, cores, results["texture_sweep"], log
     )
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
-    wind = found.sel(source=source)
-    # the first method with a valid vector: the others have nothing to look at
+    wind = winds.sel(source=source)
+    # the first method with a valid vector
     valid = (wind["flag"] == 0).any(("z", "y")).transpose("algorithm").values
     vectors = map_data(wind.isel(algorithm=int(valid.argmax())), ("v", "w"), cores)
     alone = () if experiment.sensor else judged(experiment, results, metrics)
@@ -103,7 +103,7 @@ def _doppler(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
     doppler = experiment.fringes
-    assert doppler is not None  # whose results these are
+    assert doppler is not None  # the results of this section
     drawn = doppler_figures.draw_all(
         folder,
         doppler,
@@ -119,13 +119,13 @@ def _doppler(
 def _sensor(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
-    found, cores = results["wind3d"], results["cores"]
-    shown = found if metrics["sensor.vectors"] else None
-    drawn = sensor_figures.draw_all(folder, shown, results["lines"], cores, log)
+    wind, cores = results["wind3d"], results["cores"]
+    drawn_wind = wind if metrics["sensor.vectors"] else None
+    drawn = sensor_figures.draw_all(folder, drawn_wind, results["lines"], cores, log)
     vectors = (
         None
-        if found is None
-        else map_data(found, COMPONENTS, cores, "u" if _behind_turbine(experiment) else "")
+        if wind is None
+        else map_data(wind, COMPONENTS, cores, "u" if _behind_turbine(experiment) else "")
     )
     verdicts = judged(experiment, results, metrics)
     return sensor_chapter(experiment, metrics, verdicts, drawn, vectors)

@@ -54,42 +54,45 @@ def run(
     refuse_strangers(folder, STUDY, "study's folder")
     # faults of the last one are reported before the first one is run
     ready = {
-        key: experiment.prepare(one, beside, _of(key, notice)) for key, one in variants.items()
+        key: experiment.prepare(variant, beside, _of(key, notice))
+        for key, variant in variants.items()
     }
-    settings = {key: settings_of(one) for key, one in variants.items()}
+    settings = {key: settings_of(variant) for key, variant in variants.items()}
     make_folder(folder)
     with locked(folder):
         refuse_strangers(folder, STUDY, "study's folder")
         write_text(folder / STUDY, to_yaml({"name": name, "variants": list(variants)}))
-        metrics, rows, found = {}, {}, {}
+        metrics, rows, answers = {}, {}, {}
         for key in variants:
             done = experiment.complete(ready.pop(key), folder / key, overwrite=overwrite)
-            metrics[key], found[key] = done.metrics, done.answer
+            metrics[key], answers[key] = done.metrics, done.answer
             # a variant without a wake has rings only, which the table compares
             if done.wind is not None:
-                rows[key] = _shown(done.scans[0], done.wind, done.cores)
+                rows[key] = _images_and_wind(done.scans[0], done.wind, done.cores)
         log = Log(notice, folder / LOG)
         log(f"comparing {', '.join(variants)}")
         drawn = draw_comparison(folder / FIGURES, rows, log) if rows else []
         merged = {
-            f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()
+            f"{key}.{name}": value
+            for key, variant in metrics.items()
+            for name, value in variant.items()
         }
         write_json(folder / METRICS, merged)
-        write_text(folder / REPORT, page(name, settings, metrics, drawn, found))
+        write_text(folder / REPORT, page(name, settings, metrics, drawn, answers))
         log("done")
     return metrics
 
 
 def _of(variant: str, notice: Notice) -> Notice:
     def named(text: str, fraction: float | None) -> None:
-        # what is a warning stays one
+        # warnings remain warnings
         kind, text = ("warning: ", text[9:]) if text.startswith("warning: ") else ("", text)
         notice(f"{kind}{variant}: {text}", fraction)
 
     return named
 
 
-def _shown(
+def _images_and_wind(
     scan: xr.Dataset, wind: xr.Dataset, cores: Sequence[Core]
 ) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:
     """First image of the instrument, wind by the first method, positions of true cores.

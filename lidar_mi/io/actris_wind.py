@@ -20,14 +20,14 @@ def in_actris_layout(winds: xr.Dataset) -> xr.Dataset:
         ``uwind_stderr``, ``vwind_stderr``, ``wind_speed``, ``wind_direction`` (degrees, from) and
         ``flag``; attributes of the winds.
     """
-    found = {}
+    variables = {}
     valid = winds["flag"] == 0
     for ours, (theirs, long_name) in _NAMES.items():
         raw = winds[ours]
-        found[theirs] = raw.where(valid).assign_attrs(raw.attrs, long_name=long_name)
+        variables[theirs] = raw.where(valid).assign_attrs(raw.attrs, long_name=long_name)
         about = {"units": raw.attrs["units"], "long_name": f"{long_name}, not screened"}
-        found[f"{theirs}_raw"] = raw.copy().drop_attrs().assign_attrs(about)
-        found[f"{theirs}_stderr"] = winds[f"{ours}_stderr"]
+        variables[f"{theirs}_raw"] = raw.copy().drop_attrs().assign_attrs(about)
+        variables[f"{theirs}_stderr"] = winds[f"{ours}_stderr"]
     for ours, theirs in (("wind_speed", "wind_speed"), ("wind_from_direction", "wind_direction")):
-        found[theirs] = winds[ours].where(valid).assign_attrs(winds[ours].attrs)
-    return xr.Dataset(found | {"flag": winds["flag"]}, attrs=winds.attrs)
+        variables[theirs] = winds[ours].where(valid).assign_attrs(winds[ours].attrs)
+    return xr.Dataset(variables | {"flag": winds["flag"]}, attrs=winds.attrs)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lidar_mi.errors import InputError
 
-# a process killed while writing can only leave such a file
+# a process killed while writing leaves only such a file
 TEMPORARY = ".lidar-mi.*.part"
 
 _numbers = count()
@@ -45,7 +45,7 @@ def write_atomically(
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is no ordinary file; expected a file or a new name")
         _remove_leftovers(path.parent)
-        temporary = path.with_name(f"{_own_prefix()}{os.getpid()}.{next(_numbers)}.part")
+        temporary = path.with_name(f"{_host_prefix()}{os.getpid()}.{next(_numbers)}.part")
         try:
             _write_synced(temporary, content)
             if first:
@@ -83,15 +83,15 @@ def _write_synced(path: Path, content: bytes | memoryview) -> None:
         os.fsync(file.fileno())
 
 
-def _own_prefix() -> str:
+def _host_prefix() -> str:
     return f".lidar-mi.{platform.node()}."
 
 
 def _remove_leftovers(folder: Path) -> None:
     """Remove temporary files of processes of this machine that have ended."""
     for path in folder.glob(TEMPORARY):
-        process = path.name.removeprefix(_own_prefix()).split(".")[0]
-        if path.name.startswith(_own_prefix()) and process.isdigit() and not _lives(int(process)):
+        process = path.name.removeprefix(_host_prefix()).split(".")[0]
+        if path.name.startswith(_host_prefix()) and process.isdigit() and not _lives(int(process)):
             path.unlink(missing_ok=True)
 
 
@@ -100,6 +100,6 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (PermissionError, OverflowError):  # of another user; no process has such a number
+    except (PermissionError, OverflowError):  # of another user; a number that no process can have
         return True
     return True

@@ -201,12 +201,12 @@ def _read(
 def _layers(parts: Sequence[Any]) -> dict[str, np.ndarray]:
     """Pixels by the names of channels; of several parts by PART.CHANNEL."""
     names = [part.name() if len(parts) > 1 else "" for part in parts]
-    found = {}
+    layers = {}
     for number, (name, part) in enumerate(zip(names, parts, strict=True)):
         prefix = name if names.count(name) == 1 else f"{name or 'part'}{number}"
         for channel, content in part.channels.items():
-            found[f"{prefix}.{channel}" if prefix else channel] = np.array(content.pixels)
-    return found
+            layers[f"{prefix}.{channel}" if prefix else channel] = np.array(content.pixels)
+    return layers
 
 
 def axis_of(header: dict[str, Any], name: str, size: int, path: str | Path) -> np.ndarray:

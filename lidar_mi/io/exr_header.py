@@ -49,7 +49,7 @@ def _declared(content: bytes) -> tuple[int, int]:
 
 def _attributes(content: bytes, place: int) -> tuple[dict[bytes, bytes], int]:
     """Attributes of one header by name, and where it ends."""
-    found = {}
+    attributes = {}
     while content[place]:
         name, place = _text(content, place)
         _, place = _text(content, place)
@@ -57,9 +57,9 @@ def _attributes(content: bytes, place: int) -> tuple[dict[bytes, bytes], int]:
         place += 4
         if not 0 <= size <= len(content) - place:
             raise IndexError
-        found[name] = content[place : place + size]
+        attributes[name] = content[place : place + size]
         place += size
-    return found, place + 1
+    return attributes, place + 1
 
 
 def _bytes_of_pixel(channels: bytes) -> int:

@@ -44,8 +44,8 @@ def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) ->
 
     if len({frame.shape for frame in frames}) != 1:
         raise InputError(f"{path}: {len(frames)} frames of one size expected")
-    # one palette for all, so that what rests does not flicker; of all colours, not of the most
-    # frequent, so that thin lines keep theirs next to a grey image
+    # one palette for all frames, so that the background does not flicker; of all colours, not the
+    # most frequent ones, so that thin lines keep theirs next to a grey image
     palette = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 4)])).quantize(
         _COLOURS, Image.Quantize.MAXCOVERAGE
     )

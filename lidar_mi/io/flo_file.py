@@ -29,8 +29,8 @@ def write_flo(path: str | Path, wind: xr.Dataset, pixel: tuple[float, float]) ->
         for axis, size in zip("zy", pixel, strict=True)
     )
     flow = np.stack([right, down], -1)
-    known = (wind["flag"].transpose("z", "y").values[::-1, ::-1] == 0) & np.isfinite(flow).all(-1)
-    flow = np.where(known[..., None], flow, _UNKNOWN).astype("<f4")
-    height, width = known.shape
+    valid = (wind["flag"].transpose("z", "y").values[::-1, ::-1] == 0) & np.isfinite(flow).all(-1)
+    flow = np.where(valid[..., None], flow, _UNKNOWN).astype("<f4")
+    height, width = valid.shape
     head = b"PIEH" + np.array([width, height], "<i4").tobytes()
     write_atomically(path, head + flow.tobytes())

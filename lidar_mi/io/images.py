@@ -46,9 +46,9 @@ def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = 
     path = Path(path)
     frames = _frames(path, layer)
     if frame is None and frames.count > 1:
-        what = "channels" if frames.channels else "frames"
+        axis = "channels" if frames.channels else "frames"
         raise InputError(
-            f"{path}: {frames.count} {what}; expected --frame, 0 to {frames.count - 1}"
+            f"{path}: {frames.count} {axis}; expected --frame, 0 to {frames.count - 1}"
         )
     return _numbered(path, frames, [frame or 0])[0].astype(float)
 
@@ -93,7 +93,7 @@ def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
     InputError
         As `read_pixels`.
     """
-    if kind_of(Path(path)) in _OF_ONE:
+    if kind_of(Path(path)) in _SINGLE_IMAGE:
         return 1, False
     frames = _frames(Path(path), layer)
     return frames.count, frames.channels
@@ -119,7 +119,7 @@ def _frames(path: Path, layer: str | None) -> Frames:
             f"layer: {layer!r} is not allowed for {path}; only EXR, FITS, npz, mat and HDF5 files "
             "have layers"
         )
-    return _WITHOUT[kind](path)
+    return _WITHOUT_LAYERS[kind](path)
 
 
 def _exr(path: Path, layer: str | None) -> Frames:
@@ -128,17 +128,17 @@ def _exr(path: Path, layer: str | None) -> Frames:
         raise InputError(
             f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
         )
-    named = layer or default_layer(path)
-    if named:
-        return frames_of(path, layers[named][None])
+    chosen = layer or default_layer(path)
+    if chosen:
+        return frames_of(path, layers[chosen][None])
     colours = np.stack([layers[name] for name in "RGB"], -1)
     return frames_of(path, grey(path, colours, 3)[None])
 
 
 _WITH_LAYERS = {"exr": _exr, "fits": read_fits, "npz": read_npz, "mat": read_mat, "hdf5": read_hdf5}
-_OF_ONE = ("exr", "png", "jpeg2000", "mat")
+_SINGLE_IMAGE = ("exr", "png", "jpeg2000", "mat")
 """Kinds that hold one image."""
-_WITHOUT = {
+_WITHOUT_LAYERS = {
     "tiff": read_tiff,
     "png": read_png,
     "picture": read_picture,
@@ -235,7 +235,7 @@ def read_images(
 ) -> list[xr.DataArray]:
     """Some images of a file, each as `read_image` gives it; the file is read once."""
     images = read_frames(path, layer, numbers)
-    return [_on_axes(path, layer, spacing, one.astype(float)) for one in images]
+    return [_on_axes(path, layer, spacing, frame.astype(float)) for frame in images]
 
 
 def _on_axes(
@@ -298,9 +298,9 @@ def read_noise(
     if not _is_exr(path):
         return None
     layers, layer = read_layers(path)[1], layer or default_layer(path)
-    # of random numbers that both images of a pair share: what the other does not have
-    own = "gate000.S0_pair_stderr"
-    error = own if own in layers else "gate000.S0_stderr"
+    # images of a pair share random numbers: the part of the noise that they do not share
+    unshared = "gate000.S0_pair_stderr"
+    error = unshared if unshared in layers else "gate000.S0_stderr"
     if layer in ("Y", "Y_noisy") and {"gate000.S0", error, "Y"} <= set(layers):
         signal, stderr, scaled = (
             read_image(path, name, spacing) for name in ("gate000.S0", error, "Y")
@@ -310,8 +310,8 @@ def read_noise(
             detector = read_image(path, "Y_noise_std", spacing)
             noise = noise.copy(data=np.hypot(noise.values, detector.values))
         return noise
-    known = f"{layer}_stderr"
-    return read_image(path, known, spacing) if known in layers else None
+    stderr_layer = f"{layer}_stderr"
+    return read_image(path, stderr_layer, spacing) if stderr_layer in layers else None
 
 
 def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | None:
@@ -335,8 +335,8 @@ def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | N
     if "beam_time" not in layers:
         return None
     names = [name for name in ("beam_time", "y_reported", "z_reported") if name in layers]
-    found = xr.Dataset({name: read_image(path, name, spacing) for name in names})
-    return found.assign_attrs(frozen_air=int(header.get("frozen_air", 0)))
+    beams = xr.Dataset({name: read_image(path, name, spacing) for name in names})
+    return beams.assign_attrs(frozen_air=int(header.get("frozen_air", 0)))
 
 
 def as_webp(path: str | Path) -> bytes:
@@ -368,10 +368,10 @@ def _short(error: Exception) -> str:
 
 
 def panel_cuts(path: str | Path) -> list[float]:
-    """Where the panels of a figure side by side part, as fractions of its width.
+    """Boundaries of panels side by side, as fractions of a figure's width.
 
-    A figure of n equal columns parts at white gaps of its full height near k / n; the smallest n
-    up to 4 is taken. Empty: one column, or panels that something spans.
+    A figure of n equal columns has white gaps of its full height near k / n; the smallest n up to 4
+    is taken. Empty: one column, or an element that spans several.
 
     Raises
     ------
@@ -386,13 +386,13 @@ def panel_cuts(path: str | Path) -> list[float]:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
     white = np.flatnonzero((pixels > 250).all(0)) / max(pixels.shape[1], 1)
-    # one panel is about as high as it is wide
+    # a panel is about as high as wide
     most = min(4, round(2 * pixels.shape[1] / max(pixels.shape[0], 1)))
     for columns in range(2, most + 1):
-        wanted = [k / columns for k in range(1, columns)]
-        near = [white[abs(white - cut) < 0.1 / columns] for cut in wanted]
+        expected = [k / columns for k in range(1, columns)]
+        near = [white[abs(white - cut) < 0.1 / columns] for cut in expected]
         if all(gap.size for gap in near):
             return [
-                float(gap[abs(gap - cut).argmin()]) for gap, cut in zip(near, wanted, strict=True)
+                float(gap[abs(gap - cut).argmin()]) for gap, cut in zip(near, expected, strict=True)
             ]
     return []

@@ -37,10 +37,14 @@ def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
         reactions = ElementTree.SubElement(top, "external_reactions")
     for kind in ("force", "moment"):
         for axis in AXES:
-            one = ElementTree.SubElement(reactions, kind, name=f"wake-{kind}-{axis}", frame="BODY")
+            reaction = ElementTree.SubElement(
+                reactions, kind, name=f"wake-{kind}-{axis}", frame="BODY"
+            )
             if kind == "force":
-                _vector(one, "location", "000", unit="IN")
-            _vector(one, "direction", ["1" if axis == other else "0" for other in AXES])
+                _vector(reaction, "location", "000", unit="IN")
+            _vector(
+                reaction, "direction", ["1" if axis == direction else "0" for direction in AXES]
+            )
     tree.write(path)
 
 

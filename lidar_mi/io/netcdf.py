@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import h5py
 
 
-# What never written cells hold (NC_FILL_* of netcdf.h), but in types of one byte, which the library
-# does not check either, as all their values are in use.
+# Values of cells that were never written (NC_FILL_* of netcdf.h). None for types of one byte, all
+# of whose values are in use; the library does not check them either.
 _NEVER_WRITTEN = {
     "i2": -32767,
     "u2": 65535,
@@ -32,7 +32,7 @@ _NEVER_WRITTEN = {
     "f4": 9.969209968386869e36,
     "f8": 9.969209968386869e36,
 }
-# How files begin, what they are, and what makes NetCDF that is read of them.
+# First bytes of files, their kind, and the command that converts them to NetCDF.
 _KINDS = (
     (b"PK\x03\x04", "is a zip archive", "unzip {0}"),
     (b"\x0e\x03\x13\x01", "is HDF4", "ncks {0} out.nc"),
@@ -45,7 +45,7 @@ _LIBRARY = "netCDF4"
 
 
 def open_netcdf(path: str | Path, group: str | None = None) -> xr.Dataset:
-    """A NetCDF-4 or NetCDF-3 file, its times as numbers, its values read when they are asked for.
+    """A NetCDF-4 or NetCDF-3 file, times as numbers, values read on demand.
 
     With a ``group``, the variables of that group of a NetCDF-4 file (`groups`).
 
@@ -82,7 +82,7 @@ def groups(path: str | Path) -> list[str]:
         return []
     try:
         with h5py.File(path, "r") as file:
-            return [name for name, one in file.items() if isinstance(one, h5py.Group)]
+            return [name for name, member in file.items() if isinstance(member, h5py.Group)]
     except Exception as error:
         raise _damaged(path, error) from None
 
@@ -95,9 +95,9 @@ def _open(path: str | Path, group: str | None = None, **how: Any) -> xr.Dataset:
     if kind == "CDF-5":
         unread = f"is NetCDF of 64-bit data (CDF-5); {_convert('nccopy -k nc4 {0} out.nc', path)}"
     elif kind == "HDF5":
-        found, filters = _declared(path, group)
-        for what, size in found:
-            check_size(path, size, what)
+        declared, filters = _declared(path, group)
+        for variable, size in declared:
+            check_size(path, size, variable)
         if filters:
             convert = _convert("nccopy -d 4 -F none {0} out.nc", path, "zlib")
             unread = f"is compressed with {', '.join(filters)}; {convert}"
@@ -140,46 +140,46 @@ def _kind(path: Path) -> str:
     if packed := compression(magic):
         name, program = packed
         raise InputError(f"{path}: is compressed with {name}; {_convert(f'{program} {{0}}', path)}")
-    for begin, what, command in _KINDS:
+    for begin, contents, command in _KINDS:
         if magic.startswith(begin):
-            raise InputError(f"{path}: {what}; {_convert(command, path)}")
+            raise InputError(f"{path}: {contents}; {_convert(command, path)}")
     # HDF5 may begin behind a block of the user's
     if magic and h5py.is_hdf5(os.fsencode(path)):
         return "HDF5"
     raise InputError(f"{path}: is not NetCDF; allowed: NetCDF-4 (HDF5) or NetCDF-3 classic")
 
 
-def _convert(command: str, path: Path, wanted: str = "NetCDF-4 or NetCDF-3 classic") -> str:
-    return f"expected {wanted}: {command.format(shlex.quote(str(path)))}"
+def _convert(command: str, path: Path, target: str = "NetCDF-4 or NetCDF-3 classic") -> str:
+    return f"expected {target}: {command.format(shlex.quote(str(path)))}"
 
 
 def _declared(path: Path, group: str | None) -> tuple[list[tuple[str, int]], list[str]]:
     """Bytes read on opening and the largest chunk read for a value; filters that are missing."""
     import h5py
 
-    found: list[tuple[str, int]] = []
+    sizes: list[tuple[str, int]] = []
     filters: dict[int, str] = {}
     try:
         with h5py.File(path, "r") as file:
             file.attrs.get("_nc3_strict")  # h5netcdf could not even be closed without
             within = file if group is None else file[group]
-            inner = [name for name, one in within.items() if isinstance(one, h5py.Group)]
+            inner = [name for name, member in within.items() if isinstance(member, h5py.Group)]
             for name, variable in within.items():
                 if isinstance(variable, h5py.Dataset):
                     axis = variable.shape if variable.ndim == 1 else None
                     for shape in (axis, variable.chunks):
                         if shape is not None:
-                            found.append((name, math.prod(shape) * variable.dtype.itemsize))
+                            sizes.append((name, math.prod(shape) * variable.dtype.itemsize))
                     filters |= _missing_filters(variable)
     except Exception as error:
         raise _damaged(path, error) from None
-    if inner and not found:
+    if inner and not sizes:
         command = f"ncks -G : -g {shlex.quote(inner[0])} {{0}} out.nc"
         raise InputError(
             f"{path}: has all variables in groups ({', '.join(inner)}); "
             f"{_convert(command, path, 'them outside')}"
         )
-    return found, list(filters.values())
+    return sizes, list(filters.values())
 
 
 def _missing_filters(variable: "h5py.Dataset") -> dict[int, str]:
@@ -196,7 +196,7 @@ def _missing_filters(variable: "h5py.Dataset") -> dict[int, str]:
 
 
 def _mark_missing(variable: xr.Variable) -> None:
-    """Let xarray find what CF calls missing and it does not.
+    """Mark the values that are missing by CF and that xarray does not recognise.
 
     What the library writes into cells that were never written; the sign of ``missing_value`` where
     ``_Unsigned`` changes that of the values.
@@ -209,7 +209,7 @@ def _mark_missing(variable: xr.Variable) -> None:
             attributes["missing_value"] = stored.view(f"{signs}{kind.itemsize}")
         return
     fill = _NEVER_WRITTEN.get(kind.str[1:])
-    # no measured number, also where another fill value came later
+    # never a measurement, even if another fill value was declared later
     if fill is not None and kind.kind == "f":
         also = np.append(np.ravel(attributes.get("missing_value", [])), fill)
         attributes["missing_value"] = also.astype(kind)
@@ -238,12 +238,12 @@ def load_variable(variable: xr.DataArray, path: str | Path) -> xr.DataArray:
     """
     check_size(path, variable.nbytes, str(variable.name))
     try:
-        found = variable.load()
+        loaded = variable.load()
     except Exception as error:
         raise _damaged(path, error) from None
     low, high = valid_range(variable, path)
-    bad = (found < low) | (found > high) if math.isfinite(low) or math.isfinite(high) else None
-    return found if bad is None or not bad.any() else found.where(~bad)
+    bad = (loaded < low) | (loaded > high) if math.isfinite(low) or math.isfinite(high) else None
+    return loaded if bad is None or not bad.any() else loaded.where(~bad)
 
 
 def valid_range(variable: xr.DataArray, path: str | Path) -> tuple[float, float]:
@@ -261,8 +261,8 @@ def valid_range(variable: xr.DataArray, path: str | Path) -> tuple[float, float]
     for name, ends in (("valid_min", [0]), ("valid_max", [1]), ("valid_range", [0, 1])):
         if name not in variable.attrs or variable.dtype.kind not in "iuf":
             continue
-        given = np.ravel(variable.attrs[name])
-        if given.dtype.kind not in "iuf" or given.size != len(ends):
+        limit = np.ravel(variable.attrs[name])
+        if limit.dtype.kind not in "iuf" or limit.size != len(ends):
             raise InputError(
                 f"{path}: variable {variable.name!r} has the {name} {variable.attrs[name]!r}; "
                 f"expected {'two numbers' if len(ends) == 2 else 'a number'}"
@@ -270,14 +270,14 @@ def valid_range(variable: xr.DataArray, path: str | Path) -> tuple[float, float]
         packing = variable.encoding
         scale, offset = packing.get("scale_factor", 1), packing.get("add_offset", 0)
         stored = np.dtype(packing.get("dtype", variable.dtype))
-        wider = given.dtype.kind == "f" and (
-            stored.kind != "f" or given.dtype.itemsize > stored.itemsize
+        wider = limit.dtype.kind == "f" and (
+            stored.kind != "f" or limit.dtype.itemsize > stored.itemsize
         )
         # in the steps and the type of xarray, so that the limit itself is valid
-        values = given.astype(variable.dtype if variable.dtype.kind == "f" else float)
+        values = limit.astype(variable.dtype if variable.dtype.kind == "f" else float)
         if ("scale_factor" in packing or "add_offset" in packing) and not wider:
-            if packing.get("_Unsigned") == "true" and given.dtype.kind == "i":
-                values = given.view(f"u{given.dtype.itemsize}").astype(values.dtype)
+            if packing.get("_Unsigned") == "true" and limit.dtype.kind == "i":
+                values = limit.view(f"u{limit.dtype.itemsize}").astype(values.dtype)
             values *= scale
             values += offset
             if scale < 0:

@@ -26,8 +26,8 @@ def write_npz(path: str | Path, data: xr.Dataset) -> None:
     for name, variable in data.variables.items():
         text = variable.dtype.kind in "OUS"
         values[str(name)] = variable.values.astype(str) if text else variable.values
-        described = {key: str(value) for key, value in variable.attrs.items()}
-        about[str(name)] = {"dims": [str(dim) for dim in variable.dims], **described}
+        attributes = {key: str(value) for key, value in variable.attrs.items()}
+        about[str(name)] = {"dims": [str(dim) for dim in variable.dims], **attributes}
     buffer = BytesIO()
     values["about"] = np.array(json.dumps(about))
     np.savez_compressed(buffer, **values)

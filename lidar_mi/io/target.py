@@ -46,7 +46,7 @@ def check_target(
         return
     if not path.is_file():
         raise InputError(f"{path}: is no ordinary file; expected a file or a new name (-o FILE)")
-    if any(Path(one).exists() and os.path.samefile(path, one) for one in inputs):
+    if any(Path(source).exists() and os.path.samefile(path, source) for source in inputs):
         raise InputError(f"{path}: is an input; expected another file (-o FILE)")
     if not overwrite and not software(path).startswith(_OURS):
         raise InputError(

@@ -33,12 +33,12 @@ def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
     """
     path = Path(path)
     try:
-        found = path.stat()
-        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+        status = path.stat()
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
             raise InputError(f"{path}: a device or a pipe; expected {expected}")
-        if found.st_size > longest:
+        if status.st_size > longest:
             raise InputError(
-                f"{path}: {found.st_size} bytes are not allowed; expected {expected} of at most "
+                f"{path}: {status.st_size} bytes are not allowed; expected {expected} of at most "
                 f"{longest} bytes"
             )
         content = path.read_bytes()
@@ -48,10 +48,10 @@ def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
         # line ends of any system
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
-        other, line = _encoding(content), content.count(b"\n", 0, error.start) + 1
-    if other is None:
+        encoding, line = _encoding(content), content.count(b"\n", 0, error.start) + 1
+    if encoding is None:
         raise InputError(f"{path}: not a text file; expected {expected}") from None
-    command = f"iconv -f {other} -t UTF-8 {shlex.quote(str(path))}"
+    command = f"iconv -f {encoding} -t UTF-8 {shlex.quote(str(path))}"
     raise InputError(
         f"{path}: line {line} is not UTF-8; expected {expected} in UTF-8: {command}"
     ) from None

@@ -52,22 +52,22 @@ def read_timed_table(
         does not convert, a value that is no finite number, an axis that does not increase.
     """
     path = Path(path)
-    wanted = {TIME: "s", **units} if axis == TIME else dict(units)
+    expected = {TIME: "s", **units} if axis == TIME else dict(units)
     read = _netcdf if path.suffix in (".nc", ".nc4", ".cdf") else _csv
-    found = read(path, wanted)
-    if axis not in found or len(found) == 1:
-        missing = axis if axis not in found else f"all of {', '.join(units)}"
-        raise InputError(f"{path}: {missing} missing; expected columns {', '.join(wanted)}")
+    columns = read(path, expected)
+    if axis not in columns or len(columns) == 1:
+        missing = axis if axis not in columns else f"all of {', '.join(units)}"
+        raise InputError(f"{path}: {missing} missing; expected columns {', '.join(expected)}")
     table = {}
-    for name, (values, unit) in found.items():
+    for name, (values, unit) in columns.items():
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise InputError(
                 f"{path}: {name}: {values[bad[0]]} in row {bad[0] + 1} is not allowed; expected "
                 "finite numbers"
             )
-        table[name] = values * _factor(unit, wanted[name], name, path)
-    along, unit = table[axis], wanted[axis]
+        table[name] = values * _factor(unit, expected[name], name, path)
+    along, unit = table[axis], expected[axis]
     if len(along) < 2:
         raise InputError(f"{path}: {len(along)} rows; expected two or more")
     back = np.flatnonzero(~(np.diff(along) > 0))
@@ -92,7 +92,7 @@ def _factor(unit: str | None, target: str, name: str, path: Path) -> float:
         raise InputError(f"{path}: {name}: unit {unit!r} is not allowed; {allowed}") from None
 
 
-def _csv(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
+def _csv(path: Path, expected: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
     text = read_text(path, "a table, CSV or NetCDF")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     try:
@@ -100,7 +100,7 @@ def _csv(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray, s
     except csv.Error as error:
         raise InputError(f"{path}: not a CSV table ({error})") from None
     if not rows:
-        raise InputError(f"{path}: empty; expected a head and numbers: {', '.join(wanted)}")
+        raise InputError(f"{path}: empty; expected a head and numbers: {', '.join(expected)}")
     heads = [_HEAD.fullmatch(cell) for cell in rows[0]]
     names = [head[1] if head else "" for head in heads]
     units = [head[2] if head else None for head in heads]
@@ -112,12 +112,12 @@ def _csv(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray, s
             raise InputError(
                 f"{path}: {len(row)} values in row {number}; expected {len(names)}, as in its head"
             )
-    found = {}
+    columns = {}
     for index, (name, unit) in enumerate(zip(names, units, strict=True)):
-        if name in wanted:
+        if name in expected:
             cells = enumerate((row[index] for row in rows[1:]), 1)
-            found[name] = np.array([_number(cell, name, row, path) for row, cell in cells]), unit
-    return found
+            columns[name] = np.array([_number(cell, name, row, path) for row, cell in cells]), unit
+    return columns
 
 
 def _number(cell: str, name: str, row: int, path: Path) -> float:
@@ -129,10 +129,10 @@ def _number(cell: str, name: str, row: int, path: Path) -> float:
         ) from None
 
 
-def _netcdf(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
-    found = {}
+def _netcdf(path: Path, expected: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
+    columns = {}
     with open_netcdf(path) as data:
-        for name in wanted:
+        for name in expected:
             if name not in data.variables:
                 continue
             variable = data[name]
@@ -145,10 +145,10 @@ def _netcdf(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray
             unit = variable.attrs.get("units")
             if name == TIME and unit is not None:
                 unit = count_unit(unit, f"{path}: {name}")
-            found[name] = values, None if unit is None else str(unit)
-    sizes = {len(values) for values, _ in found.values()}
+            columns[name] = values, None if unit is None else str(unit)
+    sizes = {len(values) for values, _ in columns.values()}
     if len(sizes) > 1:
         raise InputError(
-            f"{path}: {', '.join(found)} have {sorted(sizes)} values; expected equally many"
+            f"{path}: {', '.join(columns)} have {sorted(sizes)} values; expected equally many"
         )
-    return found
+    return columns

@@ -147,8 +147,8 @@ def _from_data(data: dict[str, Any], where: str) -> VortexPairFit:
             f"{where}.profile: {profile!r} is not one of {', '.join(get_args(Profile))}"
         )
     if not reasons:
-        known = np.isfinite(parameters).all() and np.isfinite(covariance).all()
-        if not known or not np.allclose(covariance, covariance.T):
+        finite = np.isfinite(parameters).all() and np.isfinite(covariance).all()
+        if not finite or not np.allclose(covariance, covariance.T):
             raise InputError(
                 f"{where}.covariance: not symmetric and finite; expected that of a fit"
             )

@@ -55,8 +55,8 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
     dims = tuple(map(str, shape)) if kind in (".vts", ".vtu") else AXES
     points: dict[str, np.ndarray | tuple[np.ndarray, ...]] = {}
     for name, variable in data.variables.items():
-        there = set(variable.dims) & set(dims) or (kind == ".vtu" and not variable.dims)
-        if variable.dtype.kind in "iuf" and name not in AXES and there:
+        on_nodes = set(variable.dims) & set(dims) or (kind == ".vtu" and not variable.dims)
+        if variable.dtype.kind in "iuf" and name not in AXES and on_nodes:
             points[_label(data, str(name))] = _values(data[name], data, dims)
     if {"v", "w"} <= set(data.data_vars) and set(data["v"].dims) & set(dims):
         v, w = (_values(data[name], data, dims) for name in ("v", "w"))
@@ -125,5 +125,5 @@ def _values(variable: xr.DataArray, data: xr.Dataset, dims: tuple[str, ...]) -> 
     """On all nodes, in the memory layout that VTK has: x runs fastest."""
     sizes = {dim: data.sizes.get(dim, 1) for dim in dims}
     missing = {dim: size for dim, size in sizes.items() if dim not in variable.dims}
-    own: Any = variable.variable  # xarray states no types for its `set_dims`
-    return np.asfortranarray(own.set_dims(missing | dict(variable.sizes)).transpose(*dims).values)
+    raw: Any = variable.variable  # xarray states no types for its `set_dims`
+    return np.asfortranarray(raw.set_dims(missing | dict(variable.sizes)).transpose(*dims).values)

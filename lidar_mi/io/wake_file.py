@@ -19,7 +19,7 @@ _VARIABLES = {
     "u": ("m s-1", "velocity along the flight path"),
     "v": ("m s-1", "velocity across the flight path, positive to port"),
     "w": ("m s-1", "vertical velocity, positive upwards"),
-    "tracer": (None, "exhaust tracer"),  # any scale, any unit: its largest value is what counts
+    "tracer": (None, "exhaust tracer"),  # any unit: only ratios to its largest value matter
     "aerosol": ("1", "background aerosol relative to its mean"),
 }
 _REQUIRED = ("v", "w")
@@ -52,11 +52,11 @@ def _numbers(variable: xr.DataArray, path: Path) -> np.ndarray:
 
 def _file_names(names: Mapping[str, str] | None, path: Path) -> tuple[dict[str, str], set[str]]:
     """Our name -> the file's, for all dimensions and variables; and those of opposite sign."""
-    known = (*_DIMENSIONS, *_VARIABLES)
+    allowed = (*_DIMENSIONS, *_VARIABLES)
     names, opposite = dict(names or {}), set()
     for ours, theirs in names.items():
-        if ours not in known:
-            raise InputError(f"wake.names: {ours!r} is not known; allowed: {', '.join(known)}")
+        if ours not in allowed:
+            raise InputError(f"wake.names: {ours!r} is not known; allowed: {', '.join(allowed)}")
         if not isinstance(theirs, str):
             raise InputError(f"wake.names.{ours}: {theirs!r} is not allowed; a text is")
         if theirs.startswith("-"):
@@ -67,7 +67,7 @@ def _file_names(names: Mapping[str, str] | None, path: Path) -> tuple[dict[str, 
                 )
             names[ours] = theirs[1:].strip()
             opposite.add(ours)
-    table = {ours: names.get(ours, ours) for ours in known}
+    table = {ours: names.get(ours, ours) for ours in allowed}
     doubled = {t for t in table.values() if list(table.values()).count(t) > 1}
     if doubled:
         raise InputError(
@@ -144,7 +144,7 @@ def wake_times(path: str | Path, names: Mapping[str, str] | None = None) -> np.n
 
 
 def _rounding(variable: xr.DataArray, values: np.ndarray) -> np.ndarray:
-    """To which the file rounds a variable's values; integers are as they were meant."""
+    """Rounding of a variable's values in the file; integers have none."""
     kind = np.dtype(variable.encoding.get("dtype", variable.dtype))
     half = np.spacing(np.abs(values).astype(kind)) / 2 if kind.kind == "f" else 0.0 * values
     return half.astype(float)
@@ -189,7 +189,7 @@ def _positive_down(
     heights: Iterable[str],
     path: Path,
 ) -> list[str]:
-    """Axes of heights that the file says to be depths, unless the sign is changed by their name."""
+    """Vertical axes that the file states to be depths, unless their name changes the sign."""
     down = [
         name
         for name in heights
@@ -300,24 +300,24 @@ def read_wake(
             raise InputError(
                 f"wake: variable {name!r} is not known; allowed: {', '.join(_VARIABLES)}"
             )
-    asked = {*_REQUIRED, *require, *(n for n in (names or {}) if n in _VARIABLES)}
+    needed = {*_REQUIRED, *require, *(n for n in (names or {}) if n in _VARIABLES)}
     with open_netcdf(path) as data:
-        return _read(data, table, sign, asked, time, x, path)
+        return _read(data, table, sign, needed, time, x, path)
 
 
-def _hint(name: str, table: Mapping[str, str], there: Iterable[Any]) -> str:
-    """How to give the name in the file, or the one there that is nearest to the name given."""
+def _hint(name: str, table: Mapping[str, str], present: Iterable[Any]) -> str:
+    """A hint: the key that gives the file's name, or the nearest name in the file."""
     if table[name] != name:
-        others = [str(one) for one in there]
-        close = difflib.get_close_matches(table[name], others, 1)
-        # a name that is nothing like those there: ours may be among them
-        close = close or ([name] if name in others else [])
+        names = [str(candidate) for candidate in present]
+        close = difflib.get_close_matches(table[name], names, 1)
+        # no similar name: ours may be among them
+        close = close or ([name] if name in names else [])
         return f"; did you mean {close[0]}?" if close else ""
     none = f", or wake.extinction.{name}: null" if name in ("tracer", "aerosol") else ""
     return f"; expected wake.names: {{{name}: its name there}}{none}"
 
 
-def _own_dims(
+def _spatial_dims(
     data: xr.Dataset, table: Mapping[str, str], name: str, spatial: Mapping[str, str]
 ) -> dict[str, str]:
     """The dimensions in space of a variable, and which of ours each is; empty: others.
@@ -342,22 +342,17 @@ def _in_the_ground(variable: xr.DataArray, height: str, path: Path) -> int:
     return 0
 
 
-def _staggered(own: Mapping[str, Mapping[str, str]], spatial: Mapping[str, str]) -> set[str]:
-    """Axes that some variable has at nodes of its own."""
-    return {ours for dims in own.values() for d, ours in dims.items() if d not in spatial}
-
-
 def _read(
     data: xr.Dataset,
     table: Mapping[str, str],
     sign: Mapping[str, float],
-    asked: Collection[str],
+    needed: Collection[str],
     time: float | None,
     x: float | None,
     path: Path,
 ) -> xr.Dataset:
     for name in _VARIABLES:
-        if name in asked and table[name] not in data.data_vars:
+        if name in needed and table[name] not in data.data_vars:
             raise InputError(
                 f"{path}: variable {table[name]!r} ({name}) is missing; it has "
                 f"{', '.join(map(str, data.data_vars)) or 'none'}"
@@ -371,35 +366,41 @@ def _read(
             )
     present = [name for name in _VARIABLES if table[name] in data.data_vars]
     spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}
-    own = {name: _own_dims(data, table, name, spatial) for name in present}
-    odd = [name for name in present if not own[name]]
-    if odd:
+    dims_of = {name: _spatial_dims(data, table, name, spatial) for name in present}
+    if unplaced := [table[name] for name in present if not dims_of[name]]:
         missing = next((n for n in ("time", "x", "y", "z") if table[n] not in data.dims), "x")
         raise InputError(
-            f"{path}: variable {table[odd[0]]!r} has the dimensions "
-            f"({', '.join(map(str, data[table[odd[0]]].dims))}); allowed: {', '.join(spatial)} "
+            f"{path}: variable {unplaced[0]!r} has the dimensions "
+            f"({', '.join(map(str, data[unplaced[0]].dims))}); allowed: {', '.join(spatial)} "
             f"and, at choice, {table['time']}, in any order, one of them staggered; expected "
             f"wake.names of the others, such as {{{missing}: its name there}}"
         )
 
     data, seconds = _pick_time(data, table["time"], time, path)
     reverse = []
-    places = {theirs: ours for dims in own.values() for theirs, ours in dims.items()} | spatial
+    places = {theirs: ours for dims in dims_of.values() for theirs, ours in dims.items()} | spatial
     down = _positive_down(data, table, sign, [d for d, ours in places.items() if ours == "z"], path)
-    found = {}
+    file_nodes = {}
     for theirs, ours in places.items():
         points = sign[ours] * (-1.0 if theirs in down else 1.0)
-        found[theirs], turned = _axis(data, theirs, ours, path, points)
+        file_nodes[theirs], turned = _axis(data, theirs, ours, path, points)
         if turned:
             reverse.append(theirs)
     data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
     for theirs in [d for d, ours in places.items() if ours == "z"]:
-        levels = [_in_the_ground(data[table[n]], theirs, path) for n in own if theirs in own[n]]
+        levels = [
+            _in_the_ground(data[table[n]], theirs, path) for n in dims_of if theirs in dims_of[n]
+        ]
         above = slice(max(levels, default=0), None)
-        data, found[theirs] = data.isel({theirs: above}), found[theirs][above]
-    axes = {ours: found[theirs] for theirs, ours in spatial.items()}
+        data, file_nodes[theirs] = data.isel({theirs: above}), file_nodes[theirs][above]
+    axes = {ours: file_nodes[theirs] for theirs, ours in spatial.items()}
     for ours in spatial.values():
-        ends = [found[d][[0, -1]] for dims in own.values() for d, o in dims.items() if o == ours]
+        ends = [
+            file_nodes[d][[0, -1]]
+            for dims in dims_of.values()
+            for d, o in dims.items()
+            if o == ours
+        ]
         low, high = max(end[0] for end in ends), min(end[1] for end in ends)
         axes[ours] = even_axis(axes[ours], low, high)
     if "x" not in axes:
@@ -418,11 +419,12 @@ def _read(
         index = _plane_index(axes["x"], x, path, table["x"])
         axes["x"] = axes["x"][index : index + 1]
         # planes that are not needed are not read
-        planes = found.get(table["x"], axes["x"])
-        if planes.size > 1 and is_even(planes) and "x" not in _staggered(own, spatial):
+        planes = file_nodes.get(table["x"], axes["x"])
+        staggered = {o for dims in dims_of.values() for d, o in dims.items() if d not in spatial}
+        if planes.size > 1 and is_even(planes) and "x" not in staggered:
             index = int(np.argmin(np.abs(planes - axes["x"][0])))
             data = data.isel({table["x"]: slice(index, index + 1)})
-            found[table["x"]] = axes["x"]
+            file_nodes[table["x"]] = axes["x"]
 
     wake = xr.Dataset(
         coords={d: (d, axes[d], {"units": "m"}) for d in ("x", "y", "z")},
@@ -438,21 +440,23 @@ def _read(
         else:
             scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
         scale *= sign.get(name, 1.0)
-        dims = sorted(own[name], key=lambda theirs: own[name][theirs])
+        dims = sorted(dims_of[name], key=lambda theirs: dims_of[name][theirs])
         variable = variable.transpose(*dims)
-        along = {own[name][theirs]: found[theirs] for theirs in dims}
+        along = {dims_of[name][theirs]: file_nodes[theirs] for theirs in dims}
         nodes = [along.get(d, axes[d]) for d in "xyz"]
         values = _numbers(variable, path).reshape([n.size for n in nodes]) * scale
-        amount = name in asked and name in ("tracer", "aerosol")
-        here = dict(zip("xyz", nodes, strict=True))
-        _check_values(values, here, table[name], path, not amount, valid_range(variable, path))
+        nonnegative = name in needed and name in ("tracer", "aerosol")
+        where = dict(zip("xyz", nodes, strict=True))
+        _check_values(
+            values, where, table[name], path, not nonnegative, valid_range(variable, path)
+        )
         low, high = values.min(), values.max()
         values, errors[name] = interpolated(values, nodes, [axes[d] for d in "xyz"])
         if name in ("tracer", "aerosol"):
             values = values.clip(low, high)
         wake[name] = ("x", "y", "z"), values, {"units": unit, "long_name": long_name}
-    if said := statement(errors, {name: wake[name].attrs["units"] for name in present}):
-        wake.attrs["interpolated"] = said
+    if note := statement(errors, {name: wake[name].attrs["units"] for name in present}):
+        wake.attrs["interpolated"] = note
     if seconds is not None:
         wake = wake.assign_coords(time=((), seconds, {"units": "s"}))
     return wake

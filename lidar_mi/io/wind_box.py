@@ -1,7 +1,7 @@
 """Boxes of wind for wind turbines: TurbSim's full fields (.bts), Mann boxes of HAWC2 (.bin).
 
-Both become a volume at rest in its mean wind, on (x, y, z): x along the wind, y to the left of who
-looks along it, z up.
+Both become a volume at rest in its mean wind, on (x, y, z): x along the wind, y to the left facing
+along it, z up.
 """
 
 import struct
@@ -42,8 +42,8 @@ def read_bts(path: str | Path) -> xr.Dataset:
     kind, nz, ny, tower, steps, dz, dy, dt, mean, _, bottom, *scales, text = _BTS_HEAD.unpack_from(
         data
     )
-    sane = kind in _BTS_KINDS and min(nz, ny, steps) > 0 and tower >= 0 and 0 <= text <= 10_000
-    if not sane or not min(dz, dy, dt) > 0:
+    plausible = kind in _BTS_KINDS and min(nz, ny, steps) > 0 and tower >= 0 and 0 <= text <= 10_000
+    if not plausible or not min(dz, dy, dt) > 0:
         raise InputError(f"{path}: no header of a TurbSim field; expected a .bts file")
     if not mean > 0:
         raise InputError(f"{path}: mean wind at the hub of {mean:g} m/s; expected above 0")
@@ -93,12 +93,12 @@ def read_mann(
         A file is missing, or its size is not that of the shape.
     """
     components = []
-    for one in mann_files(path):
-        data, expected = _content(one), 4 * int(np.prod(shape))
+    for component in mann_files(path):
+        data, expected = _content(component), 4 * int(np.prod(shape))
         if len(data) != expected:
             raise InputError(
-                f"{one}: has {len(data)} bytes; expected {expected} of {shape[0]} x {shape[1]} x "
-                f"{shape[2]} nodes"
+                f"{component}: has {len(data)} bytes; expected {expected} of "
+                f"{shape[0]} x {shape[1]} x {shape[2]} nodes"
             )
         components.append(np.frombuffer(data, "<f4").reshape(shape))
     x, y, z = (step * np.arange(nodes) for nodes, step in zip(shape, spacing, strict=True))

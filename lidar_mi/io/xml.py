@@ -1,4 +1,4 @@
-"""Scene files, looked at before Mitsuba parses them."""
+"""Scene files, checked before Mitsuba parses them."""
 
 from pathlib import Path
 from xml.parsers import expat
@@ -10,21 +10,21 @@ DEEPEST = 64
 
 
 def check_scene_file(path: str | Path) -> None:
-    """Refuse a scene that would take the process down, before anything parses it as a whole.
+    """Refuse a scene that would crash the process, before it is parsed as a whole.
 
-    Files that it includes are looked at, too.
+    Included files are checked, too.
 
     Raises
     ------
     InputError
         No XML, or tags nested deeper than `DEEPEST`.
     """
-    pending, seen = [Path(path)], set()
+    pending, checked = [Path(path)], set()
     while pending:
-        one = pending.pop().resolve()
-        if one not in seen and one.is_file():
-            seen.add(one)
-            pending += [one.parent / name for name in _included(one)]
+        file = pending.pop().resolve()
+        if file not in checked and file.is_file():
+            checked.add(file)
+            pending += [file.parent / name for name in _included(file)]
 
 
 def _included(path: Path) -> list[str]:

@@ -19,7 +19,7 @@ DEEPEST = 40
 _LARGEST_NUMBER = 10**300
 # ten times as fast where PyYAML was built with libyaml
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-# what Python raises on the text of a number or a date that is none
+# exceptions of Python for invalid numbers and dates
 _NO_VALUE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
@@ -29,7 +29,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._depth = self._count = 0
-        # values in a node, by its id; not there before the node is complete
+        # number of values in a node, by its id; absent until the node is complete
         self._sizes: dict[int, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
@@ -51,7 +51,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
             value = super().construct_object(node, deep)
-            # what is larger is no float, and cannot be shown
+            # larger integers are no floats and cannot be printed
             if not isinstance(value, int) or abs(value) < _LARGEST_NUMBER:
                 return value
         except _NO_VALUE:
@@ -61,14 +61,14 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         raise _fault(f"{one_line(text, 60)} is not of the type {kind}", node.start_mark)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+        keys = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
         data = super().construct_mapping(node, deep)
-        seen = set()
-        for key in own:
+        names = set()
+        for key in keys:
             name = self.construct_object(key, deep=True)
-            if name in seen:
+            if name in names:
                 raise _fault(f"key {one_line(repr(name), 60)} is there twice", key.start_mark)
-            seen.add(name)
+            names.add(name)
         return data
 
 

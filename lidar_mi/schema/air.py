@@ -89,13 +89,15 @@ class Gust(Section):
 
     @model_validator(mode="after")
     def _one_source_of_the_speed(self) -> Self:
-        given = [
+        sources = [
             name
             for name in ("speed", "alleviation", "maximum_altitude")
             if getattr(self, name) is not None
         ]
-        if len(given) > 1:
-            raise ValueError(f"{given[1]}: has no effect beside {given[0]}; expected one of them")
+        if len(sources) > 1:
+            raise ValueError(
+                f"{sources[1]}: has no effect beside {sources[0]}; expected one of them"
+            )
         # the regulation's range, rounded to metres
         if self.speed is None and not 9 <= self.gradient <= 107:
             raise ValueError(

@@ -37,7 +37,7 @@ NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
 
 
 def _kind_of(doppler: object) -> str:
-    """Of a Doppler lidar; an unknown one is the fault of the section of the default kind."""
+    """The kind of a Doppler lidar; the section of the default kind refuses an unknown one."""
     kind = doppler.get("kind") if isinstance(doppler, dict) else getattr(doppler, "kind", None)
     return "coherent" if kind == "coherent" else "fringes"
 
@@ -107,10 +107,10 @@ class Experiment(Tabular, Section):
 
     def tables(self) -> list[Table]:
         """Keys that differ from their defaults, as they were given."""
-        given = self.model_dump(
+        settings = self.model_dump(
             mode="json", exclude_defaults=True, exclude={"name"}, context=AS_GIVEN
         )
-        return [Table(f"experiment {self.name}; keys without their default", _rows(given))]
+        return [Table(f"experiment {self.name}; keys without their default", _rows(settings))]
 
     def read_from(self, folder: str | Path) -> "Experiment":
         """The same experiment, with another folder for the files that it names."""
@@ -165,12 +165,12 @@ class Experiment(Tabular, Section):
             raise ValueError(
                 f"{key}: not allowed with volume, which retrieves the wind in its stead"
             )
-        for key, given in (
+        for key, setting in (
             ("scan.timing", scan.timing),
             ("platform.motion", self.platform.motion),
             ("platform.reported", self.platform.reported),
         ):
-            if given is not None:
+            if setting is not None:
                 raise ValueError(
                     f"{key}: not allowed with volume, whose scans are instantaneous; expected none"
                 )
@@ -258,6 +258,6 @@ def _rows(section: dict[str, Any], above: str = "") -> list[tuple[str, str]]:
             rows += _rows(value, f"{above}{key}.")
         else:
             text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-            shown = re.sub(r"\d+\.\d+(e-?\d+)?", lambda number: f"{float(number[0]):.4g}", text)
-            rows.append((f"{above}{key}", shown))
+            rounded = re.sub(r"\d+\.\d+(e-?\d+)?", lambda number: f"{float(number[0]):.4g}", text)
+            rows.append((f"{above}{key}", rounded))
     return rows

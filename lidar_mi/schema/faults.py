@@ -1,4 +1,4 @@
-"""Faults that pydantic finds in a description, in words of who wrote it."""
+"""Faults that pydantic finds in a description, in the terms of its author."""
 
 import difflib
 import enum
@@ -28,11 +28,11 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     # a misspelt key also leaves one missing: report the misspelt one
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     where, word = _key(model, fault["loc"]), ""
-    others = [f for f in faults if f is not fault and _key(model, f["loc"]) == where]
-    if others and fault["type"] == "literal_error":
+    alternatives = [f for f in faults if f is not fault and _key(model, f["loc"]) == where]
+    if alternatives and fault["type"] == "literal_error":
         # a word or a number: report the number's fault
         word = fault["ctx"]["expected"] + " or "
-        fault = others[0]
+        fault = alternatives[0]
     field = ".".join(where)
     message = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
@@ -51,19 +51,19 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
         _metadata_at(model, fault["loc"], Within),
     )
     symbol = unit.symbol if unit else ""
-    shown = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
+    text = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
     if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
         if unit and not isinstance(value, float):
-            # as it was understood, with its unit
-            shown = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
+            # the interpreted value, with its unit
+            text = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
         expected = word + within.words(symbol)
         if symbol == "rad" and isinstance(value, str):
             # angles in the unit in which they were given
-            given = re.fullmatch(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*([a-zA-Z]+)\s*", value)
-            if given:
-                shown = " ".join(value.split())
-                size = to_si(f"1 {given[1]}", symbol, unit.example)
-                expected = word + within.words(given[1], 1 / size)
+            angle = re.fullmatch(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*([a-zA-Z]+)\s*", value)
+            if angle:
+                text = " ".join(value.split())
+                size = to_si(f"1 {angle[1]}", symbol, unit.example)
+                expected = word + within.words(angle[1], 1 / size)
     elif fault["type"].startswith("model_"):
         expected = f"a section with keys out of {', '.join(_keys_at(model, fault['loc']))}"
     elif fault["type"] == "string_pattern_mismatch":
@@ -80,13 +80,13 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
         expected = f"{fault['ctx']['min_length']} or more"
     else:
         expected = word + message.removeprefix("Input should be ")
-    return f"{field}: {shown} is not allowed; expected {expected}"
+    return f"{field}: {text} is not allowed; expected {expected}"
 
 
 def _steps(
     model: type[BaseModel], location: tuple[int | str, ...]
 ) -> Iterator[tuple[int | str, Any, Any, bool]]:
-    """Of each part of a location: it, the field and the section there, whether it is a tag."""
+    """Each part of a location, with its field and section, and whether it is a tag."""
     field: Any = None
     section: Any = model
     for part in location:
@@ -110,7 +110,7 @@ def _key(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
 
 
 def _metadata_at(model: type[BaseModel], location: tuple[int | str, ...], kind: type) -> Any:
-    """The part of a kind in the annotation of the key at a location; None if there is none."""
+    """Metadata of a type in the annotation of the key at a location; None without any."""
     field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     pending = [field.annotation, *field.metadata] if field else []
     while pending:
@@ -125,19 +125,19 @@ def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:
     """How many values a list at a location has; 1: any number."""
     field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     annotation: Any = field.annotation if field else None
-    for one in (annotation, *get_args(annotation)):
-        if get_origin(one) is tuple and Ellipsis not in get_args(one):
-            return len(get_args(one))
+    for kind in (annotation, *get_args(annotation)):
+        if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
+            return len(get_args(kind))
     return 1
 
 
 def _words_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The words that members of the list at a location may be; empty: others than words."""
+    """The words allowed in the list at a location; empty: its members are no words."""
     field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     members = get_args(field.annotation) if field else ()
     kind = members[0] if members else None
     words: tuple[Any, ...] = tuple(kind) if isinstance(kind, enum.EnumType) else ()
-    return [str(one) for one in words]
+    return [str(member) for member in words]
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

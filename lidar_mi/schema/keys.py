@@ -1,6 +1,6 @@
 """The keys of an experiment file in words: what each does, its unit, its default, what is allowed.
 
-All of it is read from the descriptions, which check a file by it.
+It is read from the models that check a file.
 """
 
 import difflib
@@ -61,7 +61,7 @@ class Key:
         """The default; empty: those of a section's keys."""
         if self.value is PydanticUndefined:
             return "required"
-        return "" if isinstance(self.value, BaseModel) else _shown(self.value, self.unit)
+        return "" if isinstance(self.value, BaseModel) else _as_in_a_file(self.value, self.unit)
 
     @property
     def example(self) -> str:
@@ -81,9 +81,12 @@ def names() -> list[str]:
 
 
 def settable() -> list[str]:
-    """Those that ``--set`` can change one at a time: no sections, nor keys of lists of sections."""
-    found = _fields()
-    return [name for name, (_, field, within) in found.items() if not within and _is_leaf(field)]
+    """Keys that ``--set`` can change: no sections, nor keys of lists of sections."""
+    return [
+        name
+        for name, (_, field, within) in _fields().items()
+        if not within and section_in(field.annotation) is None
+    ]
 
 
 def explain(name: str) -> Key:
@@ -152,7 +155,7 @@ class Kind:
 
 
 def kinds(name: str) -> tuple[Kind, ...]:
-    """Those of a section; none: it has no key ``kind`` that chooses its keys."""
+    """The kinds of a section; none: it has no key ``kind`` that chooses its keys."""
     annotation = _fields()[name][1].annotation
     if f"{name}.kind" not in _fields():
         return ()
@@ -172,11 +175,11 @@ def sections() -> tuple[str, ...]:
 @cache
 def _fields() -> Mapping[str, tuple[type[BaseModel], FieldInfo, str]]:
     """Of every key: the section that has it, its field, and the list of sections that it is in."""
-    found: dict[str, tuple[type[BaseModel], FieldInfo, str]] = {}
-    for name, one in _walk(Experiment, "", ""):
+    fields: dict[str, tuple[type[BaseModel], FieldInfo, str]] = {}
+    for name, entry in _walk(Experiment, "", ""):
         # of the kinds of a section, the first one describes the keys that they share
-        found.setdefault(name, one)
-    return found
+        fields.setdefault(name, entry)
+    return fields
 
 
 def _walk(
@@ -196,25 +199,21 @@ def _is_list(field: FieldInfo) -> bool:
     )
 
 
-def _is_leaf(field: FieldInfo) -> bool:
-    return section_in(field.annotation) is None
-
-
 def _nearest(name: str, fields: Mapping[str, object]) -> list[str]:
-    """Keys that end with these levels, that begin so, or the one that is written most alike."""
+    """Keys that end with these levels or begin with them, or the most similar one."""
     ends = [key for key in fields if key.endswith(f".{name}")]
     ends = ends or [key for key in fields if key.startswith(name)]
     return ends[:_MOST_SUGGESTED] or difflib.get_close_matches(name, [*fields, *OF_A_FILE], 1)
 
 
 def _paragraphs(model: type[BaseModel]) -> tuple[str, ...]:
-    """Those of a section's documentation, each as one line."""
+    """Paragraphs of a section's documentation, each as one line."""
     text = inspect.cleandoc(model.__doc__ or "")
     return tuple(" ".join(part.replace("``", "`").split()) for part in text.split("\n\n"))
 
 
 def _first(field: FieldInfo, kind: type) -> Any:
-    """The first part of a kind in the annotation of a key; None if there is none."""
+    """Metadata of a type in the annotation of a key; None without any."""
     pending = [*field.metadata, field.annotation]
     while pending:
         part = pending.pop(0)
@@ -224,7 +223,7 @@ def _first(field: FieldInfo, kind: type) -> Any:
     return None
 
 
-def _shown(value: Any, symbol: str) -> str:
+def _as_in_a_file(value: Any, symbol: str) -> str:
     """A value as a file would have it, numbers in their usual unit."""
     if isinstance(value, Enum):
         return str(value.value)
@@ -232,12 +231,12 @@ def _shown(value: Any, symbol: str) -> str:
         plain = not symbol or value == 0 or not math.isfinite(value)
         return f"{value:.6g}" if plain else usual(value, symbol)
     if isinstance(value, tuple | list):
-        return f"[{', '.join(_shown(one, symbol) for one in value)}]"
+        return f"[{', '.join(_as_in_a_file(member, symbol) for member in value)}]"
     return value if isinstance(value, str) else to_yaml_line(value)
 
 
 def _words(annotation: Any) -> Iterator[str]:
-    """Words that a key may have as its value, those in lists aside."""
+    """Words allowed as the value of a key, except those in lists."""
     if get_origin(annotation) is Literal:
         yield from (str(word) for word in get_args(annotation))
     elif annotation is bool:
@@ -282,7 +281,7 @@ def _allowed(annotation: Any, metadata: Any, symbol: str) -> list[str]:
 
 
 def _list_of(parts: tuple[Any, ...], symbol: str) -> str:
-    """A list of any length, or of as many values as it has parts."""
+    """A list of any length, or with one value for each of its parts."""
     each = ", ".join(_allowed(parts[0], (), symbol))
     if Ellipsis in parts:
         return f"a list of {each}" if section_in(parts[0]) is None else "a list of sections"

@@ -41,7 +41,7 @@ def new_file(name: str, shipped: str, path: Path, command: str) -> str:
         YAML, with a comment on every key and the names of the keys that a section has besides.
     """
     data = read_keys(path) | {"name": name}
-    # the paper's air is that of the shipped experiments; one's own is real
+    # shipped experiments have the paper's air; a user's has molecules
     real = data.get("wake", {}).get("extinction", {}).get("molecules") == 0
     if real:
         data["wake"]["extinction"]["molecules"] = "auto"
@@ -61,35 +61,35 @@ def new_file(name: str, shipped: str, path: Path, command: str) -> str:
     lines += ["", *_comment(f"more sections: {', '.join(absent)} (lidar-mi explain SECTION)", 0)]
     if variants:
         lines += ["", *_comment(OF_A_FILE["variants"], 0), "variants:"]
-        seen: set[str] = set()
+        explained: set[str] = set()
         for variant, changes in variants.items():
             start = f"  {variant}:" if changes else f"  {variant}: {{}}"
-            lines += [start, *_section(changes, "", 4, seen, more=False)]
+            lines += [start, *_section(changes, "", 4, explained, more=False)]
     return head + "\n".join(lines) + "\n"
 
 
 def _section(
-    data: dict[str, Any], above: str, indent: int, seen: set[str], *, more: bool = True
+    data: dict[str, Any], above: str, indent: int, explained: set[str], *, more: bool = True
 ) -> Iterator[str]:
     """Lines of a section: its keys with what they do, and the names of others.
 
-    Keys that are in ``seen`` are not explained again.
+    Keys that are in ``explained`` are not explained again.
     """
     for key, value in data.items():
-        known = explain(f"{above}{key}")
+        entry = explain(f"{above}{key}")
         start = f"{' ' * indent}{key}:"
-        about = "" if known.name in seen else known.meaning
-        seen.add(known.name)
-        if indent == 0 and known.keys:
+        about = "" if entry.name in explained else entry.meaning
+        explained.add(entry.name)
+        if indent == 0 and entry.keys:
             yield ""
-        if isinstance(value, dict) and value and known.keys:
+        if isinstance(value, dict) and value and entry.keys:
             yield from _with_comment(start, about)
-            yield from _section(value, f"{known.name}.", indent + 2, seen, more=more)
+            yield from _section(value, f"{entry.name}.", indent + 2, explained, more=more)
         else:
             yield from _with_comment(f"{start} {to_yaml_line(value)}", about)
-    others = [name for name in keys_of(above[:-1], data) if name not in seen]
-    if more and others:
-        last = ", ".join(name.rpartition(".")[2] for name in others)
+    remaining = [name for name in keys_of(above[:-1], data) if name not in explained]
+    if more and remaining:
+        last = ", ".join(name.rpartition(".")[2] for name in remaining)
         yield from _comment(f"more: {last}", indent)
 
 

@@ -70,19 +70,21 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
     path = experiment_file(name)
     variants = load_variants(path)
     if variant not in (variants or (None,)):
-        wanted = f"one of {', '.join(variants)}" if variants else f"none, as {name} has no variants"
-        raise InputError(f"variant: {variant!r} is not allowed; expected {wanted}")
-    found = variants[str(variant)] if variants else load(path)
+        expected = (
+            f"one of {', '.join(variants)}" if variants else f"none, as {name} has no variants"
+        )
+        raise InputError(f"variant: {variant!r} is not allowed; expected {expected}")
+    experiment = variants[str(variant)] if variants else load(path)
     if changes:
-        # keys that the file does not have stay defaults: checks tell them from chosen ones
-        data = settings(found) if variants else read_keys(path)
+        # keys that the file lacks remain defaults: checks distinguish them from set ones
+        data = settings(experiment) if variants else read_keys(path)
         for key, value in changes.items():
             # a.b: x is {a: {b: x}}, built from the inside
             for part in reversed(key.split(".")):
                 value = {part: value}
             data = merged(data, value)
-        found = check(data, str(name))
-    return found.read_from(path.parent)
+        experiment = check(data, str(name))
+    return experiment.read_from(path.parent)
 
 
 def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
@@ -117,22 +119,22 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
         As `load`, with the variant's name; no variants, or one that is no section.
     """
     data = read_keys(path)
-    own = [text for text in overrides or [] if text.strip().startswith("variants.")]
-    if "variants" not in data and not own:
+    of_variants = [text for text in overrides or [] if text.strip().startswith("variants.")]
+    if "variants" not in data and not of_variants:
         return {}
-    for override in own:
+    for override in of_variants:
         _override(data, override)
     variants = data.pop("variants")
     if not isinstance(variants, dict) or not variants:
         raise InputError(f"{path}: variants: {variants!r} is not allowed; expected names with keys")
-    found = {}
+    experiments = {}
     for name, changes in variants.items():
         place = f"{path}: variants.{name}"
         if not re.fullmatch(NAME, str(name)):
             raise InputError(
                 f"{place}: not allowed; expected a name of at most 100 letters, digits, _, . and -"
             )
-        if str(name) in found:
+        if str(name) in experiments:
             raise InputError(f"{place}: not allowed; another variant has this name")
         if str(name).lower() in RESERVED_NAMES:
             raise InputError(f"{place}: not allowed; a file of the study has this name")
@@ -142,34 +144,34 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
             raise InputError(f"{place}.name: not allowed; the variant is its name")
         changed = merged(data, changes)
         for override in overrides or []:
-            if override not in own:
+            if override not in of_variants:
                 _override(changed, override)
         if isinstance(changed.get("name"), str):
             changed["name"] += f".{name}"
-        found[str(name)] = check(changed, place)
-    return found
+        experiments[str(name)] = check(changed, place)
+    return experiments
 
 
 def merged(data: Any, changes: dict[str, Any]) -> dict[str, Any]:
     """``data`` with ``changes``, section by section; null removes. Both remain unchanged."""
-    found = copy.deepcopy(data)
+    result = copy.deepcopy(data)
     for key, value in changes.items():
-        inner = found.get(key)
+        inner = result.get(key)
         if value is None and isinstance(inner, dict):
-            del found[key]
+            del result[key]
             continue
-        both = isinstance(inner, dict) and isinstance(value, dict)
-        found[key] = merged(inner, value) if both else copy.deepcopy(value)
-    return found
+        nested = isinstance(inner, dict) and isinstance(value, dict)
+        result[key] = merged(inner, value) if nested else copy.deepcopy(value)
+    return result
 
 
 def read_keys(path: str | Path) -> dict[str, Any]:
-    """The keys of an experiment file as they stand, over those of its ``base`` if it has one."""
+    """The keys of an experiment file, merged into those of its ``base`` if it has one."""
     return _read_keys(Path(path), ())
 
 
 def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
-    """The same of a file that those ``above`` are based on."""
+    """`read_keys` of a file that those ``above`` are based on."""
     if path.suffix == ".xml":
         raise InputError(
             f"{path}: a Mitsuba scene, not an experiment; expected lidar-mi render {path}"
@@ -197,8 +199,8 @@ def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
         )
     base = data.pop("base")
     if not isinstance(base, str) or len(base) > _LONGEST_NAME or "\0" in base:
-        shown = repr(base)[:60]
-        raise InputError(f"{path}: base: {shown} is not allowed; expected an experiment's name")
+        text = repr(base)[:60]
+        raise InputError(f"{path}: base: {text} is not allowed; expected an experiment's name")
     sibling = path.parent / base
     file = sibling if sibling.is_file() else experiment_file(base)
     # links and relative paths may lead to the same file
@@ -238,21 +240,21 @@ def settings(experiment: Experiment, *, si: bool = False) -> dict[str, Any]:
     return experiment.model_dump(mode="json", exclude=unused, context=context)
 
 
-def in_si(given: dict[str, Any]) -> dict[str, Any]:
+def in_si(data: dict[str, Any]) -> dict[str, Any]:
     """The `settings` of an experiment in SI units: equal for equal experiments."""
     # the cache must not be changed by a caller
-    return copy.deepcopy(_in_si(json.dumps(given)))
+    return copy.deepcopy(_in_si(json.dumps(data)))
 
 
 @functools.lru_cache(64)
 def _in_si(text: str) -> dict[str, Any]:
-    """The same of their JSON: a run asks once for each of its stages."""
-    # text, as dictionaries are no keys of a cache
-    given = json.loads(text)
+    """`in_si` of the JSON, cached: every stage of a run needs it."""
+    # as text, since a cache has no dictionaries as keys
+    data = json.loads(text)
     try:
-        return settings(check(given, ""), si=True)
-    except InputError:  # of a version that knew other keys
-        return given
+        return settings(check(data, ""), si=True)
+    except InputError:  # of a version with other keys
+        return data
 
 
 def _override(data: dict[str, Any], text: str) -> None:

@@ -54,7 +54,7 @@ class Reference(Section):
 
 
 class Assumed(Section):
-    """What the retrieval takes for the instrument's, where that is not the true value."""
+    """Values that the retrieval assumes for the instrument in place of the true ones."""
 
     focal_length: Annotated[Length, Within(0.001, 100, "as of the camera")] | None = Field(
         None, description="taken by the retrieval in place of the true one; default: the true one"
@@ -87,12 +87,14 @@ class Assumed(Section):
         None, description="taken by the retrieval in place of the true one; default: the true one"
     )
 
-    def of(self, described: _Part) -> _Part:
+    def of(self, part: _Part) -> _Part:
         """A part of the instrument with the assumed values in place of its own."""
-        given = self.model_dump(exclude_none=True)
+        assumed = self.model_dump(exclude_none=True)
         # etalon and camera each have some of the assumed values
-        own = {name: value for name, value in given.items() if name in type(described).model_fields}
-        return described.model_copy(update=own)
+        fitting = {
+            name: value for name, value in assumed.items() if name in type(part).model_fields
+        }
+        return part.model_copy(update=fitting)
 
 
 class RingCalibration(Section):

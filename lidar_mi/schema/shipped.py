@@ -12,7 +12,7 @@ from lidar_mi.io.yaml import read_yaml
 
 
 class _Kind(NamedTuple):
-    """What a file is called, and where those of the package are."""
+    """Name of a kind of file, and its folder in the package."""
 
     called: str
     folder: str
@@ -38,22 +38,22 @@ def experiments() -> list[str]:
 
 
 def flights() -> list[str]:
-    """Those of `experiments` that are flights: with the section ``encounter``, or on such a one."""
-    found: set[str] = set()
-    held = {
+    """The `experiments` that are flights: with the section ``encounter``, or based on a flight."""
+    names: set[str] = set()
+    data_of = {
         name: read_yaml(_folder(_EXPERIMENT) / f"{name}.yaml", "an experiment")
         for name in experiments()
     }
     while more := {
         name
-        for name, data in held.items()
-        if name not in found and ("encounter" in data or data.get("base") in found)
+        for name, data in data_of.items()
+        if name not in names and ("encounter" in data or data.get("base") in names)
     }:
-        found |= more
-    return sorted(found)
+        names |= more
+    return sorted(names)
 
 
-def described(name: str) -> tuple[str, str]:
+def question_and_needs(name: str) -> tuple[str, str]:
     """The question of a shipped experiment or campaign, and what it needs.
 
     They are the first two lines of its file, ``# QUESTION`` and ``# Needs NEEDS.``.
@@ -63,7 +63,7 @@ def described(name: str) -> tuple[str, str]:
     InputError
         There is none of this name.
     """
-    path = _found_shipped(name, [_EXPERIMENT, _CAMPAIGN])
+    path = _shipped_of(name, [_EXPERIMENT, _CAMPAIGN])
     question, needs = read_text(path, "an experiment file").splitlines()[:2]
     return question.removeprefix("# "), needs.removeprefix("# Needs ").removesuffix(".")
 
@@ -81,7 +81,7 @@ def instrument_file(name: str) -> Path:
     InputError
         There is none of this name; the message lists them.
     """
-    return _found_shipped(name, [_INSTRUMENT])
+    return _shipped_of(name, [_INSTRUMENT])
 
 
 def shipped_file(name: str) -> Path:
@@ -92,7 +92,7 @@ def shipped_file(name: str) -> Path:
     InputError
         There is none of this name; the message lists them.
     """
-    return _found_shipped(name, [_EXPERIMENT])
+    return _shipped_of(name, [_EXPERIMENT])
 
 
 def scenes() -> list[str]:
@@ -122,18 +122,18 @@ def experiment_file(name: str | Path) -> Path:
     InputError
         Neither a file nor a shipped experiment.
     """
-    return _found(name, [_EXPERIMENT])
+    return _file_of(name, [_EXPERIMENT])
 
 
 def campaign_file(name: str | Path) -> Path:
-    """The same of a campaign, or of an experiment, whose variants are one.
+    """As `experiment_file`, for a campaign, or for an experiment with variants.
 
     Raises
     ------
     InputError
         There is none.
     """
-    return _found(name, [_CAMPAIGN, _EXPERIMENT])
+    return _file_of(name, [_CAMPAIGN, _EXPERIMENT])
 
 
 def scene_file(name: str | Path) -> Path:
@@ -161,20 +161,20 @@ def scene_file(name: str | Path) -> Path:
     >>> lm.scene_file("slab").name
     'slab.xml'
     """
-    return _found(name, [_SCENE])
+    return _file_of(name, [_SCENE])
 
 
-def _found(name: str | Path, kinds: Sequence[_Kind]) -> Path:
+def _file_of(name: str | Path, kinds: Sequence[_Kind]) -> Path:
     path = Path(name)
     try:
         if path.is_file():
             return path
     except OSError as error:  # a name that is too long
         raise InputError(f"{name}: {error.strerror}; expected {kinds[0].called}") from None
-    return _found_shipped(name, kinds)
+    return _shipped_of(name, kinds)
 
 
-def _found_shipped(name: str | Path, kinds: Sequence[_Kind]) -> Path:
+def _shipped_of(name: str | Path, kinds: Sequence[_Kind]) -> Path:
     path = Path(name)
     for kind in kinds:
         file = path.name if path.suffix == kind.suffix else f"{path.name}{kind.suffix}"
@@ -186,7 +186,7 @@ def _found_shipped(name: str | Path, kinds: Sequence[_Kind]) -> Path:
     )
     hint = f"did you mean {close[0]}? Expected" if close else "expected"
     names = ", ".join(_names(kinds[0]))
-    # those of the package have no files of one's own beside them
+    # instruments are only those of the package
     if kinds == [_INSTRUMENT]:
         raise InputError(f"{name}: no such instrument; {hint} one of {names}")
     raise InputError(f"{name}: no such file; {hint} {kinds[0].called} or one of {names}")

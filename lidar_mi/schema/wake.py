@@ -61,7 +61,7 @@ class VortexPair(Section):
 
     @field_validator("aircraft")
     @classmethod
-    def _known(cls, value: str | None) -> str | None:
+    def _check_aircraft(cls, value: str | None) -> str | None:
         if value is not None and value not in TYPES:
             raise ValueError(f"{value!r} is not allowed; expected one of {', '.join(TYPES)}")
         return value
@@ -70,7 +70,7 @@ class VortexPair(Section):
     def _of_the_aircraft(self) -> Self:
         if self.aircraft is None:
             for name in ("mass", "speed", "altitude"):
-                # a description that was saved has all defaults
+                # a saved description has all defaults
                 if getattr(self, name) != type(self).model_fields[name].default:
                     raise ValueError(f"{name}: not allowed without aircraft")
             return self
@@ -168,17 +168,17 @@ class ExtinctionMapping(Section):
     def _above_the_background(self) -> Self:
         if self.maximum > self.background:
             return self
-        named, other = "maximum", "background"
+        name, bound = "maximum", "background"
         # a number without a unit is per metre
         slip = not isinstance(self.background, Given) and 1e-3 * self.background < self.maximum
         if slip or "maximum" not in self.model_fields_set:
-            named, other = other, named
-        value, limit = 1e3 * getattr(self, named), 1e3 * getattr(self, other)
-        side = "more" if named == "maximum" else "less"
-        meant = f": is {1e-3 * value:g} / km meant?" if slip else ""
+            name, bound = bound, name
+        value, limit = 1e3 * getattr(self, name), 1e3 * getattr(self, bound)
+        side = "more" if name == "maximum" else "less"
+        hint = f": is {1e-3 * value:g} / km meant?" if slip else ""
         raise ValueError(
-            f"{named}: {value:g} / km is not allowed; expected {side} than {other}, {limit:g} / km"
-            f"{meant}"
+            f"{name}: {value:g} / km is not allowed; expected {side} than {bound}, {limit:g} / km"
+            f"{hint}"
         )
 
 

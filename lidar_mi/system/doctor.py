@@ -1,6 +1,6 @@
-"""What this machine can run, and what to type where it cannot.
+"""What this machine can run, and the commands that repair the rest.
 
-Everything that could crash, hang or take an abort from LLVM is tried in a process of its own.
+Whatever could crash, hang or be aborted by LLVM is tried in a separate process.
 """
 
 import os
@@ -31,7 +31,7 @@ LLVM_VARIANTS = (
 CUDA_VARIANT = "cuda_ad_mono_polarized"
 DEFAULT_VARIANT = "llvm_ad_mono_polarized"
 
-MEMORY_NEEDED = 2 * GIB  # a full scan with all its kernels stays below
+MEMORY_NEEDED = 2 * GIB  # more than a full scan with all its kernels needs
 DISK_NEEDED = 1 * GIB
 
 # Random numbers, a recorded loop and a scatter with a known sum, then a render: the first shows
@@ -122,9 +122,9 @@ class Checkup(Tabular):
     def tables(self) -> list[Table]:
         """A line for each check, then what to type."""
         marks = {True: "ok", False: "FAILED", None: "-"}
-        found = [(marks[c.ok], c.name, c.detail) for c in self.checks]
-        verdict = f"{len(self.failed)} of {len(found)} checks failed"
-        tables = [Table(verdict if self.failed else "all checks passed", found)]
+        rows = [(marks[c.ok], c.name, c.detail) for c in self.checks]
+        verdict = f"{len(self.failed)} of {len(rows)} checks failed"
+        tables = [Table(verdict if self.failed else "all checks passed", rows)]
         remedies = [
             ("to repair" if c.ok is False else "optional", c.name, c.remedy)
             for c in self.checks
@@ -159,7 +159,8 @@ def doctor() -> Checkup:
     checks = [_check_python(), *_check_dependencies(), _check_llvm()]
     with ThreadPoolExecutor(max_workers=_cores()) as pool:
         checks += pool.map(lambda trial: trial(), trials)
-    checks += [_check_cores(), _check_memory(), _check_disk(), _check_exr_tools()]
+    checks.append(Check("cores", True, f"{_cores()} usable of {os.cpu_count()}"))
+    checks += [_check_memory(), _check_disk(), _check_exr_tools()]
     return Checkup(tuple(checks))
 
 
@@ -176,11 +177,11 @@ def _check_python() -> Check:
 
 def _check_dependencies() -> list[Check]:
     try:
-        stated = metadata.requires("lidar-mi") or []
+        lines = metadata.requires("lidar-mi") or []
     except metadata.PackageNotFoundError:
-        return []  # the line about Python has said so
-    wanted = [Requirement(line) for line in stated]
-    return [_check_dependency(r) for r in wanted if r.marker is None or r.marker.evaluate()]
+        return []  # the line about Python states it
+    requirements = [Requirement(line) for line in lines]
+    return [_check_dependency(r) for r in requirements if r.marker is None or r.marker.evaluate()]
 
 
 def _check_dependency(requirement: Requirement) -> Check:
@@ -232,7 +233,7 @@ def _install_command() -> str:
 
 
 def _attempt(code: str, *arguments: str, timeout: float = 180.0) -> tuple[bool, str]:
-    """Run code in a fresh interpreter: whether it succeeded, and the last line it said."""
+    """Run code in a fresh interpreter: whether it succeeded, and its last line."""
     # -P: a file named like a module in the working folder must not be imported instead of it.
     command = [sys.executable, "-P", "-c", code, *arguments]
     try:
@@ -254,30 +255,30 @@ def _last_line(text: str) -> str:
 
 
 def _check_variant(variant: str) -> Check:
-    ok, said = _attempt(_TRY_VARIANT, variant)
+    ok, message = _attempt(_TRY_VARIANT, variant)
     if ok:
         return Check(variant, True, "computes and renders")
     remedy = _install_llvm() if llvm.check_llvm() else _reinstall("mitsuba", "drjit")
-    return Check(variant, False, said, remedy)
+    return Check(variant, False, message, remedy)
 
 
 def _check_cuda() -> Check:
-    ok, said = _attempt(_TRY_VARIANT, CUDA_VARIANT)
+    ok, message = _attempt(_TRY_VARIANT, CUDA_VARIANT)
     if ok:
         return Check(CUDA_VARIANT, True, "computes and renders")
     if shutil.which("nvidia-smi") is None and not Path("/dev/nvidiactl").exists():
         return Check(CUDA_VARIANT, None, "no NVIDIA GPU here; llvm_* variants do everything")
     remedy = "nvidia-smi (a driver as new as Dr.Jit and OptiX ask for must be running)"
-    return Check(CUDA_VARIANT, None, f"a GPU is here but does not serve: {said}", remedy)
+    return Check(CUDA_VARIANT, None, f"a GPU is here but does not serve: {message}", remedy)
 
 
 def _check_plugins() -> Check:
     name = "plugins"
-    ok, said = _attempt(_TRY_PLUGINS, DEFAULT_VARIANT)
+    ok, message = _attempt(_TRY_PLUGINS, DEFAULT_VARIANT)
     if ok:
         return Check(name, True, f"registered in {DEFAULT_VARIANT}")
     remedy = _install_llvm() if llvm.check_llvm() else _reinstall("lidar-mi")
-    return Check(name, False, said, remedy)
+    return Check(name, False, message, remedy)
 
 
 def _reinstall(*packages: str) -> str:
@@ -291,29 +292,25 @@ def _reinstall(*packages: str) -> str:
 
 
 def _check_torch() -> Check:
-    ok, said = _attempt(_TRY_TORCH)
-    return Check("torch computes", ok, said, "" if ok else _reinstall("torch"))
+    ok, message = _attempt(_TRY_TORCH)
+    return Check("torch computes", ok, message, "" if ok else _reinstall("torch"))
 
 
 def _check_device() -> Check:
-    ok, said = _attempt(_TRY_DEVICE)
-    return Check("device", ok, said, "" if ok else _reinstall("torch", "drjit"))
+    ok, message = _attempt(_TRY_DEVICE)
+    return Check("device", ok, message, "" if ok else _reinstall("torch", "drjit"))
 
 
 def _check_netcdf() -> Check:
-    ok, said = _attempt(_TRY_NETCDF)
+    ok, message = _attempt(_TRY_NETCDF)
     remedy = "" if ok else f"{sys.executable} -m pip install h5py h5netcdf"
-    return Check("NetCDF files", ok, said, remedy)
+    return Check("NetCDF files", ok, message, remedy)
 
 
 def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _check_cores() -> Check:
-    return Check("cores", True, f"{_cores()} usable of {os.cpu_count()}")
 
 
 def _check_memory() -> Check:
@@ -325,14 +322,16 @@ def _check_memory() -> Check:
 
 
 def _check_disk() -> Check:
-    here = Path.cwd()
-    free = shutil.disk_usage(here).free
-    if not os.access(here, os.W_OK):
-        detail = f"{here} cannot be written to"
+    folder = Path.cwd()
+    free = shutil.disk_usage(folder).free
+    if not os.access(folder, os.W_OK):
+        detail = f"{folder} cannot be written to"
         return Check("disk", False, detail, "lidar-mi run EXPERIMENT.yaml -o A_WRITABLE_FOLDER")
     ok = free >= DISK_NEEDED
-    detail = f"{free / GIB:.1f} GiB free in {here} (needs {DISK_NEEDED // GIB})"
-    return Check("disk", ok, detail, "" if ok else f'du -sh "{here}"/outputs/*   (remove old runs)')
+    detail = f"{free / GIB:.1f} GiB free in {folder} (needs {DISK_NEEDED // GIB})"
+    return Check(
+        "disk", ok, detail, "" if ok else f'du -sh "{folder}"/outputs/*   (remove old runs)'
+    )
 
 
 def _check_exr_tools() -> Check:

@@ -55,14 +55,14 @@ def library_folders() -> list[Path]:
     ]
     folders = []
     for pattern in patterns:
-        root, _, rest = pattern.partition("*")
-        if rest:
+        root, _, tail = pattern.partition("*")
+        if tail:
             parent, stem = os.path.split(root)
-            middle, _, last = rest.partition("/")
-            found = sorted(Path(parent).glob(f"{stem}*{middle}/{last}"))
+            middle, _, last = tail.partition("/")
+            matches = sorted(Path(parent).glob(f"{stem}*{middle}/{last}"))
         else:
-            found = [Path(pattern)]
-        folders += [folder for folder in found if folder.is_dir()]
+            matches = [Path(pattern)]
+        folders += [folder for folder in matches if folder.is_dir()]
     return list(dict.fromkeys(folders))
 
 
@@ -86,13 +86,13 @@ def find_llvm(folders: Iterable[str | os.PathLike[str]] | None = None) -> list[t
     By default in :func:`library_folders`; each file once (links resolved), without links to
     nowhere.
     """
-    found: dict[Path, int] = {}
+    versions: dict[Path, int] = {}
     for folder in library_folders() if folders is None else folders:
         for path in sorted(Path(folder).glob("libLLVM*")):
             version = version_of(path)
             if version is not None and path.is_file():
-                found.setdefault(path.resolve(), version)
-    return sorted(found.items(), key=lambda item: -item[1])
+                versions.setdefault(path.resolve(), version)
+    return sorted(versions.items(), key=lambda item: -item[1])
 
 
 def select_llvm(
@@ -126,7 +126,7 @@ def check_llvm(
 
     The library is opened and asked for its version, so a file whose name lies is found out.
     """
-    choice = select_llvm(folders, dict(environ))  # a copy: judging changes nothing
+    choice = select_llvm(folders, dict(environ))  # a copy: the check changes nothing
     if not choice:
         return None
     if choice == NOT_FOUND:
@@ -174,9 +174,9 @@ def require_llvm() -> None:
 
 
 def _nothing_suitable(folders: Iterable[str | os.PathLike[str]] | None) -> str:
-    found = ", ".join(f"{path} (LLVM {version})" for path, version in find_llvm(folders))
+    libraries = ", ".join(f"{path} (LLVM {version})" for path, version in find_llvm(folders))
     return (
-        f"libLLVM: found {found or 'none'}, Dr.Jit needs {MINIMUM_VERSION} or newer; "
+        f"libLLVM: found {libraries or 'none'}, Dr.Jit needs {MINIMUM_VERSION} or newer; "
         f"install one ({INSTALL}) or set {VARIABLE}"
     )
 

@@ -1,4 +1,4 @@
-"""The machine's memory, as far as a process may have it."""
+"""The memory that a process of this machine may have."""
 
 import os
 import subprocess
@@ -25,13 +25,15 @@ def available_memory() -> int:
 def gpu_memory() -> int:
     """Bytes that are free on the GPU that renders: by the driver's tool, or else by torch.
 
-    Where neither says it, `UNKNOWN_GPU`.
+    If neither states it, `UNKNOWN_GPU`.
     """
-    asked = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0] or "0"
-    query = ["nvidia-smi", "-i", asked, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
+    device = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0] or "0"
+    query = ["nvidia-smi", "-i", device, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
     try:
-        said = subprocess.run(query, check=True, capture_output=True, text=True, timeout=20).stdout
-        return int(said.split()[0]) << 20
+        output = subprocess.run(
+            query, check=True, capture_output=True, text=True, timeout=20
+        ).stdout
+        return int(output.split()[0]) << 20
     except (OSError, subprocess.SubprocessError, ValueError, IndexError):
         import torch
 

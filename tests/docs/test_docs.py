@@ -296,7 +296,7 @@ def _value(name, model, *given):
 
 @pytest.mark.parametrize("name", [*shipped.experiments(), *shipped.campaigns()])
 def test_an_experiment_has_the_question_of_its_file(name):
-    question = shipped.described(name)[0]
+    question = shipped.question_and_needs(name)[0]
     row = f"| [{name}]({name}.md) | {question[0].lower()}{question[1:]} |"
     assert row in (DOCS / "experiments" / "index.md").read_text().splitlines()
 

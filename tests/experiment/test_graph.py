@@ -18,7 +18,18 @@ import numpy as np
 import pytest
 
 from lidar_mi.experiment import pipeline
-from lidar_mi.experiment.graph import But, Graph, Guard, Only, Stage, parameters, section_path
+from lidar_mi.experiment.graph import (
+    _BUNDLES,
+    But,
+    Graph,
+    Guard,
+    Only,
+    Stage,
+    bundle,
+    call,
+    parameters,
+    section_path,
+)
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import STAGES, Results, stages_of
 from lidar_mi.experiment.run import complete, prepare, run
@@ -41,6 +52,16 @@ def hints(typed):
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             exec(ast.unparse(node.body), known)
     return get_type_hints(typed, known, known)
+
+
+def leaves(function):
+    """The types of a function's parameters, of a bundle those of its fields."""
+    typed = hints(function)
+    found = {}
+    for name, kind in typed.items():
+        if name != "return":
+            found |= leaves(kind) if kind in _BUNDLES else {name: kind}
+    return found
 
 
 def names(stages):
@@ -126,6 +147,36 @@ def test_a_result_depends_on_the_keys_of_its_signature_and_of_all_that_it_needs(
     assert keys.of({"lidar": None}) == {"lidar": None}
 
 
+def test_a_bundle_stands_for_its_fields():
+    """What it takes, what a result depends on, and what a stage gets; also one in another."""
+
+    @bundle
+    class Light:
+        lidar: Annotated[BackscatterLidar, But("pulse_energy")]
+        seed: int
+
+    @bundle
+    class Image:
+        light: Light
+        first: int
+
+    def first() -> int:
+        return 7
+
+    def image(image: Image, scan: Annotated[object, Only("range")]) -> Image:
+        return image
+
+    experiment = check(small())
+    graph = Graph([Stage("second", image), Stage("first", first)], experiment)
+    assert names(graph) == ["first", "second"] and graph.needs(graph["second"]) == ["first"]
+    made = graph.compute(graph["second"], {"first": 7}, Log(), ".")
+    assert made == Image(Light(experiment.lidar, experiment.seed), 7)
+    assert call(image, experiment, first=8) == replace(made, first=8)
+    keys = graph.keys(graph["second"])
+    assert all(key in keys for key in ("lidar.fov_half", "seed", "scan.range"))
+    assert "lidar.pulse_energy" not in keys and "scan.thickness" not in keys
+
+
 class Drawer:
     """Stores things as a run folder does, with what an earlier run left."""
 
@@ -176,7 +227,7 @@ def test_names_are_unambiguous_and_types_those_of_the_results():
         assert section_path(stage.name) is None
         functions = (stage.compute, stage.check, stage.remarks, stage.parts)
         for function in (f for f in functions if f is not None):
-            typed = hints(function)
+            typed = leaves(function)
             assert {p.name for p in parameters(function)} <= set(typed), function
         if not inspect.isclass(stage.compute):
             kind = hints(stage.compute)["return"]

@@ -51,7 +51,7 @@ def test_limits_and_what_is_held():
     squares, terms = drawn(2, np.array([1.0, 0.3]))
     _, limited = most_likely(squares, terms, np.array([0.5, np.inf]), 4.0)
     assert limited[0] == pytest.approx(0.5) and limited[1] > 0.3
-    _, rest = most_likely(squares, terms[1:], UNLIMITED[1:], 4.0, held=terms[0])
+    _, rest = most_likely(squares, terms[1:], UNLIMITED[1:], 4.0, fixed=terms[0])
     assert rest == pytest.approx([0.3], rel=0.05)
 
 

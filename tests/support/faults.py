@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import save_all
+from lidar_mi.assessment.figures.panels import save_all
 from lidar_mi.assessment.report import page
 from lidar_mi.cli.exit_codes import exit_by
 from lidar_mi.experiment import measure, pipeline, report

@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.lines import AxLine
 from matplotlib.quiver import Quiver, QuiverKey
 
-from lidar_mi.assessment.figures import campaign, linked, plates
-from lidar_mi.assessment.figures.seen import TRUE_CORE
+from lidar_mi.assessment.figures import campaign, linked, panels
+from lidar_mi.assessment.figures.alt_text import TRUE_CORE
 from lidar_mi.io import png
 
 
@@ -123,7 +123,7 @@ def judged_figures():
         return svg(axes, marks, label)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plates, "write_png", write)
+        patch.setattr(panels, "write_png", write)
         # that of the commands, which import it when they draw
         patch.setattr(png, "write_png", write)
         for module in (linked, campaign):

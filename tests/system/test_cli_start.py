@@ -18,10 +18,10 @@ from lidar_mi.cli.options import complete_change, complete_key, complete_shipped
 from lidar_mi.schema import keys, reading
 from lidar_mi.schema.shipped import (
     campaigns,
-    described,
     experiments,
     flights,
     instrument_file,
+    question_and_needs,
     shipped_file,
 )
 from lidar_mi.units import to_si
@@ -48,7 +48,7 @@ def test_list_names_all_that_is_shipped(lidar_mi):
 
 @pytest.mark.parametrize("name", [*SHIPPED, *campaigns()])
 def test_every_shipped_file_says_what_it_shows_and_needs(name):
-    question, needs = described(name)
+    question, needs = question_and_needs(name)
     assert re.fullmatch(r"[A-Z0-9].{20,160}\?", question)
     assert re.match(r"[\d.]+ (to \d+ )?(s|minutes?|runs|flights)\b", needs)
     if name in SHIPPED:

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import by_factors, one_to_one
+from lidar_mi.assessment.figures.panels import by_factors, one_to_one
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.errors import error_by_quality
 from lidar_mi.assessment.metrics.names import RENDERED, Source
@@ -17,13 +17,13 @@ def truth_vectors(wind: xr.Dataset) -> xr.Dataset:
     return true.assign(flag=xr.zeros_like(wind["flag"]))
 
 
-def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
+def error_and_bound(winds: xr.Dataset) -> tuple[Figure, str] | None:
     """Rms errors in groups of vectors by Cramer-Rao bound; None without noise."""
-    lines: dict[str, list[tuple[str, list[float], list[float]]]] = {"v": [], "w": []}
-    for name, drawn in lines.items():
-        for source in (s for s in found["source"].values if s in RENDERED):
-            for method in found["algorithm"].values:
-                wind = found.sel(source=source, algorithm=method)
+    curves: dict[str, list[tuple[str, list[float], list[float]]]] = {"v": [], "w": []}
+    for name, drawn in curves.items():
+        for source in (s for s in winds["source"].values if s in RENDERED):
+            for method in winds["algorithm"].values:
+                wind = winds.sel(source=source, algorithm=method)
                 bound = wind[f"{name}_bound"].values
                 error = (wind[name] - wind[f"{name}_true"]).values
                 used = (wind["flag"].values == 0) & np.isfinite(error) & np.isfinite(bound)
@@ -37,12 +37,12 @@ def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
                 )
                 label = f"{METHOD_NAMES[method]} from {SOURCE_NAMES[source]}"
                 drawn.append((label, least, rms))
-    shown = {name: drawn for name, drawn in lines.items() if drawn}
-    if not shown:
+    nonempty = {name: drawn for name, drawn in curves.items() if drawn}
+    if not nonempty:
         return None
-    figure = Figure(figsize=(6.5 * len(shown), 6.2), layout="constrained")
+    figure = Figure(figsize=(6.5 * len(nonempty), 6.2), layout="constrained")
     for axes, (name, drawn) in zip(
-        figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True
+        figure.subplots(1, len(nonempty), squeeze=False)[0], nonempty.items(), strict=True
     ):
         for label, least, rms in drawn:
             axes.plot(least, rms, "o-", ms=4, label=label)
@@ -63,7 +63,7 @@ def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
     )
 
 
-def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]:
+def error_by_texture(winds: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]:
     """Errors by sub-grid texture, and of this run's vectors by the isotropy of their windows."""
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -75,7 +75,7 @@ def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]
         ylabel="rms error / m s$^{-1}$",
         title="cross-correlation from extinction, all vectors",
     )
-    several = found.sizes["source"] > 1
+    several = winds.sizes["source"] > 1
     for source, marker in (
         (Source.EXTINCTION, "o"),
         (Source.BACKSCATTER, "s"),
@@ -83,10 +83,10 @@ def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]
         (Source.NOISY, "d"),
     ):
         # noisy images are shown where there are no others
-        if source not in found["source"].values or (source == Source.NOISY and several):
+        if source not in winds["source"].values or (source == Source.NOISY and several):
             continue
-        for method in found["algorithm"].values:
-            wind = found.sel(source=source, algorithm=method)
+        for method in winds["algorithm"].values:
+            wind = winds.sel(source=source, algorithm=method)
             groups = error_by_quality(wind, truth_vectors(wind), "isotropy")
             if not np.isfinite(groups["rmse"]).any():
                 continue

@@ -15,9 +15,9 @@ from matplotlib.colors import Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.accuracy import error_and_bound, error_by_texture, truth_vectors
-from lidar_mi.assessment.figures.plates import (
+from lidar_mi.assessment.figures.panels import (
+    Captioned,
     Drawn,
-    Plate,
     Progress,
     arrow_scale,
     frame,
@@ -78,7 +78,7 @@ def draw_all(
     folder: Path,
     truth: ObservedAir,
     scans: Sequence[xr.Dataset],
-    found: xr.Dataset,
+    winds: xr.Dataset,
     cores: Sequence[Core],
     sweep: xr.Dataset,
     log: Progress,
@@ -88,22 +88,22 @@ def draw_all(
     Winds are those of `lidar_mi.experiment.stages.winds.cross_flow_winds`, errors by texture those
     of `lidar_mi.experiment.stages.texture.texture_sweep`.
     """
-    scale, sources = _scale(truth), [str(name) for name in found["source"].values]
+    scale, sources = _scale(truth), [str(name) for name in winds["source"].values]
     # with measured images alone there are no winds from extinction to compare with
     compared = Source.EXTINCTION in sources
     ideal, lidar = (Source.EXTINCTION, Source.BACKSCATTER) if compared else (sources[-1],) * 2
-    plates: tuple[tuple[str, str, Plate | None], ...] = (
-        ("fig00_overview", "Image and retrieved wind", overview(truth, scans, found, cores)),
+    figures: tuple[tuple[str, str, Captioned | None], ...] = (
+        ("fig00_overview", "Image and retrieved wind", overview(truth, scans, winds, cores)),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         (
             "fig06_wind_from_extinction" if compared else "fig06_wind",
             f"Wind: truth and from the {SOURCE_NAMES[ideal]} pair",
-            _wind_and_truth(truth, found, ideal, cores, scale),
+            _wind_and_truth(truth, winds, ideal, cores, scale),
         ),
         (
             "fig07_deviation_from_truth",
             f"Winds from {SOURCE_NAMES[ideal]} against the truth",
-            _deviation_maps(found, ideal, None),
+            _deviation_maps(winds, ideal, None),
         ),
         ("fig08_backscatter", "Backscatter images", _backscatter(scans)),
         (
@@ -114,21 +114,21 @@ def draw_all(
         (
             "fig10_wind_from_backscatter",
             "Wind from the backscatter pair",
-            _retrieved(found, lidar, cores, scale),
+            _retrieved(winds, lidar, cores, scale),
         ),
     )
     if compared:
-        plates += (
+        figures += (
             (
                 "fig11_deviation_from_extinction_winds",
                 "Change of the winds by the instrument",
-                _deviation_maps(found, lidar, ideal),
+                _deviation_maps(winds, lidar, ideal),
             ),
         )
-    plates += (("fig12_error_by_texture", "Error and texture", error_by_texture(found, sweep)),)
-    plates += (("fig12b_error_and_bound", "Errors and Cramer-Rao bound", error_and_bound(found)),)
+    figures += (("fig12_error_by_texture", "Error and texture", error_by_texture(winds, sweep)),)
+    figures += (("fig12b_error_and_bound", "Errors and Cramer-Rao bound", error_and_bound(winds)),)
     if "depolarization" in scans[0]:
-        plates += (
+        figures += (
             (
                 "fig14_depolarization",
                 "Linear depolarisation ratio",
@@ -142,7 +142,7 @@ def draw_all(
             ),
         )
     if "multiple_scattering_fraction" in scans[0]:
-        plates += (
+        figures += (
             (
                 "fig15_multiple_scattering",
                 "Multiple scattering",
@@ -154,20 +154,22 @@ def draw_all(
                 ),
             ),
         )
-    there = [(name, title, plate) for name, title, plate in plates if plate is not None]
-    return save_all(folder, there, log)
+    drawn = [
+        (name, title, captioned) for name, title, captioned in figures if captioned is not None
+    ]
+    return save_all(folder, drawn, log)
 
 
-def _with_valid(found: xr.Dataset, *sources: str) -> tuple[list[str], str]:
-    """Methods with a valid vector from each source, and what to say of the others.
+def _with_valid(winds: xr.Dataset, *sources: str) -> tuple[list[str], str]:
+    """Methods with a valid vector from each source, and a sentence on the others.
 
-    Without a valid vector there is nothing to see: the others are random numbers.
+    Vectors of a method without a valid one are random numbers.
     """
-    valid = (found["flag"].sel(source=list(sources)) == 0).any(("z", "y")).all("source")
-    methods = [str(name) for name in found["algorithm"].values]
-    those = [name for name in methods if bool(valid.sel(algorithm=name))]
-    others = [METHOD_NAMES[name] for name in methods if name not in those]
-    return those, f" No valid vector by {' and '.join(others)}." if others else ""
+    valid = (winds["flag"].sel(source=list(sources)) == 0).any(("z", "y")).all("source")
+    methods = [str(name) for name in winds["algorithm"].values]
+    with_valid = [name for name in methods if bool(valid.sel(algorithm=name))]
+    without = [METHOD_NAMES[name] for name in methods if name not in with_valid]
+    return with_valid, f" No valid vector by {' and '.join(without)}." if without else ""
 
 
 def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, scale: Scale) -> None:
@@ -177,20 +179,20 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
     thin = wind.isel(z=slice(every // 2, None, every), y=slice(every // 2, None, every))
     y, z = (np.broadcast_to(thin[f"{a}_vector"], thin["v"].shape).ravel() for a in "yz")
     v, w, flag = (thin[name].values.ravel() for name in ("v", "w", "flag"))
-    known = np.isfinite(v) & np.isfinite(w)
+    retrieved = np.isfinite(v) & np.isfinite(w)
     style: dict[str, Any] = {
         "angles": "xy",
         "scale_units": "xy",
         "scale": scale.limit / (scale.length * step),
         "width": 0.0022,
     }
-    flagged, valid = known & (flag != 0), known & (flag == 0)
+    flagged, valid = retrieved & (flag != 0), retrieved & (flag == 0)
     if flagged.any():
-        # no longer than arrows are apart: noise is not as vivid as wind
+        # no longer than the spacing of the arrows, as most of it is noise
         most = scale.limit / scale.length
         shorter = most / np.maximum(np.hypot(v, w)[flagged], most)
-        shown = v[flagged] * shorter, w[flagged] * shorter
-        axes.quiver(y[flagged], z[flagged], *shown, color="0.75", **style)
+        clipped = v[flagged] * shorter, w[flagged] * shorter
+        axes.quiver(y[flagged], z[flagged], *clipped, color="0.75", **style)
     speed = np.hypot(v, w)[valid]
     stretch = arrow_stretch(speed, None, scale.limit / scale.length)
     arrows = axes.quiver(
@@ -210,13 +212,13 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
 
 
 def overview(
-    truth: ObservedAir, scans: Sequence[xr.Dataset], found: xr.Dataset, cores: Sequence[Core]
+    truth: ObservedAir, scans: Sequence[xr.Dataset], winds: xr.Dataset, cores: Sequence[Core]
 ) -> tuple[Figure, str]:
     """First image of the lidar beside the wind retrieved from two, and a caption; as `draw_all`."""
     scale = _scale(truth)
     detected = "Y_noisy" in scans[0]
     source = Source.NOISY if detected else Source.BACKSCATTER
-    methods, none = _with_valid(found, source)
+    methods, none = _with_valid(winds, source)
     figure, panels = panels_of(1 + bool(methods))
     first = scans[0]["Y_noisy" if detected else "Y"] * 1e6
     norm = _span(first) if detected else _bright([first])
@@ -232,7 +234,7 @@ def overview(
     noise = " with photon, sky, dark and speckle noise of one pulse per beam" if detected else ""
     if not methods:
         return figure, f"The first backscatter image{noise}.{none}"
-    wind = found.sel(source=source, algorithm=methods[0])
+    wind = winds.sel(source=source, algorithm=methods[0])
     _arrows(panels[1], wind, cores, "wind retrieved from two such images", scale)
     return figure, (
         f"The first backscatter image{noise}, and the cross-flow wind retrieved from it and the "
@@ -241,11 +243,11 @@ def overview(
 
 
 def _crosses(cores: Sequence[Core]) -> str:
-    """What of the caption speaks of the vortices, where there are any."""
+    """The part of the caption about the vortices; empty without any."""
     return ", red crosses mark the true cores" if cores else ""
 
 
-def _extinction(truth: ObservedAir) -> Plate:
+def _extinction(truth: ObservedAir) -> Captioned:
     figure, axes = sheet(1, 2)
     fields = [truth.image(k) * 1e3 for k in (0, 1)]
     norm = _bright(fields)
@@ -266,12 +268,12 @@ def _extinction(truth: ObservedAir) -> Plate:
 
 
 def _wind_and_truth(
-    truth: ObservedAir, found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale
-) -> Plate:
-    methods, none = _with_valid(found, source)
-    figure, (wind, colours, *panels) = panels_of(2 + len(methods))
-    first = found.sel(source=source).isel(algorithm=0)
-    _arrows(wind, truth_vectors(first), cores, "true wind", scale)
+    truth: ObservedAir, winds: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale
+) -> Captioned:
+    methods, none = _with_valid(winds, source)
+    figure, (vectors, colours, *panels) = panels_of(2 + len(methods))
+    first = winds.sel(source=source).isel(algorithm=0)
+    _arrows(vectors, truth_vectors(first), cores, "true wind", scale)
     image_panel(
         colours,
         speed_of(truth.wind["v"], truth.wind["w"]),
@@ -281,7 +283,7 @@ def _wind_and_truth(
         norm=Normalize(0, scale.limit),
         cmap="viridis",
     )
-    _retrieved_into(panels, found, source, methods, cores, scale)
+    _retrieved_into(panels, winds, source, methods, cores, scale)
     return figure, (
         "The true cross-flow wind and its speed, and the winds retrieved from the "
         f"{SOURCE_NAMES[source]} pair. Grey vectors are flagged{_crosses(cores)}.{none}"
@@ -290,46 +292,48 @@ def _wind_and_truth(
 
 def _retrieved_into(
     panels: Sequence[Axes],
-    found: xr.Dataset,
+    winds: xr.Dataset,
     source: str,
     methods: Sequence[str],
     cores: Sequence[Core],
     scale: Scale,
 ) -> None:
     for axis, method in zip(panels, methods, strict=True):
-        wind = found.sel(source=source, algorithm=method)
+        wind = winds.sel(source=source, algorithm=method)
         _arrows(axis, wind, cores, f"{METHOD_NAMES[method]}, {source}", scale)
 
 
-def _retrieved(found: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale) -> Plate | None:
-    methods, none = _with_valid(found, source)
+def _retrieved(
+    winds: xr.Dataset, source: str, cores: Sequence[Core], scale: Scale
+) -> Captioned | None:
+    methods, none = _with_valid(winds, source)
     if not methods:
         return None
     figure, panels = panels_of(len(methods))
-    _retrieved_into(panels, found, source, methods, cores, scale)
+    _retrieved_into(panels, winds, source, methods, cores, scale)
     return figure, (
         f"Winds retrieved from the rendered {source} pair, unfiltered: grey vectors are flagged"
         f"{_crosses(cores)}.{none}"
     )
 
 
-def _deviation_maps(found: xr.Dataset, source: str, reference: str | None) -> Plate | None:
-    methods, none = _with_valid(found, source, *([reference] if reference else []))
+def _deviation_maps(winds: xr.Dataset, source: str, reference: str | None) -> Captioned | None:
+    methods, none = _with_valid(winds, source, *([reference] if reference else []))
     if not methods:
         return None
     figure, axes = sheet(len(methods), 2)
     for row, method in zip(axes, methods, strict=True):
-        wind = found.sel(source=source, algorithm=method)
-        other = (
+        wind = winds.sel(source=source, algorithm=method)
+        compared = (
             truth_vectors(wind)
             if reference is None
-            else found.sel(source=reference, algorithm=method)
+            else winds.sel(source=reference, algorithm=method)
         )
         # flagged vectors do not characterise the method
-        error = deviations(wind, other).where((wind["flag"] == 0) & (other["flag"] == 0))
+        error = deviations(wind, compared).where((wind["flag"] == 0) & (compared["flag"] == 0))
         limit = _upper(abs(error["speed"]), 0.99) or 1.0
         for axis in row:
-            # shows where there is no vector
+            # visible where there is no vector
             axis.set_facecolor("0.7")
         image_panel(
             row[0],
@@ -374,7 +378,7 @@ def _upper(field: xr.DataArray, fraction: float) -> float:
     return float(np.quantile(values, fraction)) if values.size else 0.0
 
 
-def _backscatter(scans: Sequence[xr.Dataset]) -> Plate:
+def _backscatter(scans: Sequence[xr.Dataset]) -> Captioned:
     figure, axes = sheet(1, 2)
     norm = _bright([scan["Y"] * 1e6 for scan in scans])
     for k, scan in enumerate(scans):
@@ -393,7 +397,7 @@ def _backscatter(scans: Sequence[xr.Dataset]) -> Plate:
     )
 
 
-def _product(scan: xr.Dataset, name: str, label: str, caption: str) -> Plate:
+def _product(scan: xr.Dataset, name: str, label: str, caption: str) -> Captioned:
     """A product of a scan's first gate, and its standard error."""
     figure, axes = sheet(1, 2)
     first = scan.isel(gate=0)
@@ -418,7 +422,7 @@ def _span(field: xr.DataArray) -> Normalize:
     return Normalize((low + high) / 2 - half, (low + high) / 2 + half)
 
 
-def _image_differences(truth: ObservedAir, scans: Sequence[xr.Dataset]) -> Plate:
+def _image_differences(truth: ObservedAir, scans: Sequence[xr.Dataset]) -> Captioned:
     figure, axes = sheet(1, 2)
     differences = []
     for k, scan in enumerate(scans):

@@ -19,7 +19,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from lidar_mi.assessment.digits import three
 from lidar_mi.assessment.figures.linked import Mark, as_svg, panel, wrapped
-from lidar_mi.assessment.figures.plates import one_to_one
+from lidar_mi.assessment.figures.panels import one_to_one
 from lidar_mi.assessment.metrics.campaign import MEMBER, Interval, over_members
 from lidar_mi.assessment.metrics.sensitivity import SobolIndices
 
@@ -62,8 +62,8 @@ class Axis(NamedTuple):
 
 def colour_scale(values: xr.DataArray) -> Normalize:
     """From the smallest to the largest of all panels, by factors beyond a ratio of 20."""
-    known = values.values[np.isfinite(values.values)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    finite = values.values[np.isfinite(values.values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     if low > 0 and high > 20 * low:
         return LogNorm(low, high)
     return Normalize(low, high if high > low else low + (abs(low) or 1.0))
@@ -119,7 +119,7 @@ def draw_requirements(
     """Where all requirements are met (green), and the boundary of each with its uncertainty."""
     figure, axes = panel(title)
     order = (y.name, x.name)
-    means = {name: one.mean.transpose(*order) for name, one in margins.items()}
+    means = {name: margin.mean.transpose(*order) for name, margin in margins.items()}
     worst = xr.concat(list(means.values()), "row", coords="minimal", compat="override").min(
         "row", skipna=False
     )
@@ -134,10 +134,10 @@ def draw_requirements(
         lambda v: f"{100 * v:+.0f} %",
     )
     handles = []
-    for (name, one), colour in zip(margins.items(), COLOURS * 3, strict=False):
+    for (name, margin), colour in zip(margins.items(), COLOURS * 3, strict=False):
         if not _boundary(axes, means[name], x, y, colors=colour, linewidths=1.8):
             continue
-        for end in (one.low, one.high):
+        for end in (margin.low, margin.high):
             style = {"linewidths": 0.8, "linestyles": "--"}
             _boundary(axes, end.transpose(*order), x, y, colors=colour, **style)
         handles.append(Line2D([], [], color=colour, label=name))
@@ -178,8 +178,8 @@ def _legend_below(figure: Figure, handles: Sequence[Line2D]) -> None:
 
 def _span(values: xr.DataArray) -> str:
     """From the smallest to the largest value, as words after a label."""
-    known = values.values[np.isfinite(values.values)]
-    return f": {three(float(known.min()))} to {three(float(known.max()))}" if known.size else ""
+    finite = values.values[np.isfinite(values.values)]
+    return f": {three(float(finite.min()))} to {three(float(finite.max()))}" if finite.size else ""
 
 
 MET, UNMET = "#2c7a3f", FAILED
@@ -199,10 +199,10 @@ def draw_margins(
     axes.plot(across, up, ",", alpha=0)
     marks = []
     for k, value in enumerate(worst):
-        known = np.isfinite(value)
-        lost = "failed" if bool(points.failed.values[k]) else "no value"
-        text = f"smallest margin {100 * value:+.0f} %" if known else lost
-        colour = (MET if value >= 0 else UNMET) if known else ABSENT
+        finite = np.isfinite(value)
+        missing = "failed" if bool(points.failed.values[k]) else "no value"
+        text = f"smallest margin {100 * value:+.0f} %" if finite else missing
+        colour = (MET if value >= 0 else UNMET) if finite else ABSENT
         marks.append(_dot(across[k], up[k], text, colour, points, k))
     _scale(axes, x, y)
     axes.grid(alpha=0.3)
@@ -226,7 +226,7 @@ def draw_lines(
     A limit is marked.
     """
     _, axes = panel(title)
-    marks, known = [], []
+    marks, means = [], []
     for (name, (values, points)), colour in zip(groups.items(), COLOURS * 3, strict=False):
         mean = over_members(values).mean
         place = x.places(mean[x.name].values)
@@ -235,13 +235,13 @@ def draw_lines(
         if MEMBER in values.dims and x.name != MEMBER:
             low, high = values.quantile([0.16, 0.84], MEMBER).transpose("quantile", x.name).values
             axes.fill_between(place, low, high, color=colour, alpha=0.18, lw=0)
-        known.append(mean.values)
+        means.append(mean.values)
         marks += [
             _dot(p, v, f"{label}: {three(v)}", colour, points, {x.name: k})
             for k, (p, v) in enumerate(zip(place, mean.values, strict=True))
             if np.isfinite(v)
         ]
-    low = _lowest(known)
+    low = _lowest(means)
     for _, points in groups.values():
         for k in np.flatnonzero(points.failed.values):
             p = x.places(points.failed[x.name].values)[k]
@@ -251,7 +251,7 @@ def draw_lines(
     for values, _ in list(groups.values())[:1]:
         _ticks(axes.xaxis, x, x.places(values[x.name].values))
     axes.set_ylabel(wrapped(label))
-    _by_factors(axes, known)
+    _by_factors(axes, means)
     if limit is not None:
         axes.axhline(limit, color=FAILED, ls="--", lw=1, label="limit")
     if len(groups) > 1 or limit is not None:
@@ -276,21 +276,21 @@ def draw_scatter(
     """
     _, axes = panel(title)
     across, up = np.asarray(across, dtype=float), np.asarray(up, dtype=float)
-    known = np.isfinite(across) & np.isfinite(up)
-    axes.plot(across[known], up[known], ",", alpha=0)
+    finite = np.isfinite(across) & np.isfinite(up)
+    axes.plot(across[finite], up[finite], ",", alpha=0)
     _by_factors(axes, [up])
-    low = _lowest([up[known]])
+    low = _lowest([up[finite]])
     marks = []
     for k in range(len(up)):
-        if known[k]:
+        if finite[k]:
             colour = COLOURS[1] if front is not None and front[k] else DOT
             marks.append(_dot(across[k], up[k], f"{y.label}: {three(up[k])}", colour, points, k))
         elif np.isfinite(across[k]):
-            lost = bool(points.failed.values[k])
-            text = "failed" if lost else f"{y.label}: no value"
-            if lost:
+            failed = bool(points.failed.values[k])
+            text = "failed" if failed else f"{y.label}: no value"
+            if failed:
                 axes.plot(across[k], low, "x", color=FAILED, ms=6, clip_on=False)
-            marks.append(_dot(across[k], low, text, FAILED if lost else ABSENT, points, k))
+            marks.append(_dot(across[k], low, text, FAILED if failed else ABSENT, points, k))
     if line is not None:
         chosen = np.flatnonzero(line)
         order = chosen[np.argsort(across[chosen])]
@@ -342,17 +342,17 @@ def draw_against(
     return as_svg(axes, [], f"{label} against {name}")
 
 
-def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str], of: str) -> str:
+def draw_indices(title: str, indices: SobolIndices, labels: Mapping[str, str], of: str) -> str:
     """First-order and total indices of every knob for a metric, with their intervals."""
     _, axes = panel(title)
-    rows = np.arange(len(found.knobs), dtype=float)[::-1]
+    rows = np.arange(len(indices.knobs), dtype=float)[::-1]
     for shift, name, values, interval, colour in (
-        (0.17, "first order", found.first, found.first_interval, COLOURS[0]),
-        (-0.17, "total", found.total, found.total_interval, COLOURS[1]),
+        (0.17, "first order", indices.first, indices.first_interval, COLOURS[0]),
+        (-0.17, "total", indices.total, indices.total_interval, COLOURS[1]),
     ):
         axes.barh(rows + shift, values, 0.3, color=colour, label=name, alpha=0.8)
         axes.hlines(rows + shift, *interval.T, color="k", lw=1)
-    axes.set_yticks(rows, [labels[name] for name in found.knobs])
+    axes.set_yticks(rows, [labels[name] for name in indices.knobs])
     axes.set(xlim=(0, 1), xlabel="fraction of the variance")
     axes.legend(fontsize=8)
     return as_svg(axes, [], f"{title} of {of}")
@@ -374,17 +374,17 @@ def _between(
 ) -> np.ndarray:
     """Values (y, x) between the points, linear in the scale of each axis."""
     (across, up), (fine_x, fine_y) = (
-        [np.log(one) if log else one for one, log in zip(axes, logarithmic, strict=True)]
+        [np.log(axis) if log else axis for axis, log in zip(axes, logarithmic, strict=True)]
         for axes in (places, finer)
     )
-    found = RegularGridInterpolator((up, across), values)
-    return found(tuple(np.meshgrid(fine_y, fine_x, indexing="ij")))
+    interpolate = RegularGridInterpolator((up, across), values)
+    return interpolate(tuple(np.meshgrid(fine_y, fine_x, indexing="ij")))
 
 
 def _crosses_zero(values: np.ndarray) -> bool:
     """Whether known values have both signs."""
-    known = values[np.isfinite(values)]
-    return bool(known.size and known.min() < 0 <= known.max())
+    finite = values[np.isfinite(values)]
+    return bool(finite.size and finite.min() < 0 <= finite.max())
 
 
 def _cells(
@@ -404,7 +404,7 @@ def _cells(
     failed = points.failed.transpose(y.name, x.name).values
     for i, j in np.ndindex(*values.shape):
         value = float(values.values[i, j])
-        shown = ABSENT if not np.isfinite(value) else colour(value)
+        fill = ABSENT if not np.isfinite(value) else colour(value)
         words = text(value) if np.isfinite(value) else "failed" if failed[i, j] else "no value"
         at = {y.name: i, x.name: j}
         marks.append(
@@ -413,7 +413,7 @@ def _cells(
                 (float(edges[0][j]), float(edges[0][j + 1])),
                 (float(edges[1][i]), float(edges[1][i + 1])),
                 words,
-                shown,
+                fill,
                 str(points.link.isel(at).values),
             )
         )
@@ -425,10 +425,10 @@ def _cells(
                 float(across[j]),
                 float(up[i]),
                 number(value) if np.isfinite(value) else "no value",
-                color="k" if _luminance(shown) > 0.4 else "w",
+                color="k" if _luminance(fill) > 0.4 else "w",
                 ha="center",
                 va="center",
-                bbox={"facecolor": shown, "edgecolor": "none", "pad": 1},
+                bbox={"facecolor": fill, "edgecolor": "none", "pad": 1},
             )
     # how many numbers an axis has follows from its limits
     axes.set_xlim(edges[0].min(), edges[0].max())
@@ -476,8 +476,8 @@ def _edges(places: np.ndarray, logarithmic: bool) -> np.ndarray:
 
 
 def _lowest(values: Sequence[np.ndarray]) -> float:
-    known = np.concatenate([one[np.isfinite(one)] for one in values]) if values else np.zeros(0)
-    return float(known.min()) if known.size else 0.0
+    finite = np.concatenate([part[np.isfinite(part)] for part in values]) if values else np.zeros(0)
+    return float(finite.min()) if finite.size else 0.0
 
 
 def _scale(axes: Axes, x: Axis, y: Axis | None) -> None:
@@ -496,8 +496,8 @@ def _scale(axes: Axes, x: Axis, y: Axis | None) -> None:
 
 
 def _by_factors(axes: Axes, values: Sequence[np.ndarray]) -> None:
-    known = np.concatenate([one[np.isfinite(one)] for one in values])
-    if known.size and known.min() > 0 and known.max() > 20 * known.min():
+    finite = np.concatenate([part[np.isfinite(part)] for part in values])
+    if finite.size and finite.min() > 0 and finite.max() > 20 * finite.min():
         axes.set_yscale("log")
         _plain_decades(axes.yaxis)
 

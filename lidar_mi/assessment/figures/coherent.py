@@ -8,11 +8,11 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, save_all
+from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, save_all
 from lidar_mi.assessment.metrics.coherent import PUBLISHED, vortex_errors
 
-_SHOWN = 3  # slices
-_ASIDE = 110.0  # m about the vortices
+_MOST_SLICES = 3  # slices
+_MARGIN = 110.0  # m about the vortices
 _TRUE, _FOUND = "k", "tab:green"
 _SIDES = (("v", "nearer vortex"), ("^", "farther vortex"))
 
@@ -21,13 +21,13 @@ def draw_slices(
     folder: Path, lines: xr.Dataset, vortices: xr.Dataset, log: Progress
 ) -> list[Drawn]:
     """Figures of vertical slices, from `coherent_lines` and `line_vortices`."""
-    plates = [
+    figures = [
         ("fig30_slices", "Vertical slices", _slices(lines, vortices)),
         ("fig31_vortex_track", "The vortices by age", _track(vortices)),
     ]
     if (vortices["flag"] == 0).any():
-        plates.append(("fig32_vortex_errors", "Errors by age", _errors(vortices)))
-    return save_all(folder, plates, log)
+        figures.append(("fig32_vortex_errors", "Errors by age", _errors(vortices)))
+    return save_all(folder, figures, log)
 
 
 def draw_profiles(folder: Path, winds: xr.Dataset, log: Progress) -> list[Drawn]:
@@ -49,26 +49,26 @@ def draw_stare(folder: Path, lines: xr.Dataset, log: Progress) -> list[Drawn]:
     return save_all(folder, [("fig30_lines", "Lines of sight", plate)], log)
 
 
-def _slices(lines: xr.Dataset, vortices: xr.Dataset) -> Plate:
+def _slices(lines: xr.Dataset, vortices: xr.Dataset) -> Captioned:
     sweeps = np.unique(lines["sweep"])
     usable = np.flatnonzero(vortices["flag"].values == 0)
     usable = usable if usable.size else np.arange(sweeps.size)
-    chosen = usable[np.unique(np.linspace(0, usable.size - 1, _SHOWN).round().astype(int))]
+    chosen = usable[np.unique(np.linspace(0, usable.size - 1, _MOST_SLICES).round().astype(int))]
     places = vortices.isel(scan=chosen)
-    left, right = float(places["y_true"].min()) - _ASIDE, float(places["y_true"].max()) + _ASIDE
-    top = float(places["z_true"].max()) + 0.6 * _ASIDE
+    left, right = float(places["y_true"].min()) - _MARGIN, float(places["y_true"].max()) + _MARGIN
+    top = float(places["z_true"].max()) + 0.6 * _MARGIN
     # panels are 5.7 inches wide and true to scale
     height = 5.7 * top / (right - left) + 0.5
     figure = Figure(figsize=(13, height * len(chosen) + 0.4), layout="constrained")
     panels = figure.subplots(len(chosen), 2, squeeze=False, sharex=True, sharey=True)
-    shown = lines.isel(time=np.flatnonzero(np.isin(lines["sweep"], sweeps[chosen])))
-    limit = float(np.quantile(np.abs(shown["radial_velocity_true"].values), 0.998))
+    drawn = lines.isel(time=np.flatnonzero(np.isin(lines["sweep"], sweeps[chosen])))
+    limit = float(np.quantile(np.abs(drawn["radial_velocity_true"].values), 0.998))
     for row, number in zip(panels, chosen, strict=True):
-        one = lines.isel(time=np.flatnonzero(lines["sweep"] == sweeps[number]))
-        one = one.isel(time=np.argsort(one["elevation"].values))
+        scan = lines.isel(time=np.flatnonzero(lines["sweep"] == sweeps[number]))
+        scan = scan.isel(time=np.argsort(scan["elevation"].values))
         pair = vortices.isel(scan=number)
-        angle = np.deg2rad(one["elevation"].values)[:, None]
-        y, z = one["range"].values * np.cos(angle), one["range"].values * np.sin(angle)
+        angle = np.deg2rad(scan["elevation"].values)[:, None]
+        y, z = scan["range"].values * np.cos(angle), scan["range"].values * np.sin(angle)
         for axes, name, title in zip(
             row,
             ("radial_velocity", "radial_velocity_true"),
@@ -78,7 +78,7 @@ def _slices(lines: xr.Dataset, vortices: xr.Dataset) -> Plate:
             mesh = axes.pcolormesh(
                 y,
                 z,
-                one[name],
+                scan[name],
                 cmap="RdBu_r",
                 vmin=-limit,
                 vmax=limit,
@@ -118,32 +118,32 @@ def _mark(axes: Axes, pair: xr.Dataset) -> None:
     )
 
 
-def _track(vortices: xr.Dataset) -> Plate:
+def _track(vortices: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(13, 4.2), layout="constrained")
     strength, path = figure.subplots(1, 2, width_ratios=(1, 1.4))
     age, valid = vortices["age"].values, (vortices["flag"] == 0).values
     name = "circulation_5_15"
     for k, (marker, side) in enumerate(_SIDES):
-        one, colour = vortices.isel(vortex=k), f"C{k}"
-        sign = np.sign(one[f"{name}_true"].values)
-        strength.plot(age, sign * one[f"{name}_true"], color=colour, lw=1, label=f"{side}, true")
+        vortex, colour = vortices.isel(vortex=k), f"C{k}"
+        sign = np.sign(vortex[f"{name}_true"].values)
+        strength.plot(age, sign * vortex[f"{name}_true"], color=colour, lw=1, label=f"{side}, true")
         strength.errorbar(
             age[valid],
-            (sign * one[name].values)[valid],
-            yerr=1.96 * one[f"{name}_stderr"].values[valid],
+            (sign * vortex[name].values)[valid],
+            yerr=1.96 * vortex[f"{name}_stderr"].values[valid],
             fmt=marker,
             color=colour,
             ms=4,
             lw=0.8,
             label=f"{side}, fitted",
         )
-        path.plot(one["y_true"], one["z_true"], color=colour, lw=1, label=f"{side}, true")
-        seen = one.isel(scan=valid)
+        path.plot(vortex["y_true"], vortex["z_true"], color=colour, lw=1, label=f"{side}, true")
+        fitted = vortex.isel(scan=valid)
         path.errorbar(
-            seen["y"],
-            seen["z"],
-            xerr=1.96 * seen["y_stderr"].values,
-            yerr=1.96 * seen["z_stderr"].values,
+            fitted["y"],
+            fitted["z"],
+            xerr=1.96 * fitted["y_stderr"].values,
+            yerr=1.96 * fitted["z_stderr"].values,
             fmt=marker,
             color=colour,
             ms=4,
@@ -158,7 +158,7 @@ def _track(vortices: xr.Dataset) -> Plate:
     return figure, "Every slice by itself, with 95 % intervals; those with a flag are left out."
 
 
-def _errors(vortices: xr.Dataset) -> Plate:
+def _errors(vortices: xr.Dataset) -> Captioned:
     errors = vortex_errors(vortices)
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     panels = figure.subplots(2, 2)
@@ -169,29 +169,29 @@ def _errors(vortices: xr.Dataset) -> Plate:
         (panels[1, 0], "z", "error of the height / m"),
     ):
         for k, (marker, side) in enumerate(_SIDES):
-            one, colour = vortices.isel(vortex=k), f"C{k}"
-            true = one[f"{name}_true"].values
+            vortex, colour = vortices.isel(vortex=k), f"C{k}"
+            true = vortex[f"{name}_true"].values
             scale = 100 / np.abs(true) if name == "circulation_5_15" else np.ones_like(true)
-            error = scale * (one[name].values - true) * np.sign(true)
+            error = scale * (vortex[name].values - true) * np.sign(true)
             axes.errorbar(
                 age[valid],
                 error[valid],
-                yerr=(1.96 * scale * one[f"{name}_stderr"].values)[valid],
+                yerr=(1.96 * scale * vortex[f"{name}_stderr"].values)[valid],
                 fmt=marker,
                 color=colour,
                 ms=4,
                 lw=0.8,
                 label=side,
             )
-            if f"{name}_tracked" in one:
-                middle = one[f"{name}_tracked"].values - true
-                spread = 1.96 * one[f"{name}_tracked_stderr"].values
+            if f"{name}_tracked" in vortex:
+                middle = vortex[f"{name}_tracked"].values - true
+                spread = 1.96 * vortex[f"{name}_tracked_stderr"].values
                 axes.fill_between(age, middle - spread, middle + spread, color=colour, alpha=0.2)
         axes.axhline(0, color="0.5", lw=0.8)
         axes.set(xlabel="age of the wake / s", ylabel=label)
     panels[0, 0].legend(fontsize=8)
     _normalised(panels[1, 1], errors)
-    published = ", ".join(f"{100 * one:.0f} %" for one in PUBLISHED.values())
+    published = ", ".join(f"{100 * vortex:.0f} %" for vortex in PUBLISHED.values())
     return figure, (
         "Errors of single slices with 95 % intervals; bands: those of the places by all slices "
         "together. Published for simulated scans with known truth, of strength and of place in "
@@ -216,7 +216,7 @@ def _normalised(axes: Axes, errors: xr.Dataset) -> None:
     axes.legend(fontsize=8)
 
 
-def _profiles(winds: xr.Dataset) -> Plate:
+def _profiles(winds: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(11, 5), layout="constrained")
     panels: Sequence[Axes] = figure.subplots(1, 3, sharey=True)
     height = winds["height"].values
@@ -224,14 +224,14 @@ def _profiles(winds: xr.Dataset) -> Plate:
         panels, "uvw", ("to the east", "to the north", "upwards"), strict=True
     ):
         for k in range(min(winds.sizes["time"], 3)):
-            one = winds.isel(time=k)
-            valid = one["flag"].values == 0
-            text = str(one["time"].values)[11:19]
-            axes.plot(one[f"{name}_true"], height, color=f"C{k}", lw=1, label=f"{text}, true")
+            profile = winds.isel(time=k)
+            valid = profile["flag"].values == 0
+            text = str(profile["time"].values)[11:19]
+            axes.plot(profile[f"{name}_true"], height, color=f"C{k}", lw=1, label=f"{text}, true")
             axes.errorbar(
-                one[name].values[valid],
+                profile[name].values[valid],
                 height[valid],
-                xerr=1.96 * one[f"{name}_stderr"].values[valid],
+                xerr=1.96 * profile[f"{name}_stderr"].values[valid],
                 fmt=".",
                 color=f"C{k}",
                 lw=0.8,

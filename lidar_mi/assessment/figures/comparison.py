@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import Drawn, Progress, save_all
-from lidar_mi.assessment.figures.seen import TRUE_CORE
+from lidar_mi.assessment.figures.alt_text import TRUE_CORE
+from lidar_mi.assessment.figures.panels import Drawn, Progress, save_all
 from lidar_mi.assessment.labels import BACKSCATTER
 
 _SPEED = "m s$^{-1}$"

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, one_to_one, save_all
+from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, one_to_one, save_all
 from lidar_mi.assessment.metrics.names import bound_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.instrument.fringe_camera import ring_radii
@@ -53,7 +53,7 @@ def draw_all(
     doppler: Doppler,
     exposure: RingImages,
     samples: xr.Dataset | None,
-    found: xr.Dataset,
+    velocities: xr.Dataset,
     metrics: dict[str, float],
     log: Progress,
 ) -> list[Drawn]:
@@ -69,7 +69,7 @@ def draw_all(
         From `lidar_mi.experiment.stages.ring_velocities.velocities`,
         `lidar_mi.assessment.metrics.velocities`.
     """
-    plates = [
+    figures = [
         ("fig03_fringes", "Rings on the CCD", _rings(doppler, exposure, samples)),
         (
             "fig04_ring_cuts",
@@ -81,26 +81,26 @@ def draw_all(
             "Spread and bias of the line-of-sight wind",
             _errors(doppler, metrics),
         ),
-        ("fig18_doppler_speeds", "Line-of-sight wind against the truth", _speeds(found)),
+        ("fig18_doppler_speeds", "Line-of-sight wind against the truth", _speeds(velocities)),
     ]
     if set(doppler.retrieval.methods) & set(PEAK_READERS):
-        bias = _bias(doppler, exposure, found)
-        plates.insert(-1, ("fig17_doppler_bias", "Bias of the peaks of rings", bias))
-    return save_all(folder, plates, log)
+        bias = _bias(doppler, exposure, velocities)
+        figures.insert(-1, ("fig17_doppler_bias", "Bias of the peaks of rings", bias))
+    return save_all(folder, figures, log)
 
 
-def _rings(doppler: Doppler, exposure: RingImages, samples: xr.Dataset | None) -> Plate:
+def _rings(doppler: Doppler, exposure: RingImages, samples: xr.Dataset | None) -> Captioned:
     """The paper's figure 3, and the profiles of both."""
     panels = 3 if samples is not None else 2
     figure = Figure(figsize=(5.6 * panels, 4.6), layout="constrained")
     axes = figure.subplots(1, panels)
-    shown = [(exposure.noisy, f"one pulse, air at {doppler.v_los[0]:g} m/s", "photoelectrons")]
+    images = [(exposure.noisy, f"one pulse, air at {doppler.v_los[0]:g} m/s", "photoelectrons")]
     if samples is not None:
         # every path has the same energy
-        hits = samples["S0"].values * samples["S0"].size * samples.attrs["samples_per_pixel"]
-        shown.append((hits, "the laser's light, traced path by path through a lens", "samples"))
+        counts = samples["S0"].values * samples["S0"].size * samples.attrs["samples_per_pixel"]
+        images.append((counts, "the laser's light, traced path by path through a lens", "samples"))
     # the last panel holds profiles
-    for axis, (image, title, label) in zip(axes, shown, strict=False):
+    for axis, (image, title, label) in zip(axes, images, strict=False):
         # single noisy pixels must not determine the scale
         mesh = axis.imshow(image, cmap="inferno", vmin=0, vmax=np.quantile(image, 0.998))
         axis.set(title=title, xlabel="x / px", ylabel="y / px")
@@ -133,7 +133,7 @@ def _rings(doppler: Doppler, exposure: RingImages, samples: xr.Dataset | None) -
     )
 
 
-def _cuts(doppler: Doppler, exposure: RingImages) -> Plate:
+def _cuts(doppler: Doppler, exposure: RingImages) -> Captioned:
     """The paper's figure 4."""
     figure = Figure(figsize=(12, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -169,7 +169,7 @@ def _cuts(doppler: Doppler, exposure: RingImages) -> Plate:
     )
 
 
-def _errors(doppler: Doppler, metrics: Mapping[str, float]) -> Plate:
+def _errors(doppler: Doppler, metrics: Mapping[str, float]) -> Captioned:
     settings = doppler.retrieval
     figure = Figure(figsize=(6.2 * len(settings.centre), 8.2), layout="constrained")
     axes = figure.subplots(2, len(settings.centre), sharex=True, sharey="row", squeeze=False)
@@ -196,15 +196,15 @@ def _errors(doppler: Doppler, metrics: Mapping[str, float]) -> Plate:
         column[0].plot(settings.averaged, bound, "k--", label="Cramer-Rao bound")
         column[0].axhline(REQUIRED, color="0.5", ls=":", label="required (table 1)")
         for axis, quantity in zip(column, ("std", "bias"), strict=True):
-            stated = PUBLISHED[centre]
+            published = PUBLISHED[centre]
             axis.plot(
-                stated["averaged"],
-                stated[quantity],
+                published["averaged"],
+                published[quantity],
                 "*",
                 color="k",
                 ms=13,
                 zorder=5,
-                label=f"paper: {'below ' * (centre == 'known')}{stated[quantity]:g} m/s",
+                label=f"paper: {'below ' * (centre == 'known')}{published[quantity]:g} m/s",
             )
             axis.set(xscale="log", yscale="log")
             axis.set_xticks(settings.averaged, [str(n) for n in settings.averaged])
@@ -223,7 +223,7 @@ def _errors(doppler: Doppler, metrics: Mapping[str, float]) -> Plate:
     )
 
 
-def _bias(doppler: Doppler, exposure: RingImages, found: xr.Dataset) -> Plate:
+def _bias(doppler: Doppler, exposure: RingImages, velocities: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(16, 4.8), layout="constrained")
     *rings, last = figure.subplots(1, 3)
     camera = doppler.camera
@@ -240,8 +240,8 @@ def _bias(doppler: Doppler, exposure: RingImages, found: xr.Dataset) -> Plate:
         axis.axvline(fitted, color=_BY_COORDINATE[coordinate], ls=":", label="Gaussian's crest")
         axis.set(xlabel=f"{name} / {unit}", ylabel="photons per pixel", title=f"fit in {name}")
         last.plot(
-            found["piece"],
-            found["peak_bias"].sel(coordinate=coordinate),
+            velocities["piece"],
+            velocities["peak_bias"].sel(coordinate=coordinate),
             "o-",
             color=_BY_COORDINATE[coordinate],
             label=f"fit in {name}",
@@ -264,13 +264,13 @@ def _bias(doppler: Doppler, exposure: RingImages, found: xr.Dataset) -> Plate:
     )
 
 
-def _speeds(found: xr.Dataset) -> Plate:
+def _speeds(velocities: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(13, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
-    case = found.isel(averaged=0, centre=0)
+    case = velocities.isel(averaged=0, centre=0)
     true = case["v_los"].values
     order = np.argsort(true)
-    for name in found["algorithm"].values:
+    for name in velocities["algorithm"].values:
         v = case["v"].sel(algorithm=name).transpose("v_los", "image").values[order]
         count = np.isfinite(v).sum(1)
         mean = np.where(count > 0, np.nansum(v, 1) / np.maximum(count, 1), np.nan)

@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from lidar_mi.assessment.figures.alt_text import TRUE_CORE
 from lidar_mi.assessment.figures.encounter_loads import load_factor
-from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, arrow_scale, save_all
-from lidar_mi.assessment.figures.seen import TRUE_CORE
+from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, arrow_scale, save_all
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
@@ -48,12 +48,12 @@ def draw_all(
 
     The series has dims (flight, time), the track (source, slab); slabs are images and vectors.
     """
-    plates = [("fig30_roll", "Roll angle and roll rate", _roll(series))]
+    figures = [("fig30_roll", "Roll angle and roll rate", _roll(series))]
     if track is not None and track.sizes["slab"]:
         if slabs is not None:
             overview = _overview(series, track, slabs, span)
-            plates.insert(0, ("fig29_encounter", "A slab ahead, and the roll angle", overview))
-        plates.append(
+            figures.insert(0, ("fig29_encounter", "A slab ahead, and the roll angle", overview))
+        figures.append(
             (
                 "fig31_approach",
                 "The approach from above and from the side",
@@ -61,19 +61,21 @@ def draw_all(
             )
         )
         if slabs is not None:
-            plates.append(
+            figures.append(
                 ("fig32_cockpit", "A slab from the cockpit", _cockpit(track, slabs, span))
             )
         if np.isfinite(track["port_y"].values).any():
-            plates.append(("fig33_track", "The vortices, estimated and tracked", _track(track)))
+            figures.append(("fig33_track", "The vortices, estimated and tracked", _track(track)))
     if "feedforward" in series["flight"]:
-        plates.append(("fig34_moment", "Predicted and true rolling moment", _moment(series)))
-    plates.append(("fig35_commands", "The ailerons", _commands(series)))
+        figures.append(("fig34_moment", "Predicted and true rolling moment", _moment(series)))
+    figures.append(("fig35_commands", "The ailerons", _commands(series)))
     if series.attrs.get(MET) == "air":
-        plates.append(("fig36_loads", "Loads by the wind", _loads(series)))
+        figures.append(("fig36_loads", "Loads by the wind", _loads(series)))
     if np.isfinite(series["load_factor"]).any():
-        plates.append(("fig37_load_factor", "Load factor and bending", load_factor(series, _lines)))
-    return save_all(folder, plates, log)
+        figures.append(
+            ("fig37_load_factor", "Load factor and bending", load_factor(series, _lines))
+        )
+    return save_all(folder, figures, log)
 
 
 def flight_style(mode: str, series: xr.Dataset) -> tuple[str, str, str]:
@@ -83,22 +85,24 @@ def flight_style(mode: str, series: xr.Dataset) -> tuple[str, str, str]:
 
 def _flown(series: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     """Flights in the order in which they are drawn, the one with the lidar on top."""
-    there = [str(mode) for mode in series["flight"].values]
+    modes = [str(mode) for mode in series["flight"].values]
     return [
         (mode, series.sel(flight=mode))
         for mode in ("off", "autopilot", "perfect", "feedforward")
-        if mode in there
+        if mode in modes
     ]
 
 
 def _lines(axes: Axes, series: xr.Dataset, name: str, factor: float = 1.0) -> None:
-    for mode, one in _flown(series):
+    for mode, flight in _flown(series):
         label, colour, style = flight_style(mode, series)
-        axes.plot(one["time"], factor * one[name], color=colour, ls=style, lw=1.8, label=label)
+        axes.plot(
+            flight["time"], factor * flight[name], color=colour, ls=style, lw=1.8, label=label
+        )
     axes.grid(alpha=0.3)
 
 
-def _roll(series: xr.Dataset) -> Plate:
+def _roll(series: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(10.5, 6.4), layout="compressed")
     angle, rate = figure.subplots(2, 1, sharex=True)
     _lines(angle, series, "roll", np.degrees(1))
@@ -111,11 +115,11 @@ def _roll(series: xr.Dataset) -> Plate:
     return (figure, "Positive: port wing up. Shaded: bank angles of a stable approach.")
 
 
-def _approach(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset | None) -> Plate:
+def _approach(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset | None) -> Captioned:
     figure = Figure(figsize=(11.5, 7.2), layout="compressed")
     above, side = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
-    one = series.sel(flight="feedforward")
-    truth, tracked, found = (track.sel(source=s) for s in ("truth", "track", "estimate"))
+    flight = series.sel(flight="feedforward")
+    truth, tracked, estimate = (track.sel(source=s) for s in ("truth", "track", "estimate"))
     for axes, axis in ((above, "y"), (side, "z")):
         for name, colour in SIDES.items():
             key = f"{name}_{axis}"
@@ -129,8 +133,8 @@ def _approach(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset | None) -
             )
             axes.errorbar(
                 track["x"],
-                found[key],
-                TWO_SIGMA * found[f"{key}_stderr"],
+                estimate[key],
+                TWO_SIGMA * estimate[f"{key}_stderr"],
                 fmt=".",
                 ms=4,
                 color="0.55",
@@ -138,7 +142,7 @@ def _approach(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset | None) -
                 label="estimate of each slab, 2 sigma" if name == "port" else None,
             )
             axes.plot(track["x"], tracked[key], color=colour, lw=2, label=f"{name}, tracked")
-        axes.plot(one["x"], one[axis], color="tab:blue", lw=2, label="flight path")
+        axes.plot(flight["x"], flight[axis], color="tab:blue", lw=2, label="flight path")
         axes.grid(alpha=0.3)
         axes.margins(x=0.01)
     if slabs is not None and "image_y" in slabs:
@@ -162,7 +166,7 @@ def _approach(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset | None) -
     )
 
 
-def _overview(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset, span: float) -> Plate:
+def _overview(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset, span: float) -> Captioned:
     figure = Figure(figsize=(13.6, 4.9), layout="compressed")
     view, angle = figure.subplots(1, 2, width_ratios=(1.25, 1))
     ahead = _draw_slab(view, track, slabs, span)
@@ -177,7 +181,7 @@ def _overview(series: xr.Dataset, track: xr.Dataset, slabs: xr.Dataset, span: fl
     )
 
 
-def _cockpit(track: xr.Dataset, slabs: xr.Dataset, span: float) -> Plate:
+def _cockpit(track: xr.Dataset, slabs: xr.Dataset, span: float) -> Captioned:
     figure = Figure(figsize=(10.5, 7.0), layout="compressed")
     axes = figure.subplots()
     ahead = _draw_slab(axes, track, slabs, span)
@@ -213,9 +217,9 @@ def _draw_slab(axes: Axes, track: xr.Dataset, slabs: xr.Dataset, span: float) ->
 
 def best_slab(track: xr.Dataset, slabs: xr.Dataset) -> int:
     """The last slab whose vortices were found on both sides of the path; else the last accepted."""
-    found = track.sel(source="estimate")
-    both = (found["port_y"] > 0) & (found["starboard_y"] < 0)
-    for chosen in (both, track["accepted"] > 0):
+    estimate = track.sel(source="estimate")
+    astride = (estimate["port_y"] > 0) & (estimate["starboard_y"] < 0)
+    for chosen in (astride, track["accepted"] > 0):
         x = track["x"].values[chosen.values]
         if x.size:
             middle = x[x.size // 2]
@@ -293,20 +297,20 @@ def draw_vortices(axes: Axes, at: xr.Dataset) -> None:
             axes.add_patch(circle)
 
 
-def _track(track: xr.Dataset) -> Plate:
+def _track(track: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(11.5, 10.0), layout="compressed")
     panels = figure.subplots(len(_ROWS), 2, sharex=True)
-    truth, tracked, found = (track.sel(source=s) for s in ("truth", "track", "estimate"))
+    truth, tracked, estimate = (track.sel(source=s) for s in ("truth", "track", "estimate"))
     x = track["x"].values
     for row, (name, label) in zip(panels, _ROWS, strict=True):
         for axes, (side, colour) in zip(row, SIDES.items(), strict=True):
             key = f"{side}_{name}"
-            # along the path places change by far more than they are wrong
+            # along the path, places change by far more than their errors
             zero = truth[key].values if name in "yz" else 0.0
             spread = TWO_SIGMA * tracked[f"{key}_stderr"].values
-            middle, single = tracked[key].values - zero, found[key].values - zero
+            middle, single = tracked[key].values - zero, estimate[key].values - zero
             true = truth[key].values - zero
-            bars = TWO_SIGMA * found[f"{key}_stderr"].values
+            bars = TWO_SIGMA * estimate[f"{key}_stderr"].values
             axes.errorbar(
                 x,
                 single,
@@ -343,64 +347,64 @@ def _track(track: xr.Dataset) -> Plate:
     )
 
 
-def _fit_limits(axes: Axes, truth: np.ndarray, found: np.ndarray, spread: np.ndarray) -> None:
+def _fit_limits(axes: Axes, truth: np.ndarray, estimates: np.ndarray, spread: np.ndarray) -> None:
     """Values of truth and estimates, without the widest bands."""
-    inside = np.isfinite(found)
-    values = np.concatenate([truth[inside], found[inside]]) if inside.any() else truth
+    inside = np.isfinite(estimates)
+    values = np.concatenate([truth[inside], estimates[inside]]) if inside.any() else truth
     # the band of a track that begins is many times as wide as later
-    wide = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
-    margin = max(0.3 * float(np.ptp(values)), 2 * wide, 0.05)
+    band = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
+    margin = max(0.3 * float(np.ptp(values)), 2 * band, 0.05)
     if np.isfinite([values.min(), values.max(), margin]).all():
         axes.set_ylim(values.min() - margin, values.max() + margin)
 
 
-def _moment(series: xr.Dataset) -> Plate:
+def _moment(series: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(10.5, 6.4), layout="compressed")
-    moment, rest = figure.subplots(2, 1, sharex=True)
-    one = series.sel(flight="feedforward")
-    moment.plot(one["time"], 1e-3 * one["roll_moment"], color="k", lw=1.8, label="true")
+    moment, difference = figure.subplots(2, 1, sharex=True)
+    flight = series.sel(flight="feedforward")
+    moment.plot(flight["time"], 1e-3 * flight["roll_moment"], color="k", lw=1.8, label="true")
     moment.plot(
-        one["time"],
-        1e-3 * one["predicted_roll_moment"],
+        flight["time"],
+        1e-3 * flight["predicted_roll_moment"],
         color="tab:blue",
         lw=1.8,
         ls="--",
         label="predicted from the track",
     )
     moment.plot(
-        one["time"],
+        flight["time"],
         # ailerons that cancel the wake's moment lie on its curve
-        -1e-3 * one["control_roll_moment"],
+        -1e-3 * flight["control_roll_moment"],
         color="tab:orange",
         lw=1.2,
         label="of the ailerons, reversed",
     )
-    rest.plot(
-        one["time"],
-        1e-3 * (one["predicted_roll_moment"] - one["roll_moment"]),
+    difference.plot(
+        flight["time"],
+        1e-3 * (flight["predicted_roll_moment"] - flight["roll_moment"]),
         color="tab:blue",
         lw=1.5,
         label="predicted - true",
     )
-    rest.plot(
-        one["time"],
-        1e-3 * (one["roll_moment"] + one["control_roll_moment"]),
+    difference.plot(
+        flight["time"],
+        1e-3 * (flight["roll_moment"] + flight["control_roll_moment"]),
         color="tab:orange",
         lw=1.5,
         label="felt: wake and ailerons",
     )
-    for axes in (moment, rest):
+    for axes in (moment, difference):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=9, loc="best")
         axes.set_ylabel("rolling moment / kN m")
-    rest.set_xlabel("time of flight / s")
+    difference.set_xlabel("time of flight / s")
     return figure, (
         "Flight with the lidar. Predicted: the moment on this wing from the track alone, of slabs "
         "measured up to two seconds before."
     )
 
 
-def _commands(series: xr.Dataset) -> Plate:
+def _commands(series: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(10.5, 4.0), layout="compressed")
     axes = figure.subplots()
     _lines(axes, series, "aileron_deflection", np.degrees(1))
@@ -409,7 +413,7 @@ def _commands(series: xr.Dataset) -> Plate:
     return figure, "Deflections, within the limits and the rate of the actuators."
 
 
-def _loads(series: xr.Dataset) -> Plate:
+def _loads(series: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(10.5, 6.4), layout="compressed")
     force, moment = figure.subplots(2, 1, sharex=True)
     _lines(force, series, "force_z", 1e-3)

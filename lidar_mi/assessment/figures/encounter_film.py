@@ -1,6 +1,7 @@
 """The flight as a film in real time: the last slab delivered, the wings, where the aircraft is.
 
-States are interpolated from frame to frame. What rests is drawn once, what moves on top of it.
+States are interpolated from frame to frame. The background is drawn once, moving parts on top of
+it.
 """
 
 from collections.abc import Iterator
@@ -58,10 +59,10 @@ def film(
     times = frame_times(series, track, slabs)
     if track is None or slabs is None or not times:
         return
-    found = series[["x", "y", "z", "roll"]].interp(time=times)
+    flights = series[["x", "y", "z", "roll"]].interp(time=times)
     states = {
-        str(mode): {str(name): values.values for name, values in found.sel(flight=mode).items()}
-        for mode in found["flight"].values
+        str(mode): {str(name): values.values for name, values in flights.sel(flight=mode).items()}
+        for mode in flights["flight"].values
     }
     limits = tuple(float(q) for q in np.nanquantile(slabs["image"], (0.01, 0.995)))
     figure = Figure(figsize=_SIZE, dpi=_DOTS, layout="constrained")
@@ -80,13 +81,13 @@ def film(
     figure.set_layout_engine("none")
     canvas.draw()
     at_rest = canvas.copy_from_bbox(figure.bbox)
-    with_slab, shown = at_rest, -1
+    with_slab, drawn = at_rest, -1
     for k, time in enumerate(times):
         number = int(np.flatnonzero(slabs["delivered"].values <= time + 1e-9)[-1])
-        if number != shown:
+        if number != drawn:
             canvas.restore_region(at_rest)
             _draw(view, slab_view.show(number))
-            with_slab, shown = canvas.copy_from_bbox(figure.bbox), number
+            with_slab, drawn = canvas.copy_from_bbox(figure.bbox), number
         canvas.restore_region(with_slab)
         for part in (*moving, slab_view):
             _draw(part.axes, part.at(k, time))
@@ -247,9 +248,9 @@ class _FromAbove:
         axes.grid(alpha=0.3)
 
     def at(self, k: int, time: float) -> list[Artist]:
-        known = self._delivered <= time + 1e-9
+        delivered = self._delivered <= time + 1e-9
         for side, line in self._tracked.items():
-            line.set_data(self._planes[known], self._found[side][known])
+            line.set_data(self._planes[delivered], self._found[side][delivered])
         x, y, end = self._x[k], self._y[k], self._x[k] + self._reach
         low, high = self._sides
         self._beams.set_xy([[x, y], [end, y + low], [end, y + high]])

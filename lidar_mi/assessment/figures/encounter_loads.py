@@ -7,21 +7,21 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.plates import Plate
+from lidar_mi.assessment.figures.panels import Captioned
 
 Lines = Callable[[Axes, xr.Dataset, str, float], None]
 """Draws a variable of all flights, times a factor."""
 
 
-def load_factor(series: xr.Dataset, lines: Lines) -> Plate:
+def load_factor(series: xr.Dataset, lines: Lines) -> Captioned:
     """Load factor, bending of the wing root, pitch rate and deflections over time."""
     figure = Figure(figsize=(10.5, 9.0), layout="compressed")
     load, bending, rate, controls = figure.subplots(4, 1, sharex=True, height_ratios=(3, 2, 2, 2))
     port, starboard = series["port_bending"], series["starboard_bending"]
-    both = series.assign(bending=(port + starboard) / 2)
+    loads = series.assign(bending=(port + starboard) / 2)
     degrees = float(np.degrees(1))
     lines(load, series, "load_factor", 1.0)
-    lines(bending, both, "bending", 1e-3)
+    lines(bending, loads, "bending", 1e-3)
     lines(rate, series, "pitch_rate", degrees)
     lines(controls, series, "elevator_deflection", degrees)
     load.set_ylabel("load factor")

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from lidar_mi.assessment.digits import whole_percent
-from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, save_all
+from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, save_all
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.error_budget import (
     CAUSES,
@@ -23,14 +23,14 @@ def draw_all(folder: Path, budgets: Budgets, log: Progress) -> list[Drawn]:
 
     Budgets are those of `lidar_mi.assessment.metrics.error_budget.error_budget`, by method.
     """
-    known = {method: budget for method, budget in budgets.items() if causes_of(budget)}
-    if not known:
+    with_causes = {method: budget for method, budget in budgets.items() if causes_of(budget)}
+    if not with_causes:
         return []
-    plates = [("fig23_error_budget", "What limits the wind", _bars(known))]
-    return save_all(folder, plates, log)
+    figures = [("fig23_error_budget", "What limits the wind", _bars(with_causes))]
+    return save_all(folder, figures, log)
 
 
-def _bars(budgets: Budgets) -> Plate:
+def _bars(budgets: Budgets) -> Captioned:
     used = [c for c in CAUSES if any(c in causes_of(budget) for budget in budgets.values())]
     size = (3.4 + 3.2 * len(budgets), 1.9 + 0.5 * len(used))
     figure = Figure(figsize=size, layout="constrained")

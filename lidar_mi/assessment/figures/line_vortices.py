@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 _COLOURS = ("tab:blue", "tab:red")
-_BESIDE = 70.0  # m of the scan that is drawn around the vortices
+_MARGIN = 70.0  # m of the scan that is drawn around the vortices
 
 
 def draw_line_vortices(lines: xr.Dataset, vortices: xr.Dataset, title: str = "") -> Figure:
@@ -32,12 +32,12 @@ def draw_line_vortices(lines: xr.Dataset, vortices: xr.Dataset, title: str = "")
 
 
 def _scan(figure: Figure, axes: Axes, lines: xr.Dataset, vortices: xr.Dataset, scan: int) -> None:
-    one = vortices.isel(scan=scan)
-    within = (lines["time"] >= one["start"].values) & (lines["time"] <= one["end"].values)
+    pair = vortices.isel(scan=scan)
+    within = (lines["time"] >= pair["start"].values) & (lines["time"] <= pair["end"].values)
     part = lines.isel(time=np.flatnonzero(within))
     elevation = np.deg2rad(part["elevation"].values)
-    beside = np.deg2rad(part["azimuth"].values - float(one["azimuth"]))
-    angle = np.arctan2(np.sin(elevation), np.cos(elevation) * np.cos(beside))
+    azimuth = np.deg2rad(part["azimuth"].values - float(pair["azimuth"]))
+    angle = np.arctan2(np.sin(elevation), np.cos(elevation) * np.cos(azimuth))
     order = np.argsort(angle)
     distance = part["range"].values
     y, z = distance * np.cos(angle[order, None]), distance * np.sin(angle[order, None])
@@ -56,22 +56,22 @@ def _scan(figure: Figure, axes: Axes, lines: xr.Dataset, vortices: xr.Dataset, s
     )
     figure.colorbar(drawn, ax=axes, label=f"radial velocity less {middle:.1f} m/s / (m/s)")
     for k, colour in zip(range(vortices.sizes["vortex"]), _COLOURS, strict=False):
-        place = float(one["y"][k]), float(one["z"][k])
+        place = float(pair["y"][k]), float(pair["z"][k])
         if not np.isfinite(place).all():
             continue
-        error = [1.96 * float(one[f"{name}_stderr"][k]) for name in "yz"]
-        label = f"{float(one['circulation'][k]):.0f} m²/s"
+        error = [1.96 * float(pair[f"{name}_stderr"][k]) for name in "yz"]
+        label = f"{float(pair['circulation'][k]):.0f} m²/s"
         axes.errorbar(
             *place, yerr=error[1], xerr=error[0], fmt="+", ms=12, c=colour, label=label, mew=1.5
         )
-    if np.isfinite(one["y"].values).all():
-        axes.set_xlim(float(one["y"].min()) - _BESIDE, float(one["y"].max()) + _BESIDE)
+    if np.isfinite(pair["y"].values).all():
+        axes.set_xlim(float(pair["y"].min()) - _MARGIN, float(pair["y"].max()) + _MARGIN)
         axes.set_ylim(
-            max(float(one["z"].min()) - _BESIDE, float(z.min())), float(one["z"].max()) + _BESIDE
+            max(float(pair["z"].min()) - _MARGIN, float(z.min())), float(pair["z"].max()) + _MARGIN
         )
         axes.legend(loc="upper right", title="circulation, 95 % of place")
-    time = str(one["time"].values)[:19].replace("T", " ")
-    verdict = "" if int(one["flag"]) == 0 else ", not valid"
+    time = str(pair["time"].values)[:19].replace("T", " ")
+    verdict = "" if int(pair["flag"]) == 0 else ", not valid"
     axes.set(aspect="equal", xlabel="horizontal distance / m", ylabel="height above the lidar / m")
     axes.set_title(f"{time} UTC{verdict}", fontsize="medium")
 

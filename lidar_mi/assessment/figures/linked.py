@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.seen import seen
+from lidar_mi.assessment.figures.alt_text import alt_text
 
 
 class Mark(NamedTuple):
@@ -53,7 +53,7 @@ def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     """The axes' figure as an SVG element with marks below its lines; all text is escaped."""
     figure = axes.figure
     assert isinstance(figure, Figure)  # that of `panel`
-    spoken = ". ".join(part for part in (label.strip(" ,"), seen(figure)) if part)
+    spoken = ". ".join(part for part in (label.strip(" ,"), alt_text(figure)) if part)
     # cells and dots are behind the frame
     figure.patch.set_visible(False)
     axes.patch.set_visible(False)
@@ -66,7 +66,7 @@ def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     body = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     size = re.search(r'viewBox="([^"]*)"', body)
-    # what holds links is no image
+    # an element that contains links is no image
     role = "group" if marks else "img"
     start = f'<svg viewBox="{size[1] if size else ""}" role="{role}" aria-label="{escape(spoken)}">'
     drawn = "".join(_element(axes, mark, height) for mark in marks)

@@ -13,9 +13,9 @@ def draw_normalised_errors(
     """Histogram of errors over standard errors, by label; the last bins hold all beyond 5."""
     edges = np.linspace(-5, 5, 51)
     for label, values in errors.items():
-        known = values[np.isfinite(values)]
+        finite = values[np.isfinite(values)]
         axes.hist(
-            np.clip(known, -5, 5),
+            np.clip(finite, -5, 5),
             list(edges),
             density=True,
             histtype="step",

@@ -6,9 +6,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from lidar_mi.assessment.figures.plates import (
+from lidar_mi.assessment.figures.panels import (
+    Captioned,
     Drawn,
-    Plate,
     Progress,
     arrow_scale,
     frame,
@@ -25,11 +25,11 @@ _ARROWS = 21
 
 def draw_all(folder: Path, pointing: ScanPointing, log: Progress) -> list[Drawn]:
     """Draw the figure of beam times and poses."""
-    plates = [("fig24_scan_time", "Times and places of the beams", _scan_time(pointing))]
-    return save_all(folder, plates, log)
+    figures = [("fig24_scan_time", "Times and places of the beams", _scan_time(pointing))]
+    return save_all(folder, figures, log)
 
 
-def _scan_time(pointing: ScanPointing) -> Plate:
+def _scan_time(pointing: ScanPointing) -> Captioned:
     wrong = bool(np.abs(pointing.errors).max() > 0)
     panels = [_times, _errors, _wind] if pointing.on_nodes() else [_times, _errors]
     panels = panels if wrong else [_times]

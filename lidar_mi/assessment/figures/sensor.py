@@ -12,7 +12,7 @@ from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import Drawn, Plate, Progress, mark_cores, save_all
+from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, mark_cores, save_all
 from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.retrieval.combined.vectors import COMPONENTS, line_places
 
@@ -20,33 +20,33 @@ _SPEED = "m s$^{-1}$"
 
 
 def draw_all(
-    folder: Path, found: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core], log: Progress
+    folder: Path, wind: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core], log: Progress
 ) -> list[Drawn]:
     """Draw the combined sensor's figures as PNG into ``folder``.
 
     The wind is that of `combined.combine.combine`, with the truth as u_true, v_true, w_true, the
     lines of `lidar_mi.experiment.stages.lines.measure_lines`.
     """
-    plates = [("fig19_lines_of_sight", "The scan of the Doppler lidar", _scan(lines, cores))]
-    if found is not None:
-        plates = [
-            ("fig20_wind3d", "The wind from both lidars", _maps(found, lines, cores)),
-            *plates,
-            ("fig21_uncertainty", "Standard errors of the wind", _uncertainty(found)),
+    figures = [("fig19_lines_of_sight", "The scan of the Doppler lidar", _scan(lines, cores))]
+    if wind is not None:
+        figures = [
+            ("fig20_wind3d", "The wind from both lidars", _maps(wind, lines, cores)),
+            *figures,
+            ("fig21_uncertainty", "Standard errors of the wind", _uncertainty(wind)),
         ]
-    return save_all(folder, plates, log)
+    return save_all(folder, figures, log)
 
 
-def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
+def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Captioned:
     place = line_places(lines)
     speed, true = lines["v_los"].values, lines["v_los_true"].values
     normalised = (speed - true) / lines["v_los_std"].values
     read = np.isfinite(speed)
-    # without a velocity there is only where lines are
+    # without velocities only the places of the lines are drawn
     figure = Figure(figsize=(13.6 if read.any() else 6.8, 4.6), layout="compressed")
     panels = figure.subplots(1, 1 + read.any(), sharex=True, sharey=True, squeeze=False)[0]
     span = np.quantile(np.where(read, speed, true), (0.0, 1.0))
-    shown: tuple[tuple[np.ndarray, str, str, dict[str, Any]], ...] = (
+    maps: tuple[tuple[np.ndarray, str, str, dict[str, Any]], ...] = (
         (
             speed,
             "velocity along the line of sight",
@@ -60,7 +60,7 @@ def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
             {"cmap": "RdBu_r", "vmin": -4, "vmax": 4},
         ),
     )
-    for panel, (values, title, label, style) in zip(panels, shown, strict=False):
+    for panel, (values, title, label, style) in zip(panels, maps, strict=False):
         dots = panel.scatter(
             place[read, 1],
             place[read, 2],
@@ -87,19 +87,19 @@ def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
     )
 
 
-def _maps(found: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
+def _maps(wind: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Captioned:
     figure = Figure(figsize=(17, 10.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
-    valid = found["flag"] == 0
-    y, z = found["y"], found["z"]
+    valid = wind["flag"] == 0
+    y, z = wind["y"], wind["z"]
     place = line_places(lines)
     for row, name in zip(axes, COMPONENTS, strict=True):
-        true, value = found[f"{name}_true"], found[name].where(valid)
+        true, value = wind[f"{name}_true"], wind[name].where(valid)
         error = value - true
-        both = np.concatenate([true.values.ravel(), value.values.ravel()])
+        values = np.concatenate([true.values.ravel(), value.values.ravel()])
         columns = (
-            (true, _colours(both), f"{name}, true"),
-            (value, _colours(both), f"{name}, retrieved"),
+            (true, _colours(values), f"{name}, true"),
+            (value, _colours(values), f"{name}, retrieved"),
             (error, _colours(error.values), f"{name}, error"),
         )
         for panel, (field, colours, title) in zip(row, columns, strict=True):
@@ -130,17 +130,17 @@ def _maps(found: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Plate:
 
 
 def _crosses(cores: Sequence[Core], colour: str) -> str:
-    """What of a caption speaks of the vortices, where there are any."""
+    """The part of a caption about the vortices; empty without any."""
     return f"{colour} crosses: true cores." if cores else ""
 
 
-def _uncertainty(found: xr.Dataset) -> Plate:
+def _uncertainty(wind: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(17, 4.3), layout="compressed")
     axes = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 1))
-    valid = (found["flag"] == 0).transpose("z", "y").values
-    y, z = found["y"], found["z"]
+    valid = (wind["flag"] == 0).transpose("z", "y").values
+    y, z = wind["y"], wind["z"]
     for panel, name in zip(axes[:2], ("u", "w"), strict=True):
-        stderr = found[f"{name}_stderr"].transpose("z", "y").values
+        stderr = wind[f"{name}_stderr"].transpose("z", "y").values
         # few large values must not determine the colours
         top = float(np.quantile(stderr[valid], 0.99)) if valid.any() else 1.0
         mesh = panel.pcolormesh(
@@ -163,7 +163,7 @@ def _uncertainty(found: xr.Dataset) -> Plate:
         panel.set_xlim(float(y.max()), float(y.min()))
         figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="max")
     errors = {
-        name: (found[name] - found[f"{name}_true"]) / found[f"{name}_stderr"] for name in COMPONENTS
+        name: (wind[name] - wind[f"{name}_true"]) / wind[f"{name}_stderr"] for name in COMPONENTS
     }
     draw_normalised_errors(
         axes[-1], {name: e.transpose("z", "y").values[valid] for name, e in errors.items()}
@@ -179,9 +179,9 @@ def _uncertainty(found: xr.Dataset) -> Plate:
 
 def _colours(values: np.ndarray) -> dict[str, Any]:
     """Symmetric about 0, or the values' own range if all of them have the same sign."""
-    known = values[np.isfinite(values)]
-    low, high = np.quantile(known, (0.005, 0.995)) if known.size else (0.0, 0.0)
+    finite = values[np.isfinite(values)]
+    low, high = np.quantile(finite, (0.005, 0.995)) if finite.size else (0.0, 0.0)
     if low > 0 or high < 0:
         return {"cmap": "viridis", "vmin": low, "vmax": high}
-    limit = (float(np.quantile(np.abs(known), 0.995)) if known.size else 0.0) or 1.0
+    limit = (float(np.quantile(np.abs(finite), 0.995)) if finite.size else 0.0) or 1.0
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}

@@ -14,9 +14,9 @@ from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.plates import (
+from lidar_mi.assessment.figures.panels import (
+    Captioned,
     Drawn,
-    Plate,
     Progress,
     by_factors,
     mark_cores,
@@ -31,7 +31,7 @@ _COMPONENTS = ("u", "v", "w")
 
 def draw_all(
     folder: Path,
-    found: xr.Dataset,
+    winds: xr.Dataset,
     volumes: Sequence[xr.DataArray],
     cores: Sequence[Core],
     log: Progress,
@@ -41,28 +41,28 @@ def draw_all(
     Winds are those of `lidar_mi.experiment.stages.volume.volume_winds`; volumes (x, z, y) are
     attenuated backscatter.
     """
-    source = found["source"].values[-1]
-    best = found.sel(source=source).isel(algorithm=-1)
+    source = winds["source"].values[-1]
+    best = winds.sel(source=source).isel(algorithm=-1)
     across = best.isel(x=best.sizes["x"] // 2)
     along = best.sel(z=cores[0].z if cores else 0, method="nearest")
-    plates = [("fig30_volume", "The observed volume", _volume_section(volumes, cores))]
+    figures = [("fig30_volume", "The observed volume", _volume_section(volumes, cores))]
     # a cut without a valid vector has nothing to show
     if _any_valid(across):
         title = "The wind in three dimensions"
-        plates.append(("fig31_wind_in_three_dimensions", title, _across_x(across, cores)))
+        figures.append(("fig31_wind_in_three_dimensions", title, _across_x(across, cores)))
     if _any_valid(along):
-        plates.append(("fig32_wind_along_x", "The wind along the flight path", _along_x(along)))
-    if _any_valid(found.sel(source=source)):
-        errors = _errors(found.sel(source=source))
-        plates.append(("fig33_volume_errors", "Errors of the winds", errors))
-    return save_all(folder, plates, log)
+        figures.append(("fig32_wind_along_x", "The wind along the flight path", _along_x(along)))
+    if _any_valid(winds.sel(source=source)):
+        errors = _errors(winds.sel(source=source))
+        figures.append(("fig33_volume_errors", "Errors of the winds", errors))
+    return save_all(folder, figures, log)
 
 
 def _any_valid(wind: xr.Dataset) -> bool:
     return bool((wind["flag"] == 0).any())
 
 
-def _volume_section(volumes: Sequence[xr.DataArray], cores: Sequence[Core]) -> Plate:
+def _volume_section(volumes: Sequence[xr.DataArray], cores: Sequence[Core]) -> Captioned:
     figure = Figure(figsize=(16, 6.4), layout="compressed")
     axes = figure.subplots(2, 2, height_ratios=(3.2, 1))
     values = [1e6 * volume for volume in volumes]
@@ -81,7 +81,7 @@ def _volume_section(volumes: Sequence[xr.DataArray], cores: Sequence[Core]) -> P
     )
 
 
-def _across_x(cut: xr.Dataset, cores: Sequence[Core]) -> Plate:
+def _across_x(cut: xr.Dataset, cores: Sequence[Core]) -> Captioned:
     figure = Figure(figsize=(17, 10.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     for row, name in zip(axes, _COMPONENTS, strict=True):
@@ -96,7 +96,7 @@ def _across_x(cut: xr.Dataset, cores: Sequence[Core]) -> Plate:
     )
 
 
-def _along_x(cut: xr.Dataset) -> Plate:
+def _along_x(cut: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(17, 5.4), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     for row, name in zip(axes, _COMPONENTS, strict=True):
@@ -146,26 +146,26 @@ def _map(
     return mesh
 
 
-def _errors(found: xr.Dataset) -> Plate:
+def _errors(winds: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(17, 8.4), layout="compressed")
     axes = figure.subplots(2, 3)
     # an experiment may have a single method
-    colours = dict(zip(found["algorithm"].values, ("tab:orange", "tab:blue"), strict=False))
+    colours = dict(zip(winds["algorithm"].values, ("tab:orange", "tab:blue"), strict=False))
     for column, name in enumerate(_COMPONENTS):
         profile, density = axes[:, column]
-        rms = np.sqrt((found[f"{name}_true"] ** 2).mean(("y", "z")))
-        profile.plot(found["x"], rms, "k:", label="the wind itself, rms")
+        rms = np.sqrt((winds[f"{name}_true"] ** 2).mean(("y", "z")))
+        profile.plot(winds["x"], rms, "k:", label="the wind itself, rms")
         for method, colour in colours.items():
-            wind = found.sel(algorithm=method)
+            wind = winds.sel(algorithm=method)
             valid = wind["flag"] == 0
             error = (wind[name] - wind[f"{name}_true"]).where(valid)
-            stated = wind[f"{name}_stderr"].where(valid)
-            for values, style, text in ((error, "-", "error"), (stated, "--", "as stated")):
+            stderr = wind[f"{name}_stderr"].where(valid)
+            for values, style, text in ((error, "-", "error"), (stderr, "--", "as stated")):
                 level = np.sqrt((values**2).mean(("y", "z")))
                 profile.plot(
-                    found["x"], level, style, color=colour, label=f"{METHOD_NAMES[method]}, {text}"
+                    winds["x"], level, style, color=colour, label=f"{METHOD_NAMES[method]}, {text}"
                 )
-            normalised = (error / stated).values
+            normalised = (error / stderr).values
             draw_normalised_errors(density, {METHOD_NAMES[method]: normalised}, color=colour)
         profile.set(title=f"rms error of {name}", xlabel="x / m", ylabel=_SPEED)
         by_factors(profile)
@@ -182,5 +182,5 @@ def _errors(found: xr.Dataset) -> Plate:
 
 
 def _limit(values: xr.DataArray) -> float:
-    known = np.abs(values.values[np.isfinite(values.values)])
-    return (float(np.quantile(known, 0.995)) if known.size else 0.0) or 1.0
+    sizes = np.abs(values.values[np.isfinite(values.values)])
+    return (float(np.quantile(sizes, 0.995)) if sizes.size else 0.0) or 1.0

@@ -10,15 +10,15 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lidar_mi.assessment.figures.plates import (
+from lidar_mi.assessment.figures.alt_text import TRUE_CORE
+from lidar_mi.assessment.figures.panels import (
+    Captioned,
     Drawn,
-    Plate,
     Progress,
     arrow_scale,
     save_all,
     speed_of,
 )
-from lidar_mi.assessment.figures.seen import TRUE_CORE
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.plots import ARROWS, arrow_length
@@ -43,8 +43,8 @@ def draw_all(
     """Draw the fits over the first image, the vectors (None: there are none) and the truth."""
     if not fits:
         return []
-    plates = [("fig22_vortices", "The vortex pair", _pair(image, vectors, truth, fits, cores))]
-    return save_all(folder, plates, log)
+    figures = [("fig22_vortices", "The vortex pair", _pair(image, vectors, truth, fits, cores))]
+    return save_all(folder, figures, log)
 
 
 def _pair(
@@ -53,10 +53,10 @@ def _pair(
     truth: xr.Dataset,
     fits: Mapping[str, VortexPairFit],
     cores: Sequence[Core],
-) -> Plate:
+) -> Captioned:
     figure = Figure(figsize=(13.6, 12.4), layout="compressed")
     grid = figure.add_gridspec(3, 2)
-    first, fitted, wrong, stated = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
+    first, fitted, wrong, uncertain = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
     cut = figure.add_subplot(grid[2, :])
     y, z = truth["y"].values, truth["z"].values
     best = next(iter(fits))
@@ -85,14 +85,14 @@ def _pair(
     most = float(np.quantile(error, 0.995)) or 1.0
     for axes, values, title in (
         (wrong, error, "its error (speed of the difference to the truth)"),
-        (stated, stderr, "its standard error"),
+        (uncertain, stderr, "its standard error"),
     ):
         mesh = axes.pcolormesh(
             y, z, values, cmap="magma", vmin=0, vmax=most, shading="nearest", rasterized=True
         )
         figure.colorbar(mesh, ax=axes, label=_SPEED, pad=0.02, extend="max")
         axes.set_title(title)
-    for axes in (first, fitted, wrong, stated):
+    for axes in (first, fitted, wrong, uncertain):
         _mark(axes, fits if axes is first else {best: fits[best]}, cores)
         axes.set(aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
         axes.set_xlim(y.max(), y.min())

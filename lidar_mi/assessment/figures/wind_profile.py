@@ -18,9 +18,9 @@ def draw_wind_profiles(winds: xr.Dataset, title: str = "") -> Figure:
     if title:
         figure.suptitle(title)
     valid = winds.where(winds["flag"] == 0)
-    known = np.isfinite(valid["u"].values).any(0)
+    measured = np.isfinite(valid["u"].values).any(0)
     # heights above the last that has a wind say nothing
-    valid = valid.isel(height=slice(0, int(np.flatnonzero(known).max(initial=0)) + 1))
+    valid = valid.isel(height=slice(0, int(np.flatnonzero(measured).max(initial=0)) + 1))
     if winds.sizes["time"] <= _MOST_CURVES:
         _curves(figure, valid)
     else:
@@ -32,15 +32,15 @@ def _curves(figure: Figure, valid: xr.Dataset) -> None:
     speed, direction, vertical = figure.subplots(1, 3, sharey=True)
     height = valid["height"].values
     for k in range(valid.sizes["time"]):
-        one = valid.isel(time=k)
-        label = str(one["time"].values)[:19].replace("T", " ")
-        size = np.maximum(one["wind_speed"].values, 1e-6)
-        along, across = _errors(one)
+        profile = valid.isel(time=k)
+        label = str(profile["time"].values)[:19].replace("T", " ")
+        size = np.maximum(profile["wind_speed"].values, 1e-6)
+        along, across = _errors(profile)
         style = {"fmt": ".", "ms": 4, "lw": 0.7, "label": label}
-        speed.errorbar(one["wind_speed"], height, xerr=1.96 * along, **style)
+        speed.errorbar(profile["wind_speed"], height, xerr=1.96 * along, **style)
         degrees = np.minimum(np.rad2deg(1.96 * across / size), 180)
-        direction.errorbar(one["wind_from_direction"], height, xerr=degrees, **style)
-        vertical.errorbar(one["w"], height, xerr=1.96 * one["w_stderr"].values, **style)
+        direction.errorbar(profile["wind_from_direction"], height, xerr=degrees, **style)
+        vertical.errorbar(profile["w"], height, xerr=1.96 * profile["w_stderr"].values, **style)
     speed.set(xlabel="wind speed / (m/s)", ylabel="height above the lidar / m")
     direction.set(xlabel="wind from / degrees", xlim=(0, 360), xticks=range(0, 361, 90))
     vertical.set(xlabel="vertical wind / (m/s)")
@@ -48,12 +48,12 @@ def _curves(figure: Figure, valid: xr.Dataset) -> None:
     speed.legend(fontsize="small")
 
 
-def _errors(one: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+def _errors(profile: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors of the horizontal wind along and across its direction, m/s."""
-    size = np.maximum(one["wind_speed"].values, 1e-6)
-    east, north = one["u"].values / size, one["v"].values / size
-    uu, vv = one["u_stderr"].values ** 2, one["v_stderr"].values ** 2
-    uv = one["uv_correlation"].values * one["u_stderr"].values * one["v_stderr"].values
+    size = np.maximum(profile["wind_speed"].values, 1e-6)
+    east, north = profile["u"].values / size, profile["v"].values / size
+    uu, vv = profile["u_stderr"].values ** 2, profile["v_stderr"].values ** 2
+    uv = profile["uv_correlation"].values * profile["u_stderr"].values * profile["v_stderr"].values
     along = east**2 * uu + 2 * east * north * uv + north**2 * vv
     across = north**2 * uu - 2 * east * north * uv + east**2 * vv
     return np.sqrt(along), np.sqrt(across)

@@ -1,4 +1,4 @@
-"""Numbers of a campaign: its dimensions, means over members, requirements, stated errors.
+"""Numbers of a campaign: its dimensions, means over members, requirements, coverages.
 
 A campaign's data set has the swept keys as dimensions, or a dimension ``sample`` with the keys as
 coordinates; ``member`` if points were repeated with random numbers of their own.
@@ -57,7 +57,7 @@ def metrics_of(dataset: xr.Dataset) -> dict[str, xr.DataArray]:
     ``vortex.ORIGIN.error_circulation_5_15`` (m^2 s^-1) and ``error_position`` (m): rms error over
     both vortices of a point.
     """
-    found = {str(name): array for name, array in dataset.items() if name not in _POINT}
+    metrics = {str(name): array for name, array in dataset.items() if name not in _POINT}
     for origin in Origin:
         for name, parts, units in (
             ("circulation_5_15", ("circulation_5_15",), "m²/s"),
@@ -65,16 +65,16 @@ def metrics_of(dataset: xr.Dataset) -> dict[str, xr.DataArray]:
         ):
             keys = [f"{side}_{part}" for side in ("port", "starboard") for part in parts]
             pairs = [(vortex_key(origin, k), vortex_key("truth", k)) for k in keys]
-            if all(key in found for pair in pairs for key in pair):
-                squares = [(found[one] - found[true]) ** 2 for one, true in pairs]
+            if all(key in metrics for pair in pairs for key in pair):
+                squares = [(metrics[estimated] - metrics[true]) ** 2 for estimated, true in pairs]
                 error = xr.concat(squares, "part", coords="minimal", compat="override")
                 error = (error.sum("part", skipna=False) / 2) ** 0.5
                 error.attrs = {"units": units, "long_name": f"error of {name}, {origin}"}
-                found[vortex_key(origin, f"error_{name}")] = error
-    return found
+                metrics[vortex_key(origin, f"error_{name}")] = error
+    return metrics
 
 
-def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> list[str]:
+def chosen(metrics: Mapping[str, xr.DataArray], names: Sequence[str] | None) -> list[str]:
     """The metrics to show: those asked for, or errors, stated errors, vortices and pulses.
 
     Raises
@@ -82,23 +82,23 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
     InputError
         A metric that the campaign does not have.
     """
-    for key in asked or ():
+    for key in names or ():
         if key not in metrics:
             near = ", ".join(difflib.get_close_matches(key, metrics, 3, 0.5))
             hint = f"; did you mean {near}?" if near else ""
             raise InputError(f"metrics: {key!r} is no metric of this campaign{hint}")
-    if asked:
-        return list(dict.fromkeys(asked))
-    known = {key for key, values in metrics.items() if np.isfinite(values).any()}
-    best = _best_method(metrics, known)
+    if names:
+        return list(dict.fromkeys(names))
+    finite = {key for key, values in metrics.items() if np.isfinite(values).any()}
+    best = _best_method(metrics, finite)
     vortex = [vortex_key(Origin.IMAGES, f"error_{q}") for q in ("circulation_5_15", "position")]
-    both = any(f"sensor.rmse_{name}" in known for name in "uvw")
-    head, components = ("sensor", "uvw") if both else (best, "vw")
-    wanted = [
-        # an error beside how often it lies within what is stated
+    combined = any(f"sensor.rmse_{name}" in finite for name in "uvw")
+    head, components = ("sensor", "uvw") if combined else (best, "vw")
+    defaults = [
+        # each error with its coverage
         *(f"{head}.{what}_{name}" for name in components for what in ("rmse", "coverage_95")),
         *(() if head == "sensor" else (f"{best}.valid_fraction",)),
-        # of these, what the simulation's own noise adds
+        # the part of it by Monte Carlo noise
         f"{best}.monte_carlo_w",
         *vortex,
         "sensor.rmse_v_los",
@@ -115,16 +115,16 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
         "encounter.lead_time",
         "encounter.normalised_innovation",
     ]
-    found = [key for key in wanted if key in known]
-    return found or sorted(known)[:8]
+    found = [key for key in defaults if key in finite]
+    return found or sorted(finite)[:8]
 
 
-def _best_method(metrics: Mapping[str, xr.DataArray], known: set[str]) -> str:
+def _best_method(metrics: Mapping[str, xr.DataArray], finite: set[str]) -> str:
     """Source and method of the smallest median error of w; the most complete source that is."""
     for source in (*reversed(RENDERED), *EXACT):
         errors = {
             key.rpartition(".")[0]: float(metrics[key].median())
-            for key in known
+            for key in finite
             if re.fullmatch(rf"{source}\.\w+\.rmse_w", key)
         }
         if errors:
@@ -148,17 +148,17 @@ def over_members(values: xr.DataArray) -> Interval:
 
 def requirements(metrics: Mapping[str, xr.DataArray]) -> dict[tuple[str, str], dict[str, str]]:
     """Keys of the margins by (application, phase of flight), then quantity."""
-    found: dict[tuple[str, str], dict[str, str]] = {}
+    margins: dict[tuple[str, str], dict[str, str]] = {}
     for key in metrics:
         if match := _MARGIN.fullmatch(key):
-            found.setdefault((match[1], match[2]), {})[match[3]] = key
-    return found
+            margins.setdefault((match[1], match[2]), {})[match[3]] = key
+    return margins
 
 
 def judged(dataset: xr.Dataset, key: str) -> xr.DataArray:
-    """A margin, -1 (nothing of what is required) where a finished run gave nothing to be judged.
+    """A margin; -1 where a finished run has no value to judge.
 
-    NaN where the run is of another phase of flight, whose speed its aircraft does not have.
+    NaN where the run is of another phase of flight.
     """
     margin, phase = dataset[key], key.rsplit(".", 2)[0]
     nothing = (dataset["status"] == 0) & margin.isnull()
@@ -168,7 +168,7 @@ def judged(dataset: xr.Dataset, key: str) -> xr.DataArray:
 
 
 def spaced_by_factors(values: np.ndarray) -> bool:
-    """Whether values are spaced more evenly by factors than by differences; two, by 8 or more."""
+    """Whether values are spaced evenly by factors, not by differences; of two, by 8 or more."""
     at = np.sort(np.asarray(values, dtype=float))
     if len(at) < 2 or at[0] <= 0:
         return False
@@ -180,8 +180,8 @@ def spaced_by_factors(values: np.ndarray) -> bool:
 
 def varies_by_factors(values: np.ndarray) -> bool:
     """Whether all values are positive and the largest is 10 times the smallest or more."""
-    known = values[np.isfinite(values)]
-    return bool(known.size and known.min() > 0 and known.max() >= 10 * known.min())
+    finite = values[np.isfinite(values)]
+    return bool(finite.size and finite.min() > 0 and finite.max() >= 10 * finite.min())
 
 
 def met(margin: Interval) -> xr.DataArray:
@@ -225,37 +225,37 @@ def boundaries(margin: Interval, logarithmic: bool) -> list[Boundary]:
     order = np.argsort(margin.mean[knob].values)
     place = margin.mean[knob].values[order].astype(float)
     x = np.log(place) if logarithmic else place
-    curves = [each.values[order] for each in (margin.mean, margin.low, margin.high)]
-    found = []
+    curves = [part.values[order] for part in (margin.mean, margin.low, margin.high)]
+    boundaries = []
     ends = [_crossings(x, curve) for curve in curves[1:]]
     for value, above in _crossings(x, curves[0]):
         span = [math.nan, math.nan]
         if np.isfinite(curves[1]).any():
             # met above: the upper curve crosses first
             sides = (ends[1], ends[0]) if above else (ends[0], ends[1])
-            before = [at for at, way in sides[0] if way == above and at <= value]
-            after = [at for at, way in sides[1] if way == above and at >= value]
+            before = [at for at, positive in sides[0] if positive == above and at <= value]
+            after = [at for at, positive in sides[1] if positive == above and at >= value]
             span = [max(before, default=-math.inf), min(after, default=math.inf)]
         at, low, high = (
             math.exp(k) if logarithmic and math.isfinite(k) else k for k in (value, *span)
         )
-        found.append(Boundary(at, low, high, above))
-    return found
+        boundaries.append(Boundary(at, low, high, above))
+    return boundaries
 
 
 def _crossings(x: np.ndarray, y: np.ndarray) -> list[tuple[float, bool]]:
     """Zeros of a polyline and whether it is positive after them; gaps where it is not known."""
-    found = []
+    crossings = []
     for k in range(len(x) - 1):
         a, b = y[k], y[k + 1]
         if np.isfinite([a, b]).all() and (a >= 0) != (b >= 0):
-            found.append((float(x[k] + (x[k + 1] - x[k]) * a / (a - b)), bool(b >= 0)))
-    return found
+            crossings.append((float(x[k] + (x[k + 1] - x[k]) * a / (a - b)), bool(b >= 0)))
+    return crossings
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often errors lie within what is stated, of a quantity, over points and members."""
+    """Fraction of errors of a quantity within the stated errors, over points and members."""
 
     quantity: str
     count: int
@@ -266,18 +266,17 @@ class Coverage:
 
 
 def coverages(metrics: Mapping[str, xr.DataArray]) -> list[Coverage]:
-    """Of winds the mean of the runs' coverages; of vortices that of their parameters.
+    """Coverages of winds and of vortex parameters, averaged over runs.
 
-    Every run counts once. The standard error of a mean of runs is that of their spread; members
-    of one point have errors of their own, runs of one member at several points may not: the members
-    are the unit where there are any.
+    Every run counts once. The standard error is that of the spread over members, which have
+    independent errors, or over runs where there are no members.
     """
-    found = []
+    rows = []
     for key, inner in metrics.items():
         head, name, component = key.rpartition(".coverage_68_")
-        other = f"{head}.coverage_95_{component}"
-        if name and other in metrics:
-            found.append(_coverage(f"{head}: {component}", inner, metrics[other]))
+        outer = f"{head}.coverage_95_{component}"
+        if name and outer in metrics:
+            rows.append(_coverage(f"{head}: {component}", inner, metrics[outer]))
     for origin in Origin:
         for key in metrics:
             quantity = key.removeprefix(vortex_key("truth", ""))
@@ -286,8 +285,8 @@ def coverages(metrics: Mapping[str, xr.DataArray]) -> list[Coverage]:
                 error = abs(metrics[value] - metrics[key]) / metrics[stderr]
                 error = error.where(np.isfinite(error))
                 within = [(error < k).where(error.notnull()).astype(float) for k in (1, 1.96)]
-                found.append(_coverage(f"vortex, {origin}: {quantity}", *within))
-    return [one for one in found if one.count]
+                rows.append(_coverage(f"vortex, {origin}: {quantity}", *within))
+    return [row for row in rows if row.count]
 
 
 def _coverage(quantity: str, inner: xr.DataArray, outer: xr.DataArray) -> Coverage:
@@ -298,8 +297,8 @@ def _coverage(quantity: str, inner: xr.DataArray, outer: xr.DataArray) -> Covera
 
 def _mean_and_error(values: xr.DataArray) -> tuple[float, float]:
     unit = MEMBER if MEMBER in values.dims else None
-    others = [dim for dim in values.dims if dim != unit]
-    rows = (values.mean(others) if unit else values).values.ravel()
+    averaged = [dim for dim in values.dims if dim != unit]
+    rows = (values.mean(averaged) if unit else values).values.ravel()
     rows = rows[np.isfinite(rows)]
     if not rows.size:
         return math.nan, math.nan

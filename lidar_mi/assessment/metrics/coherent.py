@@ -21,25 +21,25 @@ _CIRCULATION = "circulation_5_15"
 
 
 def lines_metrics(lines: xr.Dataset) -> dict[str, float]:
-    """Number of lines, and noise of their velocities: stated, and found against the truth.
+    """Number of lines, and noise of their velocities: as stated, and against the truth.
 
     ``coherent.lines``, ``coherent.noise`` (median of the stated standard errors, m/s),
     ``coherent.rmse_v_los`` and ``coherent.bias_v_los`` (m/s), ``coherent.cnr`` (median, dB), of
     gates with a signal, ``coherent.signal_fraction`` of all.
     """
     signal = lines["flag"] == 0
-    found = {
+    metrics = {
         f"{PREFIX}lines": float(lines.sizes["time"]),
         f"{PREFIX}signal_fraction": float(signal.mean()),
     }
     if not signal.any():
-        return found
-    seen = lines[["radial_velocity", "radial_velocity_true", "radial_velocity_stderr", "snr"]]
-    seen = seen.where(signal)
-    error = error_statistics(seen["radial_velocity"] - seen["radial_velocity_true"])
-    return found | {
-        f"{PREFIX}noise": float(seen["radial_velocity_stderr"].median()),
-        f"{PREFIX}cnr": float(10 * np.log10(seen["snr"].median())),
+        return metrics
+    detected = lines[["radial_velocity", "radial_velocity_true", "radial_velocity_stderr", "snr"]]
+    detected = detected.where(signal)
+    error = error_statistics(detected["radial_velocity"] - detected["radial_velocity_true"])
+    return metrics | {
+        f"{PREFIX}noise": float(detected["radial_velocity_stderr"].median()),
+        f"{PREFIX}cnr": float(10 * np.log10(detected["snr"].median())),
         f"{PREFIX}rmse_v_los": error["rmse"],
         f"{PREFIX}bias_v_los": error["bias"],
     }
@@ -48,12 +48,12 @@ def lines_metrics(lines: xr.Dataset) -> dict[str, float]:
 def profile_metrics(winds: xr.Dataset) -> dict[str, float]:
     """Errors of valid winds, ``coherent.winds.rmse_u`` ..., and how many are valid."""
     valid = winds["flag"].values == 0
-    found = {f"{PREFIX}winds.valid_fraction": float(valid.mean())}
+    metrics = {f"{PREFIX}winds.valid_fraction": float(valid.mean())}
     for name in "uvw":
         error = (winds[name] - winds[f"{name}_true"]).values
         statistics = error_statistics(error, winds[f"{name}_stderr"].values, valid)
-        found |= {f"{PREFIX}winds.{key}_{name}": value for key, value in statistics.items()}
-    return found
+        metrics |= {f"{PREFIX}winds.{key}_{name}": value for key, value in statistics.items()}
+    return metrics
 
 
 def vortex_errors(vortices: xr.Dataset) -> xr.Dataset:
@@ -67,18 +67,18 @@ def vortex_errors(vortices: xr.Dataset) -> xr.Dataset:
         signed but the last; and ``y_normalised``, ``z_normalised``, ``circulation_normalised`` over
         the standard errors.
     """
-    found = {}
+    errors = {}
     valid = (vortices["flag"] == 0).values[:, None]
     for name in _QUANTITIES:
         key = _CIRCULATION if name == "circulation" else name
         true = vortices[f"{key}_true"].values
         error, stderr = vortices[key].values - true, vortices[f"{key}_stderr"].values
         size = true if key == _CIRCULATION else vortices.attrs["separation"]
-        found[f"{name}_error"] = np.where(valid, error / size, np.nan)
-        found[f"{name}_normalised"] = np.where(valid, error / stderr, np.nan)
-    found["place_error"] = np.hypot(found["y_error"], found["z_error"])
+        errors[f"{name}_error"] = np.where(valid, error / size, np.nan)
+        errors[f"{name}_normalised"] = np.where(valid, error / stderr, np.nan)
+    errors["place_error"] = np.hypot(errors["y_error"], errors["z_error"])
     return xr.Dataset(
-        {name: (("scan", "vortex"), values) for name, values in found.items()},
+        {name: (("scan", "vortex"), values) for name, values in errors.items()},
         {"age": vortices["age"]},
     )
 
@@ -93,50 +93,50 @@ def vortex_scan_metrics(vortices: xr.Dataset) -> dict[str, float]:
     the method of radial velocities, and the fraction of the slices in which it finds both;
     ``coherent.track.``: of the places by all slices together.
     """
-    errors, start = vortex_errors(vortices), f"{PREFIX}vortices."
-    found = {
-        f"{start}scans": float(vortices.sizes["scan"]),
-        f"{start}valid_fraction": float((vortices["flag"] == 0).mean()),
+    errors, prefix = vortex_errors(vortices), f"{PREFIX}vortices."
+    metrics = {
+        f"{prefix}scans": float(vortices.sizes["scan"]),
+        f"{prefix}valid_fraction": float((vortices["flag"] == 0).mean()),
     }
-    found |= _sizes(f"{PREFIX}rv.", _peer_errors(vortices))
-    known = np.isfinite(vortices["y_rv"].values).all(1)
-    found[f"{PREFIX}rv.valid_fraction"] = float(known.mean())
-    if not found[f"{start}valid_fraction"]:
-        return found
-    found |= _sizes(start, errors)
-    found[f"{start}circulation_bias"] = float(np.nanmean(errors["circulation_error"]))
+    metrics |= _sizes(f"{PREFIX}rv.", _peer_errors(vortices))
+    localised = np.isfinite(vortices["y_rv"].values).all(1)
+    metrics[f"{PREFIX}rv.valid_fraction"] = float(localised.mean())
+    if not metrics[f"{prefix}valid_fraction"]:
+        return metrics
+    metrics |= _sizes(prefix, errors)
+    metrics[f"{prefix}circulation_bias"] = float(np.nanmean(errors["circulation_error"]))
     if "y_tracked" in vortices:
-        found |= _track_metrics(vortices)
+        metrics |= _track_metrics(vortices)
     for name in _QUANTITIES:
         normalised = errors[f"{name}_normalised"].values
         statistics = error_statistics(normalised, np.ones_like(normalised))
         for key in ("coverage_68", "coverage_95", "normalised_error_variance"):
-            found[f"{start}{key}_{name}"] = statistics[key]
-    return found
+            metrics[f"{prefix}{key}_{name}"] = statistics[key]
+    return metrics
 
 
-def _sizes(start: str, errors: xr.Dataset) -> dict[str, float]:
+def _sizes(prefix: str, errors: xr.Dataset) -> dict[str, float]:
     """Medians and rms of the sizes of errors."""
-    found = {}
+    metrics = {}
     for name in ("circulation", "place"):
         size = np.abs(errors[f"{name}_error"].values)
         if np.isfinite(size).any():
-            found[f"{start}{name}_error"] = float(np.nanmedian(size))
-            found[f"{start}{name}_rms"] = float(np.sqrt(np.nanmean(size**2)))
-    return found
+            metrics[f"{prefix}{name}_error"] = float(np.nanmedian(size))
+            metrics[f"{prefix}{name}_rms"] = float(np.sqrt(np.nanmean(size**2)))
+    return metrics
 
 
 def _track_metrics(vortices: xr.Dataset) -> dict[str, float]:
-    """Of the places that all slices together give: ``coherent.track.place_error``, coverages."""
-    away, found = [], {}
+    """Errors of the places tracked over all slices: ``coherent.track.place_error``, coverages."""
+    relative, metrics = [], {}
     for name in "yz":
         error = (vortices[f"{name}_tracked"] - vortices[f"{name}_true"]).values
-        away.append(error / vortices.attrs["separation"])
+        relative.append(error / vortices.attrs["separation"])
         statistics = error_statistics(error, vortices[f"{name}_tracked_stderr"].values)
         for key in ("coverage_68", "coverage_95"):
-            found[f"{PREFIX}track.{key}_{name}"] = statistics[key]
-    found[f"{PREFIX}track.place_error"] = float(np.nanmedian(np.hypot(*away)))
-    return found
+            metrics[f"{PREFIX}track.{key}_{name}"] = statistics[key]
+    metrics[f"{PREFIX}track.place_error"] = float(np.nanmedian(np.hypot(*relative)))
+    return metrics
 
 
 def _peer_errors(vortices: xr.Dataset) -> xr.Dataset:
@@ -151,7 +151,7 @@ def _peer_errors(vortices: xr.Dataset) -> xr.Dataset:
 
 
 def errors_by_age(vortices: xr.Dataset, bins: int = 4) -> Sequence[Mapping[str, float]]:
-    """Medians of the errors in intervals of equal numbers of scans, of the wake's age.
+    """Medians of the errors in intervals of the wake's age with equal numbers of scans.
 
     Returns
     -------
@@ -165,15 +165,15 @@ def errors_by_age(vortices: xr.Dataset, bins: int = 4) -> Sequence[Mapping[str, 
     ends = np.linspace(0, order.size, min(bins, order.size) + 1).astype(int)
     for low, high in pairwise(ends):
         part = errors.isel(scan=order[low:high])
-        known = np.isfinite(part["place_error"].values)
+        valid = np.isfinite(part["place_error"].values)
         row = {
             "first": float(part["age"].min()),
             "last": float(part["age"].max()),
             "scans": float(high - low),
-            "valid": float(known.any(1).sum()),
+            "valid": float(valid.any(1).sum()),
         }
         for name in ("circulation", "place"):
-            size = np.abs(part[f"{name}_error"].values[known])
+            size = np.abs(part[f"{name}_error"].values[valid])
             row[name] = float(np.median(size)) if size.size else float("nan")
         rows.append(row)
     return rows

@@ -62,29 +62,31 @@ def flight_name(mode: str, controller: str = "") -> str:
 
 def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str, float]:
     """All numbers of a flight, flat; without a lidar there is no track."""
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for mode in series["flight"].values:
-        one = series.sel(flight=mode)
-        largest = float(one["largest_control_roll_moment"])
-        key, roll = f"encounter.{mode}", _largest(one["roll"])
-        found[f"{key}.largest_roll"] = roll
-        found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
-        found[f"{key}.largest_lift"] = _largest(one["force_z"])
-        found[f"{key}.residual_moment"] = residual_moment(one)
-        found[f"{key}.roll_control_ratio"] = roll_control_ratio(one["roll_moment"].values, largest)
-        found |= {f"{key}.{name}": value for name, value in load_increments(one).items()}
-        found[f"{key}.departed"] = float(one["departed"].max())
-        found[f"{key}.hazardous"] = float(is_hazardous(roll) or one["departed"].max() > 0)
+        flight = series.sel(flight=mode)
+        largest = float(flight["largest_control_roll_moment"])
+        key, roll = f"encounter.{mode}", _largest(flight["roll"])
+        metrics[f"{key}.largest_roll"] = roll
+        metrics[f"{key}.largest_roll_rate"] = _largest(flight["roll_rate"])
+        metrics[f"{key}.largest_lift"] = _largest(flight["force_z"])
+        metrics[f"{key}.residual_moment"] = residual_moment(flight)
+        metrics[f"{key}.roll_control_ratio"] = roll_control_ratio(
+            flight["roll_moment"].values, largest
+        )
+        metrics |= {f"{key}.{name}": value for name, value in load_increments(flight).items()}
+        metrics[f"{key}.departed"] = float(flight["departed"].max())
+        metrics[f"{key}.hazardous"] = float(is_hazardous(roll) or flight["departed"].max() > 0)
     for quantity, least in LEAST_REMOVED.items():
         keys = [f"encounter.{mode}.{quantity}" for mode in ("autopilot", "feedforward", "perfect")]
-        if all(key in found for key in keys):
-            before, ours, best = (found[key] for key in keys)
+        if all(key in metrics for key in keys):
+            before, ours, best = (metrics[key] for key in keys)
             added = float(fraction_added(before, ours, best, least))
-            found[f"encounter.removed_beyond_autopilot.{quantity}"] = added
+            metrics[f"encounter.removed_beyond_autopilot.{quantity}"] = added
     if track is not None:
-        more = _tracking(series, track) | wind_ahead_metrics(track)
-        found |= {f"encounter.{k}": v for k, v in more.items()}
-    return {key: value for key, value in found.items() if np.isfinite(value)}
+        tracking = _tracking(series, track) | wind_ahead_metrics(track)
+        metrics |= {f"encounter.{k}": v for k, v in tracking.items()}
+    return {key: value for key, value in metrics.items() if np.isfinite(value)}
 
 
 def fraction_added(
@@ -99,28 +101,28 @@ def fraction_added(
     least : float
         NaN where perfect preview removes less: there is nothing that a lidar could add.
     """
-    before, ours, best = (np.asarray(one, dtype=float) for one in (autopilot, lidar, perfect))
+    before, ours, best = (np.asarray(peak, dtype=float) for peak in (autopilot, lidar, perfect))
     room = before - best
     return np.divide(before - ours, room, out=np.full(room.shape, np.nan), where=room >= least)
 
 
-def residual_moment(one: xr.Dataset) -> float:
+def residual_moment(flight: xr.Dataset) -> float:
     """Rms rolling moment of wake and controls together, over that of the wake alone.
 
     NaN where the wake's is rounding: across a wake at right angles both wings meet the same wind.
     """
-    wake, control = one["roll_moment"].values, one["control_roll_moment"].values
+    wake, control = flight["roll_moment"].values, flight["control_roll_moment"].values
     strength = float(np.sqrt(np.mean(wake**2)))
-    if strength <= _ROUNDING * float(one["largest_control_roll_moment"]):
+    if strength <= _ROUNDING * float(flight["largest_control_roll_moment"]):
         return float("nan")
     return float(np.sqrt(np.mean((wake + control) ** 2))) / strength
 
 
-def prediction_error(one: xr.Dataset) -> float:
+def prediction_error(flight: xr.Dataset) -> float:
     """Rms difference of predicted and true rolling moment, over the rms of the true one."""
-    known = np.isfinite(one["predicted_roll_moment"].values)
-    true = one["roll_moment"].values[known]
-    error = one["predicted_roll_moment"].values[known] - true
+    predicted = np.isfinite(flight["predicted_roll_moment"].values)
+    true = flight["roll_moment"].values[predicted]
+    error = flight["predicted_roll_moment"].values[predicted] - true
     strength = float(np.sqrt(np.mean(true**2))) if true.size else 0.0
     return float(np.sqrt(np.mean(error**2))) / strength if strength else float("nan")
 
@@ -142,17 +144,17 @@ def felt_from(series: xr.Dataset) -> float:
 def measured_in_flight(
     series: xr.Dataset, track: xr.Dataset, slab_depth: float
 ) -> dict[str, float]:
-    """Rows of a requirement table in flight: range from the time from an estimate to its slab.
+    """Rows of a requirement table, as measured in flight.
 
-    The range is what the aircraft flies from the moment at which an estimate is there to its slab;
-    errors are those of valid vectors and of lines of sight against the truth; u and lines of sight
-    are absent without a Doppler lidar.
+    The range is the distance flown from the delivery of an estimate to its slab; errors are those
+    of valid vectors and of lines of sight against the truth; u and lines of sight are absent
+    without a Doppler lidar.
     """
     measured = track.where(track["vectors"] > 0, drop=True)
     # as the flight begins: the wake changes it
     speed = float(series["airspeed"].isel(time=0).mean())
     look_ahead = _look_ahead(series, track)
-    found = {
+    rows = {
         "range": float(np.median(look_ahead) * speed) if look_ahead.size else float("nan"),
         "slabs_per_second": _rate(track),
         "slab_depth": slab_depth,
@@ -162,8 +164,8 @@ def measured_in_flight(
         errors = measured[f"error_{name}"].values if f"error_{name}" in measured else np.array([])
         errors = errors[np.isfinite(errors)]
         if errors.size:
-            found[f"error_{name}"] = float(np.sqrt(np.mean(errors**2)))
-    return found
+            rows[f"error_{name}"] = float(np.sqrt(np.mean(errors**2)))
+    return rows
 
 
 def judged_in_flight(
@@ -181,9 +183,9 @@ def _rate(track: xr.Dataset) -> float:
     """Estimates a second (Hz), less those that the computer skipped."""
     if track.sizes["slab"] < 2:
         return 0.0
-    taken = 1 - float(track["skipped"].mean()) if "skipped" in track else 1.0
+    processed = 1 - float(track["skipped"].mean()) if "skipped" in track else 1.0
     # without the rounding of times
-    return round(taken / float(np.median(np.diff(track["time"].values))), 9)
+    return round(processed / float(np.median(np.diff(track["time"].values))), 9)
 
 
 def _look_ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
@@ -199,67 +201,67 @@ def _look_ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
 
 def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
     """Lead time, slabs to a track, errors after some slabs and over all of them, consistency."""
-    found: dict[str, float] = {"slabs": float(track.sizes["slab"])}
-    one = series.sel(flight="feedforward")
-    found["prediction_error"] = prediction_error(one)
+    metrics: dict[str, float] = {"slabs": float(track.sizes["slab"])}
+    flight = series.sel(flight="feedforward")
+    metrics["prediction_error"] = prediction_error(flight)
     look_ahead = _look_ahead(series, track)
     if look_ahead.size:
-        found["look_ahead"] = float(np.median(look_ahead))
-    steered = np.flatnonzero(np.isfinite(one["predicted_roll_moment"].values))
+        metrics["look_ahead"] = float(np.median(look_ahead))
+    steered = np.flatnonzero(np.isfinite(flight["predicted_roll_moment"].values))
     if steered.size:
-        found["preview_from"] = float(one["time"][steered[0]])
-        found["lead_time"] = felt_from(series) - found["preview_from"]
-    if "preview_withdrawn" in one:
-        step = float(one["time"][1] - one["time"][0])
-        found["withdrawn"] = step * float(one["preview_withdrawn"].sum())
-    found |= _latencies(track)
+        metrics["preview_from"] = float(flight["time"][steered[0]])
+        metrics["lead_time"] = felt_from(series) - metrics["preview_from"]
+    if "preview_withdrawn" in flight:
+        step = float(flight["time"][1] - flight["time"][0])
+        metrics["withdrawn"] = step * float(flight["preview_withdrawn"].sum())
+    metrics |= _latencies(track)
     usable = np.flatnonzero(track["usable"].values > 0)
-    found["usable_slabs"] = float(usable.size)
+    metrics["usable_slabs"] = float(usable.size)
     accepted = track["accepted"].values > 0
-    found["accepted_slabs"] = float(accepted.sum())
-    found["rejected_slabs"] = float(track["rejected"].max()) if track.sizes["slab"] else 0.0
+    metrics["accepted_slabs"] = float(accepted.sum())
+    metrics["rejected_slabs"] = float(track["rejected"].max()) if track.sizes["slab"] else 0.0
     if usable.size:
         first = int(usable[0])
         used = np.flatnonzero(accepted)
-        found["slabs_to_track"] = float((used <= first).sum())
+        metrics["slabs_to_track"] = float((used <= first).sum())
     after = np.flatnonzero((track["updates"].values >= AFTER) & (track["usable"].values > 0))
     if after.size:
-        found |= {f"after_{AFTER}_slabs.{k}": v for k, v in _errors(track, after[:1]).items()}
-        found |= {f"tracked.{k}": v for k, v in _errors(track, after).items()}
+        metrics |= {f"after_{AFTER}_slabs.{k}": v for k, v in _errors(track, after[:1]).items()}
+        metrics |= {f"tracked.{k}": v for k, v in _errors(track, after).items()}
     dof = track["innovation_dof"].values
-    known = (dof > 0) & np.isfinite(track["innovation"].values) & accepted
-    if known.any():
+    tested = (dof > 0) & np.isfinite(track["innovation"].values) & accepted
+    if tested.any():
         # 1 where innovations are as large as stated
-        found["normalised_innovation"] = float(
-            track["innovation"].values[known].sum() / dof[known].sum()
+        metrics["normalised_innovation"] = float(
+            track["innovation"].values[tested].sum() / dof[tested].sum()
         )
-    return found
+    return metrics
 
 
 def _latencies(track: xr.Dataset) -> dict[str, float]:
     """Times from the second scan to the delivery, and what a busy computer skipped."""
     scanned = track["time"].values + np.median(np.diff(track["time"].values)) / 2
-    found = {}
+    metrics = {}
     for name, delivered, skipped in (
         ("latency", "delivered", "skipped"),
         ("wind_latency", "wind_delivered", "wind_skipped"),
     ):
         if delivered not in track or skipped not in track:
             continue
-        found[skipped + "_slabs"] = float(track[skipped].sum())
-        there = np.isfinite(track[delivered].values) & (track[skipped].values == 0)
+        metrics[skipped + "_slabs"] = float(track[skipped].sum())
+        valid = np.isfinite(track[delivered].values) & (track[skipped].values == 0)
         if name == "latency":
-            there &= track["estimated"].values > 0
-        if there.any():
-            late = track[delivered].values[there] - scanned[there]
-            found[name], found[f"{name}_99"] = map(float, np.quantile(late, [0.5, 0.99]))
-    return found
+            valid &= track["estimated"].values > 0
+        if valid.any():
+            latency = track[delivered].values[valid] - scanned[valid]
+            metrics[name], metrics[f"{name}_99"] = map(float, np.quantile(latency, [0.5, 0.99]))
+    return metrics
 
 
 def _errors(track: xr.Dataset, slabs: np.ndarray) -> dict[str, float]:
     """Largest errors of circulations (relative) and cores (m) of the track; fraction in 2 sigma."""
-    some = track.isel(slab=slabs)
-    ours, truth = some.sel(source="track"), some.sel(source="truth")
+    part = track.isel(slab=slabs)
+    ours, truth = part.sel(source="track"), part.sel(source="truth")
     relative = [np.abs(ours[q] / truth[q] - 1) for q in _CIRCULATIONS]
     cores = [
         np.hypot(ours[f"{side}_y"] - truth[f"{side}_y"], ours[f"{side}_z"] - truth[f"{side}_z"])

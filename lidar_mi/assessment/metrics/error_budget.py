@@ -99,14 +99,14 @@ def images_without(
         Pairs by cause: `monte_carlo`, `beam_blur`, with `rendered` `detector_noise`, with
         `advected` `slab`, and those of `timed`.
     """
-    found: dict[str, Pair] = {} if rendered is None else {"detector_noise": rendered}
-    found["monte_carlo"] = _plus_difference(blurred, measured, rendered or measured)
-    found["beam_blur"] = _plus_difference(measured, sharp, blurred)
+    pairs: dict[str, Pair] = {} if rendered is None else {"detector_noise": rendered}
+    pairs["monte_carlo"] = _plus_difference(blurred, measured, rendered or measured)
+    pairs["beam_blur"] = _plus_difference(measured, sharp, blurred)
     if advected is not None:
-        found["slab"] = _plus_difference(measured, advected, blurred)
+        pairs["slab"] = _plus_difference(measured, advected, blurred)
     for cause, images in (timed or {}).items():
-        found[cause] = _plus_difference(measured, images, blurred)
-    return found
+        pairs[cause] = _plus_difference(measured, images, blurred)
+    return pairs
 
 
 def _plus_difference(base: Pair, more: Pair, less: Pair) -> list[xr.DataArray]:
@@ -149,33 +149,33 @@ def chord_wind(
         for name, h in zip(("w", "v"), spacing, strict=True)
     ]
     place = np.stack([z, y]).astype(float)
-    known = np.isfinite(place).all(0)
-    middle = place = (place[:, known] - np.array([axis[0] for axis in axes])[:, None]) / spacing
+    inside = np.isfinite(place).all(0)
+    middle = place = (place[:, inside] - np.array([axis[0] for axis in axes])[:, None]) / spacing
 
-    def wind(here: np.ndarray) -> np.ndarray:
+    def wind(at: np.ndarray) -> np.ndarray:
         return np.stack(
             [
-                scipy.ndimage.map_coordinates(speed, here, prefilter=False, mode="nearest")
+                scipy.ndimage.map_coordinates(speed, at, prefilter=False, mode="nearest")
                 for speed in speeds
             ]
         )
 
-    def moved(here: np.ndarray, time: float) -> np.ndarray:
+    def moved(at: np.ndarray, time: float) -> np.ndarray:
         h = time / steps
         for _ in range(steps):
-            k1 = wind(here)
-            k2 = wind(here + h / 2 * k1)
-            k3 = wind(here + h / 2 * k2)
-            k4 = wind(here + h * k3)
-            here = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return here
+            k1 = wind(at)
+            k2 = wind(at + h / 2 * k1)
+            k3 = wind(at + h / 2 * k2)
+            k4 = wind(at + h * k3)
+            at = at + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return at
 
     # each iteration reduces the error to 1 - cos of the rotation in dt / 2
     for _ in range(4):
         before, after = moved(middle, -dt / 2), moved(middle, dt / 2)
         middle = middle + place - (before + after) / 2
-    chord = np.full((2, *known.shape), np.nan)
-    chord[:, known] = (moved(middle, dt / 2) - moved(middle, -dt / 2)) * spacing / dt
+    chord = np.full((2, *inside.shape), np.nan)
+    chord[:, inside] = (moved(middle, dt / 2) - moved(middle, -dt / 2)) * spacing / dt
     return chord[1], chord[0]
 
 
@@ -213,7 +213,7 @@ def _box_mean(truth: xr.Dataset, template: int) -> xr.Dataset:
 
 
 def moved_rigidly(
-    found: xr.Dataset,
+    wind: xr.Dataset,
     measured: Pair,
     blurred: Pair,
     truth: xr.Dataset,
@@ -228,24 +228,24 @@ def moved_rigidly(
 
     Parameters
     ----------
-    found : xr.Dataset
+    wind : xr.Dataset
         From `retrieve_wind`, with the attributes method, template, search, stride and dt.
     measured, blurred : pair
         See `images_without`.
     truth : xr.Dataset
         v, w on (z, y).
     retrieve : callable
-        Retrieves the wind from a pair by found's method, with windows so many pixels apart.
+        Retrieves the wind from a pair by the method of `wind`, with windows so many pixels apart.
 
     Returns
     -------
     xr.Dataset or None
-        `found` with other v and w; None for a method whose windows depend on each other.
+        `wind` with other v and w; None for a method whose windows depend on each other.
     """
-    if found.attrs["method"] not in _BOXES:
+    if wind.attrs["method"] not in _BOXES:
         return None
-    template, search, stride, dt = (found.attrs[n] for n in ("template", "search", "stride", "dt"))
-    mean = truth_at_vectors(found, _box_mean(truth, template))
+    template, search, stride, dt = (wind.attrs[n] for n in ("template", "search", "stride", "dt"))
+    mean = truth_at_vectors(wind, _box_mean(truth, template))
     regions = sliding_window_view(np.zeros(measured[0].shape), (search, search))[::stride, ::stride]
     places = []
     for axis, (name, component) in enumerate((("z", "w"), ("y", "v"))):
@@ -254,7 +254,7 @@ def moved_rigidly(
         start = start[:, None] if axis == 0 else start[None, :]
         pixel = np.arange(search)[:, None] if axis == 0 else np.arange(search)[None, :]
         shift = np.nan_to_num(mean[component].values) * dt / spacing
-        # the air of a window comes from where its mean wind leads back to
+        # where the air of a window comes from, by its mean wind
         place = (start - shift)[:, :, None, None] + pixel
         places.append(np.broadcast_to(place, regions.shape))
     advected = scipy.ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
@@ -262,14 +262,15 @@ def moved_rigidly(
     def cut(image: np.ndarray) -> np.ndarray:
         return sliding_window_view(image, (search, search))[::stride, ::stride]
 
-    # what is not the blurred air, mostly noise, stays as it was
-    rest = cut(measured[1].values - blurred[1].values)
+    # the difference to the blurred air, mostly noise, is unchanged
+    remaining = cut(measured[1].values - blurred[1].values)
     pair = [
-        _side_by_side(blocks, measured[0]) for blocks in (cut(measured[0].values), advected + rest)
+        _side_by_side(blocks, measured[0])
+        for blocks in (cut(measured[0].values), advected + remaining)
     ]
-    # a stride of a search region: one window in each block
-    wind = retrieve(pair, search)
-    return found.assign({name: (("z", "y"), wind[name].values) for name in ("v", "w")})
+    # with a stride of a search region there is one window in each block
+    rigid = retrieve(pair, search)
+    return wind.assign({name: (("z", "y"), rigid[name].values) for name in ("v", "w")})
 
 
 def _side_by_side(blocks: np.ndarray, like: xr.DataArray) -> xr.DataArray:
@@ -285,7 +286,7 @@ def _side_by_side(blocks: np.ndarray, like: xr.DataArray) -> xr.DataArray:
 
 
 def error_budget(
-    found: xr.Dataset,
+    wind: xr.Dataset,
     without: Mapping[str, xr.Dataset],
     truth: xr.Dataset,
     cores: Sequence[Core],
@@ -300,7 +301,7 @@ def error_budget(
 
     Parameters
     ----------
-    found : xr.Dataset
+    wind : xr.Dataset
         From `lidar_mi.retrieval.wind.pair.retrieve_wind`; with the attributes
         method, template and dt.
     without : mapping of xr.Dataset
@@ -319,27 +320,27 @@ def error_budget(
         Flat. `rmse_v`, `rmse_w` (m s^-1) with all causes; `CAUSE.rmse_v`, `.rmse_w` without it;
         `CAUSE.fraction_v`, `.fraction_w`, and `.fraction` of both together; the same of vectors
         beyond two core radii as `outside_cores....`; `vectors`, their number. Always the same
-        vectors: those of `found` that all cases retrieved. Empty where there are none.
+        vectors: those of `wind` that all cases retrieved. Empty where there are none.
     """
-    method, template, dt = (found.attrs[name] for name in ("method", "template", "dt"))
-    here = truth_at_vectors(found, truth)
-    errors = {"": _difference(found, here)}
-    for cause, wind in without.items():
-        errors[cause] = _difference(wind, truth_at_vectors(wind, truth))
+    method, template, dt = (wind.attrs[name] for name in ("method", "template", "dt"))
+    true = truth_at_vectors(wind, truth)
+    errors = {"": _difference(wind, true)}
+    for cause, partial in without.items():
+        errors[cause] = _difference(partial, truth_at_vectors(partial, truth))
     averaged = window_mean(truth, template, method)
     if averaged is not None:
-        errors["window"] = _difference(found, truth_at_vectors(found, averaged))
+        errors["window"] = _difference(wind, truth_at_vectors(wind, averaged))
     if method in _BOXES:
-        chord = chord_wind(truth, found["y_vector"].values, found["z_vector"].values, dt)
-        errors["time_step"] = _difference(found, dict(zip("vw", chord, strict=True)))
+        chord = chord_wind(truth, wind["y_vector"].values, wind["z_vector"].values, dt)
+        errors["time_step"] = _difference(wind, dict(zip("vw", chord, strict=True)))
     if perfect is not None:
         bias = _difference(perfect, truth_at_vectors(perfect, truth))
-        # as of the other causes: the errors without it
+        # as for the other causes: the errors without it
         errors["method"] = errors[""] - bias
     chosen = np.logical_and.reduce([np.isfinite(e).all(0) for e in errors.values()])
     if not flagged:
-        chosen &= found["flag"].values == 0
-    far = chosen & outside_cores(found["y_vector"].values, found["z_vector"].values, list(cores))
+        chosen &= wind["flag"].values == 0
+    far = chosen & outside_cores(wind["y_vector"].values, wind["z_vector"].values, list(cores))
     metrics = _fractions(errors, chosen)
     if cores:
         metrics |= {f"outside_cores.{key}": x for key, x in _fractions(errors, far).items()}
@@ -357,17 +358,17 @@ def _fractions(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str
     full = square.pop("")
     metrics: dict[str, float] = {"vectors": int(chosen.sum())}
     metrics |= {f"rmse_{name}": float(value**0.5) for name, value in zip("vw", full, strict=True)}
-    for cause, rest in square.items():
+    for cause, remaining in square.items():
         metrics |= {
             f"{cause}.rmse_{name}": float(value**0.5)
-            for name, value in zip("vw", rest, strict=True)
+            for name, value in zip("vw", remaining, strict=True)
         }
         if (full > 0).all():
-            parts = 1 - rest / full
+            parts = 1 - remaining / full
             metrics |= {
                 f"{cause}.fraction_{name}": float(x) for name, x in zip("vw", parts, strict=True)
             }
-            metrics[f"{cause}.fraction"] = float(1 - rest.sum() / full.sum())
+            metrics[f"{cause}.fraction"] = float(1 - remaining.sum() / full.sum())
     return metrics
 
 

@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
+from lidar_mi.flags import masks_of
 
 
 def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
@@ -22,19 +23,19 @@ def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
     """
     axes = {name: truth[name].values for name in ("z", "y")}
     places = {name: wind[f"{name}_vector"].values for name in axes}
-    known = np.ones(wind["v"].shape, bool)
+    inside = np.ones(wind["v"].shape, bool)
     for name, axis in axes.items():
         # NaN is in no interval
-        known &= (places[name] >= axis[0]) & (places[name] <= axis[-1])
-    found = {}
+        inside &= (places[name] >= axis[0]) & (places[name] <= axis[-1])
+    components = {}
     for name in ("v", "w"):
         spline = scipy.interpolate.RectBivariateSpline(
             *axes.values(), truth[name].transpose("z", "y").values, s=0
         )
-        values = np.full(known.shape, np.nan)
-        values[known] = spline.ev(places["z"][known], places["y"][known])
-        found[name] = (wind["v"].dims, values, wind[name].attrs)
-    return xr.Dataset(found)
+        values = np.full(inside.shape, np.nan)
+        values[inside] = spline.ev(places["z"][inside], places["y"][inside])
+        components[name] = (wind["v"].dims, values, wind[name].attrs)
+    return xr.Dataset(components)
 
 
 def direction(v: xr.DataArray, w: xr.DataArray) -> Any:
@@ -84,19 +85,19 @@ def error_statistics(
     if not chosen.any():
         return {}
     values = error[chosen]
-    found = {"rmse": np.sqrt(np.mean(values**2)), "bias": np.mean(values)}
+    statistics = {"rmse": np.sqrt(np.mean(values**2)), "bias": np.mean(values)}
     if stderr is not None:
-        stated = np.broadcast_to(stderr, error.shape)[chosen]
-        known = np.isfinite(stated) & (stated > 0)
-        if known.any():
-            normalised = values[known] / stated[known]
-            found |= {
-                "stderr": np.sqrt(np.mean(stated[known] ** 2)),
+        sigma = np.broadcast_to(stderr, error.shape)[chosen]
+        positive = np.isfinite(sigma) & (sigma > 0)
+        if positive.any():
+            normalised = values[positive] / sigma[positive]
+            statistics |= {
+                "stderr": np.sqrt(np.mean(sigma[positive] ** 2)),
                 "normalised_error_variance": np.mean(normalised**2),
                 "coverage_68": np.mean(np.abs(normalised) < 1),
                 "coverage_95": np.mean(np.abs(normalised) < 1.96),
             }
-    return {name: float(value) for name, value in found.items()}
+    return {name: float(value) for name, value in statistics.items()}
 
 
 def wind_metrics(wind: xr.Dataset, truth: xr.Dataset, cores: list[Core]) -> dict[str, float]:
@@ -108,17 +109,17 @@ def wind_metrics(wind: xr.Dataset, truth: xr.Dataset, cores: list[Core]) -> dict
     displacement, flagged or not; ``valid_fraction`` and ``retrieved_fraction`` of all vectors.
     """
     error = deviations(wind, truth)
-    known = np.isfinite(error["v"].values) & np.isfinite(error["w"].values)
-    valid = known & (wind["flag"].values == 0)
+    retrieved = np.isfinite(error["v"].values) & np.isfinite(error["w"].values)
+    valid = retrieved & (wind["flag"].values == 0)
     far = outside_cores(wind["y_vector"].values, wind["z_vector"].values, cores)
     metrics = {
         "valid_fraction": float(valid.mean()),
-        "retrieved_fraction": float(known.mean()),
+        "retrieved_fraction": float(retrieved.mean()),
         **_statistics(error, valid),
     }
     if cores:
         metrics |= {f"outside_cores.{k}": x for k, x in _statistics(error, valid & far).items()}
-    metrics |= {f"all.{k}": x for k, x in _statistics(error, known).items()}
+    metrics |= {f"all.{k}": x for k, x in _statistics(error, retrieved).items()}
     return metrics
 
 
@@ -127,8 +128,8 @@ def _statistics(error: xr.Dataset, chosen: np.ndarray) -> dict[str, float]:
         return {}
     statistics: dict[str, float] = {}
     for name in ("v", "w", "speed", "direction"):
-        found = error_statistics(error[name].values, where=chosen)
-        statistics |= {f"{key}_{name}": value for key, value in found.items()}
+        numbers = error_statistics(error[name].values, where=chosen)
+        statistics |= {f"{key}_{name}": value for key, value in numbers.items()}
         for rank in (50, 90):
             percentile = np.percentile(np.abs(error[name].values[chosen]), rank)
             statistics[f"p{rank}_{name}"] = float(percentile)
@@ -148,11 +149,11 @@ def error_by_quality(
     error = deviations(wind, truth)
     # per component
     square = (error["v"] ** 2 + error["w"] ** 2).values / 2
-    known = np.isfinite(square) & np.isfinite(wind[quality].values)
-    order = np.argsort(wind[quality].values[known])
-    values = wind[quality].values[known][order]
+    retrieved = np.isfinite(square) & np.isfinite(wind[quality].values)
+    order = np.argsort(wind[quality].values[retrieved])
+    values = wind[quality].values[retrieved][order]
     groups = [g for g in np.array_split(np.arange(len(order)), bins) if len(g)]
-    square, flag = square[known][order], wind["flag"].values[known][order]
+    square, flag = square[retrieved][order], wind["flag"].values[retrieved][order]
     return xr.Dataset(
         {
             "rmse": ("group", [float(np.sqrt(square[g].mean())) for g in groups]),
@@ -164,10 +165,9 @@ def error_by_quality(
 
 def commonest_flag(flag: xr.DataArray) -> str:
     """The most frequent flag, in words; ``flag`` has its CF attributes."""
-    meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
     fractions = {
-        text: float(((flag.values & mask) != 0).mean())
-        for text, mask in zip(meanings, masks, strict=True)
+        meaning: float(((flag.values & mask) != 0).mean())
+        for meaning, mask in masks_of(flag.attrs).items()
     }
     worst = max(fractions, key=fractions.__getitem__)
     return f"{round(100 * fractions[worst])} % have the flag {worst}"

@@ -1,7 +1,7 @@
 """Whether a cross-flow can be that of a wake: its sense of rotation, its divergence.
 
-A velocity or an axis of the wrong sign makes a flow that no air has, or one that rises where wakes
-descend. Every number of a run is then computed without complaint.
+A velocity or an axis of the wrong sign gives an impossible flow, or a wake that rises, and no error
+message.
 """
 
 from collections.abc import Sequence
@@ -27,10 +27,10 @@ def relative_divergence(wind: xr.Dataset) -> float:
     v, w = (wind[name].transpose("z", "y").values.astype(float) for name in ("v", "w"))
     if min(v.shape) < 2:
         return float("nan")
-    along = np.gradient(v, spacing["y"], axis=1) + np.gradient(w, spacing["z"], axis=0)
-    turning = np.gradient(w, spacing["y"], axis=1) - np.gradient(v, spacing["z"], axis=0)
-    rms = np.sqrt((turning**2).mean())
-    return float(np.sqrt((along**2).mean()) / rms) if rms > 0 else float("nan")
+    divergence = np.gradient(v, spacing["y"], axis=1) + np.gradient(w, spacing["z"], axis=0)
+    vorticity = np.gradient(w, spacing["y"], axis=1) - np.gradient(v, spacing["z"], axis=0)
+    rms = np.sqrt((vorticity**2).mean())
+    return float(np.sqrt((divergence**2).mean()) / rms) if rms > 0 else float("nan")
 
 
 def rises(cores: Sequence[Core]) -> bool:
@@ -53,15 +53,15 @@ def sense_of_rotation(wind: xr.Dataset, cores: Sequence[Core]) -> str:
     """
     if not cores:
         return "no vortices"
-    found = sorted(cores, key=lambda core: -core.y)
+    vortices = sorted(cores, key=lambda core: -core.y)
     senses = ", ".join(
-        f"{_circulation(wind, core, [other for other in found if other is not core])} "
+        f"{_circulation(wind, core, [other for other in vortices if other is not core])} "
         f"at y = {core.y:z.1f} m, z = {core.z:z.1f} m"
-        for core in found
+        for core in vortices
     )
-    if len(found) < 2:
+    if len(vortices) < 2:
         return senses
-    return f"{senses}: the pair {'rises' if rises(found) else 'sinks'}"
+    return f"{senses}: the pair {'rises' if rises(vortices) else 'sinks'}"
 
 
 def _circulation(wind: xr.Dataset, core: Core, others: Sequence[Core]) -> str:

@@ -8,8 +8,8 @@ from lidar_mi.instrument.products import linear_depolarization
 
 def noise_metrics(scan: xr.Dataset) -> dict[str, float]:
     """Monte Carlo standard error over signal, median over the pixels, ``mc_relative_error``."""
-    lit = scan["S0"].where(scan["S0"] > 0)
-    return {f"{Source.BACKSCATTER}.mc_relative_error": float((scan["S0_stderr"] / lit).median())}
+    signal = scan["S0"].where(scan["S0"] > 0)
+    return {f"{Source.BACKSCATTER}.mc_relative_error": float((scan["S0_stderr"] / signal).median())}
 
 
 def light_metrics(scan: xr.Dataset) -> dict[str, float]:

@@ -10,16 +10,16 @@ INCREMENTS = ("largest_load_increment", "largest_bending_increment")
 """What `load_increments` finds: load factor, and bending moment of a wing root (N m)."""
 
 
-def load_increments(one: xr.Dataset) -> dict[str, float]:
+def load_increments(flight: xr.Dataset) -> dict[str, float]:
     """`INCREMENTS` of a flight; NaN for an aircraft that does not rise, nothing without loads.
 
     Parameters
     ----------
-    one : xr.Dataset, dims (time)
+    flight : xr.Dataset, dims (time)
         A flight from its trim; the bending of the larger of both wings counts.
     """
-    if "load_factor" not in one:
+    if "load_factor" not in flight:
         return {}
-    load = one["load_factor"] - one["load_factor"].isel(time=0)
-    bending = np.abs(np.stack([one[f"{side}_bending"] for side in ("port", "starboard")]))
+    load = flight["load_factor"] - flight["load_factor"].isel(time=0)
+    bending = np.abs(np.stack([flight[f"{side}_bending"] for side in ("port", "starboard")]))
     return dict(zip(INCREMENTS, (float(np.abs(load).max()), float(bending.max())), strict=True))

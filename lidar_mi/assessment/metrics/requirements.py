@@ -133,7 +133,7 @@ def judge(
         An unknown name, or an impossible value.
     """
     for name, value in measured.items():
-        _known(name, "measured")
+        _check_name(name, "measured")
         if value is not None and (value < 0 or math.isinf(value)):
             unit = QUANTITIES[name][1]
             raise InputError(
@@ -180,7 +180,7 @@ def as_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str, str]]
         margin = "" if math.isnan(finding.margin) else f"{100 * finding.margin:+.0f} %"
         # none has no sign
         margin = "0 %" if margin in ("+0 %", "-0 %") else margin
-        measured = _shown(finding.measured, unit) if not math.isnan(finding.measured) else ""
+        measured = _with_unit(finding.measured, unit) if not math.isnan(finding.measured) else ""
         rows.append((name, _required(finding, unit), measured, margin, verdict))
     return rows
 
@@ -195,7 +195,7 @@ def _section(data: object, place: str) -> Mapping[str, object]:
     return data
 
 
-def _known(name: str, place: str) -> None:
+def _check_name(name: str, place: str) -> None:
     if name in QUANTITIES:
         return
     close = difflib.get_close_matches(str(name), QUANTITIES, 1)
@@ -208,13 +208,13 @@ def _table(place: str, application: str, title: str, phase: str, rows: object) -
     speed = _limits(f"{place}.speed", rows.pop("speed")) if "speed" in rows else {}
     if "fraction_of_range" in speed:
         raise InputError(f"{place}.speed.max_of_range: not allowed; expected min or max")
-    found = tuple(_row(place, *row) for row in _section(rows, place).items())
+    requirements = tuple(_row(place, *row) for row in _section(rows, place).items())
     slowest, fastest = speed.get("minimum", 0.0), speed.get("maximum", math.inf)
-    return RequirementTable(application, title, phase, found, slowest, fastest)
+    return RequirementTable(application, title, phase, requirements, slowest, fastest)
 
 
 def _row(place: str, quantity: str, limits: object) -> Requirement:
-    _known(quantity, place)
+    _check_name(quantity, place)
     unit = QUANTITIES[quantity][1]
     place = f"{place}.{quantity}"
     row = Requirement(quantity, **_limits(place, limits, unit))
@@ -225,7 +225,7 @@ def _row(place: str, quantity: str, limits: object) -> Requirement:
 
 def _limits(place: str, limits: object, unit: str = "m/s") -> dict[str, float]:
     """Limits in SI by the names that they have in `Requirement`."""
-    found: dict[str, float] = {}
+    si: dict[str, float] = {}
     for limit, value in _section(limits, place).items():
         if limit not in _LIMITS:
             raise InputError(f"{place}.{limit}: unknown limit (allowed: {', '.join(_LIMITS)})")
@@ -235,10 +235,10 @@ def _limits(place: str, limits: object, unit: str = "m/s") -> dict[str, float]:
             raise InputError(f"{place}.{limit}: {error}") from None
         if not (number > 0 and math.isfinite(number)):
             raise InputError(f"{place}.{limit}: {value!r} is not allowed; expected more than 0")
-        found[_LIMITS[limit]] = number
-    if found.get("minimum", 0.0) > found.get("maximum", math.inf):
+        si[_LIMITS[limit]] = number
+    if si.get("minimum", 0.0) > si.get("maximum", math.inf):
         raise InputError(f"{place}: min above max is not allowed")
-    return found
+    return si
 
 
 def _judged(row: Requirement, measured: float, distance: float, reason: str) -> Finding:
@@ -263,11 +263,11 @@ def _judged(row: Requirement, measured: float, distance: float, reason: str) -> 
 def _required(finding: Finding, unit: str) -> str:
     if math.isnan(finding.maximum):
         return "fraction of the range"
-    low, high = _shown(finding.minimum, unit), _shown(finding.maximum, unit)
+    low, high = _with_unit(finding.minimum, unit), _with_unit(finding.maximum, unit)
     if math.isinf(finding.maximum):
         return f"at least {low}"
     return f"{finding.minimum:.4g} to {high}" if finding.minimum > 0 else f"at most {high}"
 
 
-def _shown(value: float, unit: str) -> str:
+def _with_unit(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}".strip() if value < 1000 else f"{value:.0f} {unit}".strip()

@@ -22,9 +22,9 @@ LEAST_EXPLAINED = 0.5
 _POINTS_PER_KNOB = 8
 # Draws of hyperparameters, functions of each, rows of Saltelli's matrices.
 _PROCESSES, _FUNCTIONS, _SALTELLI = 12, 16, 1024
-# Functions of the process are smoother than some metrics. Intervals are wider by this much and by
-# this fraction of the variance that the process does not explain: then they hold the indices of the
-# test functions of Ishigami and Sobol' at 256 points, with and without noise.
+# Functions of the process are smoother than some metrics. Intervals are widened by this and by this
+# fraction of the unexplained variance: then they contain the indices of the test functions of
+# Ishigami and Sobol' at 256 points, with and without noise.
 _RESOLUTION, _MISSED = 0.01, 0.25
 
 
@@ -42,8 +42,8 @@ class SobolIndices:
         95 % confidence intervals.
     explained : float
         Q2: fraction of the variance over the points that is predicted by the others
-        (leave-one-out). The remainder is luck, or a dependence too sharp for so few points.
-    luck : float
+        (leave-one-out). The remainder is random, or a dependence too sharp for so few points.
+    between_members : float
         Fraction of the variance of single members that is between members of the same point; NaN
         without members.
     points : int
@@ -58,7 +58,7 @@ class SobolIndices:
     first_interval: Array
     total_interval: Array
     explained: float
-    luck: float
+    between_members: float
     points: int
     reason: str
 
@@ -78,8 +78,8 @@ def unit_cube(knobs: Mapping[str, ArrayLike], logarithmic: Sequence[str] = ()) -
         that is not positive, a knob that does not vary.
     """
     columns = []
-    for name, given in knobs.items():
-        values = np.asarray(given, dtype=float)
+    for name, samples in knobs.items():
+        values = np.asarray(samples, dtype=float)
         if name in logarithmic:
             if not (values > 0).all():
                 raise InputError(f"{name}: {values.min()} is not allowed; expected more than 0")
@@ -127,13 +127,21 @@ def sobol_indices(
     if len(table) != len(cube):
         raise InputError(f"values: {len(table)} are not allowed; expected {len(cube)}, one a point")
     table = np.where(np.isfinite(table), table, np.nan).reshape(len(table), -1)
-    known = np.isfinite(table).any(axis=1)
-    cube, table = cube[known], table[known]
+    finite = np.isfinite(table).any(axis=1)
+    cube, table = cube[finite], table[finite]
     count, needed = len(table), _POINTS_PER_KNOB * len(knobs)
     unknown, interval = np.full(len(knobs), np.nan), np.full((len(knobs), 2), np.nan)
-    luck = _luck(table)
+    between_members = _member_fraction(table)
     none = SobolIndices(
-        tuple(knobs), unknown, unknown, interval, interval, np.nan, luck, count, reason=""
+        tuple(knobs),
+        unknown,
+        unknown,
+        interval,
+        interval,
+        np.nan,
+        between_members,
+        count,
+        reason="",
     )
     if count < needed:
         few = f"{count} points with a value; {needed} are needed for {len(knobs)} knobs"
@@ -145,11 +153,11 @@ def sobol_indices(
     scaled = (mean - mean.mean()) / mean.std()
     rng = np.random.default_rng(seed)
     drawn = processes(cube, scaled, _PROCESSES, rng)
-    explained = _explained(scaled, np.mean([one.without_each() for one in drawn], axis=0))
+    explained = _explained(scaled, np.mean([process.without_each() for process in drawn], axis=0))
     if explained < LEAST_EXPLAINED:
         poor = (
             f"the other points predict {100 * max(explained, 0.0):.0f} % of the variance of a "
-            f"point, less than {100 * LEAST_EXPLAINED:.0f} %: luck, or too few points"
+            f"point, less than {100 * LEAST_EXPLAINED:.0f} %: random, or too few points"
         )
         return replace(none, explained=explained, reason=poor)
     first, total = _index_draws(drawn, rng)
@@ -169,7 +177,7 @@ def _interval(draws: Array, missed: float) -> Array:
     return np.clip(np.stack([low - missed, high + missed], axis=1), 0.0, 1.0)
 
 
-def _luck(table: Array) -> float:
+def _member_fraction(table: Array) -> float:
     repeated = np.isfinite(table).sum(axis=1) > 1
     if not repeated.any():
         return np.nan
@@ -190,7 +198,7 @@ def _index_draws(drawn: Sequence[Process], rng: np.random.Generator) -> tuple[Ar
     for process in drawn:
         pairs = qmc.Sobol(2 * knobs, seed=rng).random(_SALTELLI)
         a, b = pairs[:, :knobs], pairs[:, knobs:]
-        # one column of A at a time is that of B
+        # A with one column at a time replaced by that of B
         mixed = np.where(np.eye(knobs, dtype=bool)[:, None], b, a)
         places = np.concatenate([a, b, *mixed])
         functions = process.functions(places, _FUNCTIONS, rng).T

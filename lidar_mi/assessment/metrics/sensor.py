@@ -39,7 +39,7 @@ class LidarCost:
     aided_hazard_distance: float | None = None
 
 
-def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, float]:
+def vector_metrics(wind: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, float]:
     """Errors of valid vectors (flag 0) of both lidars, as of `errors.error_statistics`.
 
     ``sensor.rmse_*``, ``bias_*`` (m/s), ``normalised_error_variance_*``, ``coverage_68_*``,
@@ -48,35 +48,35 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
 
     Parameters
     ----------
-    found : xr.Dataset or None
+    wind : xr.Dataset or None
         From `combined.combine.combine`, with u_true, v_true, w_true; None: there is no wind.
     """
-    if found is None:
+    if wind is None:
         return {"sensor.valid_fraction": 0.0, "sensor.vectors": 0}
     # with torch, which `check` does without
-    from lidar_mi.retrieval.combined.combine import CombinedFlag
+    from lidar_mi.flags import CombinedFlag
 
-    valid = found["flag"].values == 0
-    z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
+    valid = wind["flag"].values == 0
+    z, y = np.meshgrid(wind["z"], wind["y"], indexing="ij")
     far = valid & outside_cores(y, z, list(cores))
-    beyond_lines = (found["flag"].values & CombinedFlag.BEYOND_LINES) != 0
+    beyond_lines = (wind["flag"].values & CombinedFlag.BEYOND_LINES) != 0
     metrics = {
         "sensor.valid_fraction": float(valid.mean()),
         "sensor.vectors": int(valid.sum()),
         "sensor.spanned_fraction": float(1 - beyond_lines.mean()),
     }
     for name in COMPONENTS:
-        true = found[f"{name}_true"].values
-        error = found[name].values - true
-        here = error_statistics(error, found[f"{name}_stderr"].values, valid)
+        true = wind[f"{name}_true"].values
+        error = wind[name].values - true
+        statistics = error_statistics(error, wind[f"{name}_stderr"].values, valid)
         for key in ("rmse", "bias", "normalised_error_variance", "coverage_68", "coverage_95"):
-            if key in here:
-                metrics[f"sensor.{key}_{name}"] = here[key]
+            if key in statistics:
+                metrics[f"sensor.{key}_{name}"] = statistics[key]
         beyond = far & np.isfinite(error)
         if beyond.any():
             rmse = error_statistics(error, where=beyond)["rmse"]
             metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
-            # errors as large as this are those of zero wind
+            # the rms error of zero wind
             strength = float(np.sqrt((true[beyond] ** 2).mean()))
             metrics[f"sensor.outside_cores.rms_{name}"] = strength
             metrics[f"sensor.outside_cores.std_{name}"] = float(true[beyond].std())
@@ -84,20 +84,20 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
 
 
 def without_skill(metrics: Mapping[str, float]) -> list[str]:
-    """Components whose rms error is as large as the true wind varies, beyond two core radii.
+    """Components whose rms error equals the spread of the true wind: without skill.
 
-    Their mean would do as well. As large: less than it by no more than the standard error of an rms
-    of so many values, 1 / sqrt(2 n) of it (Gaussian).
+    Beyond two core radii. Equal: not smaller by more than the standard error of an rms of n values,
+    1 / sqrt(2 n) of it (Gaussian).
     """
     number = metrics.get("sensor.vectors", 0)
-    found = []
+    components = []
     for name in COMPONENTS:
         keys = [f"sensor.outside_cores.{key}_{name}" for key in ("rmse", "std")]
         if number and all(key in metrics for key in keys):
             error, spread = (metrics[key] for key in keys)
             if error >= spread * (1 - 1 / math.sqrt(2 * number)):
-                found.append(name)
-    return found
+                components.append(name)
+    return components
 
 
 def line_metrics(lines: xr.Dataset) -> dict[str, float]:
@@ -113,10 +113,10 @@ def line_metrics(lines: xr.Dataset) -> dict[str, float]:
         "sensor.lines": len(error),
         "sensor.lines_retrieved": int(np.isfinite(error).sum()),
     }
-    found = error_statistics(error, lines["v_los_std"].values)
+    statistics = error_statistics(error, lines["v_los_std"].values)
     for key in ("rmse", "bias", "normalised_error_variance"):
-        if key in found:
-            metrics[f"sensor.{key}_v_los"] = found[key]
+        if key in statistics:
+            metrics[f"sensor.{key}_v_los"] = statistics[key]
     return metrics
 
 
@@ -131,11 +131,11 @@ def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) ->
         u, v, w on (z, y).
     """
     metrics = {}
-    for key, found in winds.items():
-        valid = found["flag"].values == 0
+    for key, wind in winds.items():
+        valid = wind["flag"].values == 0
         for name in COMPONENTS:
-            true = truth[name].interp(z=found["z"], y=found["y"])
-            errors = error_statistics((found[name] - true).values, where=valid)
+            true = truth[name].interp(z=wind["z"], y=wind["y"])
+            errors = error_statistics((wind[name] - true).values, where=valid)
             if errors:
                 metrics[f"sensor.{key}.rmse_{name}"] = errors["rmse"]
     return metrics

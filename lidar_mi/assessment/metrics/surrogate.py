@@ -57,16 +57,18 @@ class Process:
         inverse = linalg.inv(_covariance(self.points, self.logs))
         rows = inverse.sum(axis=0)
         mean = rows @ self.values / rows.sum()
-        rest = self.values - mean
-        std = np.sqrt(rest @ inverse @ rest / len(rest))
+        residual = self.values - mean
+        std = np.sqrt(residual @ inverse @ residual / len(residual))
         spectrum = rng.standard_normal((_FEATURES, len(lengths))) / lengths
         spectrum /= np.sqrt(rng.chisquare(5, (_FEATURES, 1)) / 5)
         phases = rng.uniform(0, 2 * np.pi, _FEATURES)
         weights = std * np.sqrt(2 / _FEATURES) * rng.standard_normal((_FEATURES, count))
-        prior, there = (np.cos(x @ spectrum.T + phases) @ weights for x in (self.points, places))
+        prior, prior_there = (
+            np.cos(x @ spectrum.T + phases) @ weights for x in (self.points, places)
+        )
         prior += std * np.sqrt(noise) * rng.standard_normal(prior.shape)
         gain = _matern(places, self.points, lengths) @ inverse
-        return np.asarray(mean + there + gain @ (self.values[:, None] - mean - prior))
+        return np.asarray(mean + prior_there + gain @ (self.values[:, None] - mean - prior))
 
 
 def processes(points: Array, values: Array, count: int, rng: np.random.Generator) -> list[Process]:
@@ -75,16 +77,16 @@ def processes(points: Array, values: Array, count: int, rng: np.random.Generator
     The density is taken as normal about its maximum (Laplace's approximation).
     """
     learning = rng.permutation(len(points))[:_LEARNING]
-    known = points[learning], values[learning]
+    sample = points[learning], values[learning]
     variables = points.shape[1]
     starts = np.append(np.zeros(variables), np.log(0.01)), np.full(variables + 1, -1.0)
     bounds = np.array([_LENGTHS] * variables + [_NOISE])
-    found = (
-        optimize.minimize(_misfit, start, known, "L-BFGS-B", jac=True, bounds=bounds)
+    optima = (
+        optimize.minimize(_misfit, start, sample, "L-BFGS-B", jac=True, bounds=bounds)
         for start in starts
     )
-    best = min(found, key=lambda one: float(one.fun)).x
-    spread = _spread(best, *known)
+    best = min(optima, key=lambda optimum: float(optimum.fun)).x
+    spread = _spread(best, *sample)
     drawn = best + rng.standard_normal((count, len(best))) @ spread
     return [Process(points, values, logs) for logs in np.clip(drawn, *bounds.T)]
 
@@ -95,9 +97,9 @@ def _misfit(logs: Array, points: Array, values: Array) -> tuple[float, Array]:
     factor = linalg.cho_factor(_covariance(points, logs), lower=True, check_finite=False)
     inverse = linalg.cho_solve(factor, np.eye(count), check_finite=False)
     rows = inverse.sum(axis=0)
-    rest = values - rows @ values / rows.sum()
-    weights = inverse @ rest
-    variance = rest @ weights / count
+    residual = values - rows @ values / rows.sum()
+    weights = inverse @ residual
+    variance = residual @ weights / count
     misfit = count * np.log(variance) + 2 * np.log(np.diag(factor[0])).sum()
     outer = inverse - np.outer(weights, weights) / variance
     distance = _distance(points, points, lengths)
@@ -118,13 +120,13 @@ def _spread(logs: Array, points: Array, values: Array) -> Array:
         for step in steps
     ]
     curvature = np.array(gradients) / 2e-3
-    # minus twice a log density; nothing is known less well than before
+    # of minus twice a log density; the posterior is no wider than the prior
     precision, axes = np.linalg.eigh((curvature + curvature.T) / 4)
     return np.asarray((axes / np.sqrt(np.maximum(precision, _PRIOR_STD**-2))).T)
 
 
 def _covariance(points: Array, logs: Array) -> Array:
-    """Of the values, over the function's variance."""
+    """Covariance of the values over the function's variance."""
     correlation = _matern(points, points, np.exp(logs[:-1]))
     return correlation + np.exp(logs[-1]) * np.eye(len(points))
 

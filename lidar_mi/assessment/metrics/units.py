@@ -39,11 +39,11 @@ _ENCOUNTER = {
 def _of_vortices() -> dict[str, str]:
     from lidar_mi.retrieval.vortices.pair import MEANING
 
-    written = {
+    parameters = {
         name: units.replace(" s-1", "/s").replace("m2", "m²")
         for name, (units, _) in MEANING.items()
     }
-    return written | {"model_error": "m/s"}
+    return parameters | {"model_error": "m/s"}
 
 
 def unit_of(key: str) -> str:

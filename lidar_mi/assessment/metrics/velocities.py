@@ -29,7 +29,7 @@ PEAK_READERS = (RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG)
 CENTRES: Mapping[str, str] = {RingCentre.FREE: "centre found", RingCentre.KNOWN: "centre known"}
 
 
-def velocity_metrics(found: "xr.Dataset") -> dict[str, float]:
+def velocity_metrics(velocities: "xr.Dataset") -> dict[str, float]:
     """Error measures of every method, centre and number of averaged images.
 
     Keys ``doppler.METHOD.centre_CENTRE.averaged_N.`` and, all but the first in m/s,
@@ -47,23 +47,23 @@ def velocity_metrics(found: "xr.Dataset") -> dict[str, float]:
 
     Parameters
     ----------
-    found : xr.Dataset
+    velocities : xr.Dataset
         ``v`` and ``v_std`` with dims (algorithm, centre, averaged, v_los, image), NaN where there
         is none, ``v_systematic`` likewise, and ``tried`` (algorithm), the images of every case.
     """
     metrics = {}
-    for algorithm in found["algorithm"].values:
-        tried = int(found["tried"].sel(algorithm=algorithm))
-        for centre in found["centre"].values:
-            for averaged in found["averaged"].values:
-                case = found.sel(algorithm=algorithm, centre=centre, averaged=averaged)
+    for algorithm in velocities["algorithm"].values:
+        tried = int(velocities["tried"].sel(algorithm=algorithm))
+        for centre in velocities["centre"].values:
+            for averaged in velocities["averaged"].values:
+                case = velocities.sel(algorithm=algorithm, centre=centre, averaged=averaged)
                 error = (case["v"] - case["v_los"]).transpose("v_los", "image").values
                 measures = _spread(error, tried)
                 for name, part in (("std", "v_std"), ("systematic", "v_systematic")):
-                    stated = case[part].values if part in case else np.empty(0)
-                    stated = stated[np.isfinite(stated)]
-                    if stated.size:
-                        measures[f"expected_{name}"] = float(np.sqrt((stated**2).mean()))
+                    expected = case[part].values if part in case else np.empty(0)
+                    expected = expected[np.isfinite(expected)]
+                    if expected.size:
+                        measures[f"expected_{name}"] = float(np.sqrt((expected**2).mean()))
                 for name, value in measures.items():
                     metrics[ring_key(algorithm, centre, averaged, name)] = value
     return metrics
@@ -71,8 +71,8 @@ def velocity_metrics(found: "xr.Dataset") -> dict[str, float]:
 
 def _spread(error: np.ndarray, tried: int) -> dict[str, float]:
     """Measures of errors (speeds, images)."""
-    known = np.isfinite(error)
-    count = known.sum(1)
+    finite = np.isfinite(error)
+    count = finite.sum(1)
     measures = {}
     if tried:
         measures["retrieved_fraction"] = float(count.sum() / (tried * len(error)))

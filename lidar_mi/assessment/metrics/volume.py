@@ -13,7 +13,7 @@ from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 COMPONENTS = ("u", "v", "w")
 
 
-def volume_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
+def volume_metrics(winds: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
     """Errors against the truth, ``source.method.quantity``, of valid vectors (flag 0).
 
     ``rmse_u`` and so on, ``bias_u``, ``stderr_u``, ``normalised_error_variance_u``,
@@ -23,17 +23,17 @@ def volume_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]
 
     Parameters
     ----------
-    found : xr.Dataset, dims (source, algorithm, x, z, y)
+    winds : xr.Dataset, dims (source, algorithm, x, z, y)
         u, v, w, their ``_true`` and ``_stderr`` (m s^-1), flag.
     """
-    true = found[[f"{name}_true" for name in COMPONENTS]]
+    true = winds[[f"{name}_true" for name in COMPONENTS]]
     true = true.rename({f"{name}_true": name for name in COMPONENTS})
     metrics = true_wind_metrics(true, cores, COMPONENTS)
-    y, z = found["y"].values, found["z"].values[:, None]
-    far = np.broadcast_to(outside_cores(y, z, list(cores)), found["u_true"].shape)
-    for source in found["source"].values:
-        for method in found["algorithm"].values:
-            wind = found.sel(source=source, algorithm=method)
+    y, z = winds["y"].values, winds["z"].values[:, None]
+    far = np.broadcast_to(outside_cores(y, z, list(cores)), winds["u_true"].shape)
+    for source in winds["source"].values:
+        for method in winds["algorithm"].values:
+            wind = winds.sel(source=source, algorithm=method)
             for key, value in _errors(wind, far).items():
                 metrics[wind_key(source, method, key)] = value
     return metrics
@@ -44,11 +44,11 @@ def _errors(wind: xr.Dataset, far: np.ndarray) -> dict[str, float]:
     metrics = {"valid_fraction": float(valid.mean())}
     for name in COMPONENTS:
         error, stderr = (wind[name] - wind[f"{name}_true"]).values, wind[f"{name}_stderr"].values
-        here = error_statistics(error, stderr, valid)
+        statistics = error_statistics(error, stderr, valid)
         beyond, everywhere = error_statistics(error, where=valid & far), error_statistics(error)
         for key in ("rmse", "bias", "stderr", "normalised_error_variance", "coverage_68"):
-            if key in here:
-                metrics[f"{key}_{name}"] = here[key]
+            if key in statistics:
+                metrics[f"{key}_{name}"] = statistics[key]
         if beyond:
             metrics[f"outside_cores.rmse_{name}"] = beyond["rmse"]
         if everywhere:

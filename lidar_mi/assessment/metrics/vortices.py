@@ -98,10 +98,10 @@ def _model_errors(
     metrics = {}
     for name in ("v", "w"):
         error = model[name].values - truth[name].transpose("z", "y").values
-        found = error_statistics(error, model[f"{name}_stderr"].values)
+        statistics = error_statistics(error, model[f"{name}_stderr"].values)
         for key in ("rmse", "normalised_error_variance"):
-            if key in found:
-                metrics[f"{key}_{name}"] = found[key]
+            if key in statistics:
+                metrics[f"{key}_{name}"] = statistics[key]
         if cores and far.any():
             beyond = error_statistics(error, where=far)
             metrics[f"outside_cores.rmse_{name}"] = beyond["rmse"]

@@ -14,14 +14,14 @@ def wind_ahead_metrics(track: xr.Dataset) -> dict[str, float]:
     """
     if "arrival_v" not in track:
         return {}
-    found, normalised = {}, []
+    metrics, normalised = {}, []
     for name in "vw":
         truth = track[f"arrival_{name}_true"].values
-        off = track[f"arrival_{name}"].values - truth
-        found[f"wind_ahead.{name}_error"] = float(np.sqrt(np.mean(off**2)))
-        found[f"wind_ahead.{name}_rms"] = float(np.sqrt(np.mean(truth**2)))
+        error = track[f"arrival_{name}"].values - truth
+        metrics[f"wind_ahead.{name}_error"] = float(np.sqrt(np.mean(error**2)))
+        metrics[f"wind_ahead.{name}_rms"] = float(np.sqrt(np.mean(truth**2)))
         stderr = np.maximum(track[f"arrival_{name}_stderr"].values, np.finfo(float).tiny)
-        normalised.append(np.abs(off) / stderr)
+        normalised.append(np.abs(error) / stderr)
     for count in (1, 2):
-        found[f"wind_ahead.within_{count}_sigma"] = float(np.mean(np.array(normalised) <= count))
-    return found
+        metrics[f"wind_ahead.within_{count}_sigma"] = float(np.mean(np.array(normalised) <= count))
+    return metrics

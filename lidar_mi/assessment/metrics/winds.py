@@ -10,16 +10,16 @@ from lidar_mi.assessment.metrics.names import sweep_key, wind_key
 from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 
 
-def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
+def cross_flow_metrics(winds: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
     """Errors and efficiencies of every method from every source, ``source.method.quantity``.
 
     Of winds (source, algorithm, z, y) with ``v_true``, ``v_bound`` and likewise of w (m s^-1),
     their flags and positions.
     """
     metrics: dict[str, float] = {}
-    for source in found["source"].values:
-        for method in found["algorithm"].values:
-            wind = found.sel(source=source, algorithm=method)
+    for source in winds["source"].values:
+        for method in winds["algorithm"].values:
+            wind = winds.sel(source=source, algorithm=method)
             true = wind[["v_true", "w_true"]].rename(v_true="v", w_true="w")
             numbers = wind_metrics(wind, true, list(cores)) | efficiency(wind) | skill(wind)
             numbers |= coverage(wind)
@@ -48,7 +48,7 @@ def efficiency(wind: xr.Dataset) -> dict[str, float]:
 
 
 def coverage(wind: xr.Dataset) -> dict[str, float]:
-    """How often errors of valid vectors lie within what a method states, of v and w.
+    """Fractions of the errors of valid v and w within the stated errors.
 
     ``coverage_68_*``, ``coverage_95_*``: as of `errors.error_statistics`; empty for methods that
     state no errors.
@@ -58,31 +58,33 @@ def coverage(wind: xr.Dataset) -> dict[str, float]:
         if f"{name}_stderr" not in wind:
             continue
         error = (wind[name] - wind[f"{name}_true"]).values
-        found = error_statistics(error, wind[f"{name}_stderr"].values, wind["flag"].values == 0)
+        statistics = error_statistics(
+            error, wind[f"{name}_stderr"].values, wind["flag"].values == 0
+        )
         for key in ("coverage_68", "coverage_95"):
-            metrics |= {f"{key}_{name}": found[key]} if key in found else {}
+            metrics |= {f"{key}_{name}": statistics[key]} if key in statistics else {}
     return metrics
 
 
 def skill(wind: xr.Dataset) -> dict[str, float]:
-    """What a method states of its own errors; empty for methods that state none.
+    """Standard errors as a method states them; empty for methods that state none.
 
     ``stderr_*``: rms standard error, m/s, of vectors that are valid, or whose only flag is
     `no_skill`. ``no_skill_fraction``: 1 where they equal the rms of the true wind or exceed it,
     else the fraction of all vectors with that flag.
     """
-    from lidar_mi.retrieval.images.quality import Flag
+    from lidar_mi.flags import Flag
 
     flag = wind["flag"].values
     # no flag, or this one alone
     used = (flag | Flag.NO_SKILL.value) == Flag.NO_SKILL.value
     metrics: dict[str, float] = {}
     for name in ("v", "w"):
-        stated = wind[f"{name}_stderr"].values if f"{name}_stderr" in wind else np.nan
-        stated = np.broadcast_to(stated, flag.shape)
-        known = used & np.isfinite(stated)
-        if known.any():
-            metrics[f"stderr_{name}"] = float(np.sqrt(np.mean(stated[known].astype(float) ** 2)))
+        stderr = wind[f"{name}_stderr"].values if f"{name}_stderr" in wind else np.nan
+        stderr = np.broadcast_to(stderr, flag.shape)
+        finite = used & np.isfinite(stderr)
+        if finite.any():
+            metrics[f"stderr_{name}"] = float(np.sqrt(np.mean(stderr[finite].astype(float) ** 2)))
     if len(metrics) == 2:
         true = [np.sqrt(np.mean(wind[f"{name}_true"].values ** 2)) for name in ("v", "w")]
         none = np.hypot(metrics["stderr_v"], metrics["stderr_w"]) >= np.hypot(*true)

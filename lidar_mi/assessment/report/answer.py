@@ -29,12 +29,12 @@ from lidar_mi.schema.experiment import Experiment
 from lidar_mi.tables import with_error
 from lidar_mi.units import shown
 
-# Fraction of errors within 1.96 standard errors below which, and within 1 above which, they are
-# reported not to hold: four standard errors of these fractions for the eighty independent windows
-# of an image of 219 x 139 pixels, from a fifth of valid vectors on.
-_HOLDS, _ENOUGH = (0.85, 0.89), 0.2
+# Stated errors are reported as wrong if less than the first fraction of errors is within 1.96 of
+# them, or more than the second within 1: four standard errors of these fractions for the eighty
+# independent windows of 219 x 139 pixels. Judged if at least a fifth of the vectors is valid.
+_COVERAGE_LIMITS, _LEAST_VALID = (0.85, 0.89), 0.2
 # Standard errors of a circulation from which its error is named.
-_FAR_OFF = 3.0
+_LEAST_DEPARTURE = 3.0
 
 
 def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
@@ -56,7 +56,11 @@ def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged 
     """
     simulated = simulation_sentence(experiment, metrics)
     lines = [simulated] if simulated else []
-    lines += [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
+    lines += [
+        *_wind(experiment, metrics),
+        *_misstatements(experiment, metrics),
+        *_vortices(metrics),
+    ]
     lines += _scatterers(metrics)
     speed = experiment.platform.speed if experiment.imaged_wake else 0.0
     lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
@@ -102,7 +106,7 @@ def _sensor(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     if not metrics["sensor.vectors"]:
         return f"{head}: no valid wind vector."
     far = far_from_cores(metrics, "sensor.", "rmse_")
-    # an error of what is not there says nothing
+    # a component that is zero has no error
     components = "vw" if metrics.get(f"sensor.{far}rms_u") == 0 else "uvw"
     errors = _values(metrics, f"sensor.{far}rmse_", components)
     true = _values(metrics, f"sensor.{far}rms_", components)
@@ -126,9 +130,9 @@ def _images(experiment: Experiment, metrics: Mapping[str, float]) -> str:
         errors = _values(metrics, wind_key(source, method, f"{far}rmse_"), components)
         if valid is None:
             continue
-        found = f"{errors} m/s ({whole_percent(valid)} valid)" if errors else "no valid vector"
-        found = "no skill" if has_no_skill(metrics, source, method) else found
-        parts.append(f"{METHOD_NAMES[method]} {found}")
+        result = f"{errors} m/s ({whole_percent(valid)} valid)" if errors else "no valid vector"
+        result = "no skill" if has_no_skill(metrics, source, method) else result
+        parts.append(f"{METHOD_NAMES[method]} {result}")
     true = _values(metrics, f"true_wind.{far}rms_", components)
     return (
         f"Backscatter lidar, {_place(experiment)}{_without_noise(experiment)}: rms errors of "
@@ -160,8 +164,8 @@ def _rings(doppler: Doppler, metrics: Mapping[str, float]) -> Iterator[str]:
         )
 
 
-def _stated(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
-    """Standard errors that do not hold here, of the winds that the answer names."""
+def _misstatements(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
+    """Sentences on wrong standard errors of the winds that the answer names."""
     if "sensor.vectors" in metrics:
         yield from _misstated("both lidars", metrics, "sensor.", "uvw")
     elif experiment.imaged_wake:
@@ -175,14 +179,14 @@ def _stated(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[st
 def _misstated(
     name: str, metrics: Mapping[str, float], head: str, components: str
 ) -> Iterator[str]:
-    known = [one for one in components if f"{head}coverage_95_{one}" in metrics]
-    if not known or metrics.get(f"{head}valid_fraction", 1.0) < _ENOUGH:
+    stated = [component for component in components if f"{head}coverage_95_{component}" in metrics]
+    if not stated or metrics.get(f"{head}valid_fraction", 1.0) < _LEAST_VALID:
         return
     inner, outer = (
-        sum(metrics[f"{head}coverage_{level}_{one}"] for one in known) / len(known)
+        sum(metrics[f"{head}coverage_{level}_{component}"] for component in stated) / len(stated)
         for level in (68, 95)
     )
-    low, high = _HOLDS
+    low, high = _COVERAGE_LIMITS
     if outer < low:
         size, covered = (
             "small",
@@ -198,20 +202,24 @@ def _misstated(
 def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:
     """The fit to the wind vectors, or else to the images, where there is a true pair."""
     sides = ("port", "starboard")
-    known = [vortex_key("truth", f"{side}_circulation_5_15") for side in sides]
+    truth = [vortex_key("truth", f"{side}_circulation_5_15") for side in sides]
     for origin in ("vectors", "images"):
         keys = [vortex_key(origin, f"{side}_circulation_5_15") for side in sides]
-        if any(metrics.get(key) is None for key in known) or any(k not in metrics for k in keys):
+        if any(metrics.get(key) is None for key in truth) or any(k not in metrics for k in keys):
             continue
-        true = [metrics[key] for key in known]
-        found = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
-        off = max(
-            abs(metrics[key] - one) / metrics.get(f"{key}_stderr", math.inf)
-            for key, one in zip(keys, true, strict=True)
+        true = [metrics[key] for key in truth]
+        fitted = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
+        departure = max(
+            abs(metrics[key] - expected) / metrics.get(f"{key}_stderr", math.inf)
+            for key, expected in zip(keys, true, strict=True)
         )
-        beyond = f", off by up to {off:.2g} standard errors" if off > _FAR_OFF else ""
+        beyond = (
+            f", off by up to {departure:.2g} standard errors"
+            if departure > _LEAST_DEPARTURE
+            else ""
+        )
         yield (
-            f"Vortex pair: circulations {found[0]} and {found[1]} m²/s, true "
+            f"Vortex pair: circulations {fitted[0]} and {fitted[1]} m²/s, true "
             f"{true[0]:.0f} and {true[1]:.0f} m²/s{beyond}."
         )
         return

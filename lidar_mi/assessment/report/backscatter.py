@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from lidar_mi.assessment.digits import in_row, percent, three
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.names import Source, has_no_skill, wind_key
 from lidar_mi.assessment.metrics.requirements import Judged

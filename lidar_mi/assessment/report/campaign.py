@@ -1,7 +1,7 @@
 """The report of a campaign: one self-contained HTML file, from its data set alone."""
 
 import re
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Container, Hashable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import product
 
@@ -52,25 +52,25 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     """
     flown = list(encounter_blocks(numbers.metrics_of(dataset)))
     dataset = _in_usual_units(dataset)
-    known = numbers.metrics_of(dataset)
-    shown = numbers.chosen(known, metrics)
+    values = numbers.metrics_of(dataset)
+    keys = numbers.chosen(values, metrics)
     axes, points, margins = _axes(dataset), _points(dataset), _margins(dataset)
     if SAMPLE in dataset.dims:
-        blocks = list(sample_blocks(dataset, known, shown, axes, points))
+        blocks = list(sample_blocks(dataset, values, keys, axes, points))
         required = list(margin_blocks(dataset, margins, axes, points))
     else:
-        blocks = [_sweep_block(dataset, key, known[key], axes, points) for key in shown]
+        blocks = [_sweep_block(dataset, key, values[key], axes, points) for key in keys]
         required = list(_requirement_maps(dataset, margins, axes, points))
     blocks = [*flown, *blocks]
     return template("campaign.html").render(
         name=dataset.attrs.get("name", "campaign"),
-        lead=_lead(dataset, shown, axes, margins),
-        numbers=_table(dataset, shown, axes),
+        lead=_lead(dataset, keys, axes, margins),
+        numbers=_table(dataset, keys, axes),
         members=MEMBER in dataset.dims,
         rows=_requirement_rows(margins, axes),
         required=_marked(required),
         blocks=_marked(blocks),
-        coverages=_coverage_rows(known),
+        coverages=_coverage_rows(values),
         failures=_failures(dataset),
         resolved=resolved,
         points=_descriptions(dataset),
@@ -81,8 +81,8 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
 def answer(dataset: xr.Dataset) -> str:
     """How large errors are, where they are least, and where requirements are met: the lead."""
     dataset = _in_usual_units(dataset)
-    shown = numbers.chosen(numbers.metrics_of(dataset), None)
-    return _lead(dataset, shown, _axes(dataset), _margins(dataset))
+    keys = numbers.chosen(numbers.metrics_of(dataset), None)
+    return _lead(dataset, keys, _axes(dataset), _margins(dataset))
 
 
 Margins = Mapping[tuple[str, str], Mapping[str, numbers.Interval]]
@@ -95,13 +95,13 @@ def _axes(dataset: xr.Dataset) -> dict[str, Axis]:
 
 def _margins(dataset: xr.Dataset) -> Margins:
     """Margins over members of all rows, by requirement table."""
-    known = numbers.metrics_of(dataset)
+    values = numbers.metrics_of(dataset)
     return {
         group: {
             QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(numbers.judged(dataset, k))
             for q, k in rows.items()
         }
-        for group, rows in numbers.requirements(known).items()
+        for group, rows in numbers.requirements(values).items()
     }
 
 
@@ -111,7 +111,7 @@ def _marked(blocks: Sequence[Block]) -> list[Block]:
 
 def _in_usual_units(dataset: xr.Dataset) -> xr.Dataset:
     """Angles in degrees or mrad, energies in mJ: by the largest value of each variable."""
-    found = {}
+    converted = {}
     for name, variable in dataset.variables.items():
         values = variable.values
         if values.dtype.kind != "f" or "units" not in variable.attrs:
@@ -119,15 +119,15 @@ def _in_usual_units(dataset: xr.Dataset) -> xr.Dataset:
         largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
         factor, unit = usual_unit(float(largest), variable.attrs["units"])
         if factor != 1:
-            found[name] = (variable.dims, factor * values, variable.attrs | {"units": unit})
-    return dataset.assign({key: xr.Variable(*one) for key, one in found.items()})
+            converted[name] = (variable.dims, factor * values, variable.attrs | {"units": unit})
+    return dataset.assign({key: xr.Variable(*parts) for key, parts in converted.items()})
 
 
 def _axis(dataset: xr.Dataset, name: str) -> Axis:
     at = dataset[name]
     if not numbers.is_numeric(dataset, name):
         return Axis(name, label_of(at, name), False, tuple(str(value) for value in at.values))
-    # the description of a list does not say
+    # the description of a list does not state its scale
     guess = "log" if numbers.spaced_by_factors(at.values) else "linear"
     return Axis(name, label_of(at, name), at.attrs.get("scale", guess) == "log")
 
@@ -145,8 +145,8 @@ def _links(dataset: xr.Dataset, folder: xr.DataArray) -> xr.DataArray:
     """The report of a point, where reports are stored; else its folder."""
     stored = (dataset["status"] == _DONE) & (dataset.attrs.get("keep") == "everything")
     ends = [
-        f"{one}/run/report.html" if there else f"{one}/"
-        for one, there in zip(folder.values.ravel(), stored.values.ravel(), strict=True)
+        f"{path}/run/report.html" if has_report else f"{path}/"
+        for path, has_report in zip(folder.values.ravel(), stored.values.ravel(), strict=True)
     ]
     return folder.copy(data=np.array(ends, dtype=object).reshape(folder.shape))
 
@@ -160,16 +160,14 @@ def _place(dataset: xr.Dataset, at: Mapping[str, int]) -> str:
     )
     words = []
     for name in names:
-        here = dataset[name].isel({dim: k for dim, k in at.items() if dim in dataset[name].dims})
-        value = here.item()
+        coordinate = dataset[name].isel(at, missing_dims="ignore")
+        value, about = coordinate.item(), coordinate.attrs
         number = f"{value:.4g}" if isinstance(value, float) else str(value)
-        words.append(
-            f"{here.attrs.get('long_name', name)} = {number} {here.attrs.get('units', '')}".strip()
-        )
+        words.append(f"{about.get('long_name', name)} = {number} {about.get('units', '')}".strip())
     return ", ".join(words)
 
 
-def _each(array: xr.DataArray) -> Iterator[dict[str, int]]:
+def _indices(array: xr.DataArray) -> Iterator[dict[str, int]]:
     for index in np.ndindex(*array.shape):
         yield dict(zip(map(str, array.dims), index, strict=True))
 
@@ -178,45 +176,45 @@ def _descriptions(dataset: xr.Dataset) -> list[str]:
     status = dataset["status"]
     if MEMBER in status.dims:
         status = status.isel({MEMBER: 0})
-    return [_place(dataset, at) for at in _each(status)]
+    return [_place(dataset, at) for at in _indices(status)]
 
 
 def _failures(dataset: xr.Dataset) -> list[tuple[str, str, str, str]]:
     rows = []
-    for at in _each(dataset["status"]):
-        here = dataset[["status", "message", "folder"]].isel(at)
-        code = int(here["status"])
+    for at in _indices(dataset["status"]):
+        point = dataset[["status", "message", "folder"]].isel(at)
+        code = int(point["status"])
         if code != _DONE:
             word = "failed" if code == _FAILED else "missing"
-            message = str(here["message"].item())
-            rows.append((_place(dataset, at), word, message, f"{here['folder'].item()}/"))
+            message = str(point["message"].item())
+            rows.append((_place(dataset, at), word, message, f"{point['folder'].item()}/"))
     return rows
 
 
 def _table(
-    dataset: xr.Dataset, shown: Sequence[str], axes: Mapping[str, Axis]
+    dataset: xr.Dataset, keys: Sequence[str], axes: Mapping[str, Axis]
 ) -> tuple[list[str], list[tuple[str, str, list[str]]]] | None:
     """Heads and rows of the metrics at every point, with standard errors over members.
 
     None: there is one point, or there are too many.
     """
-    known = numbers.metrics_of(dataset)
+    metrics = numbers.metrics_of(dataset)
     points = dataset["status"].size // dataset.sizes.get(MEMBER, 1)
     if not axes or not 1 < points <= _ROWS:
         return None
     columns = []
-    for key in shown:
-        values = known[key]
+    for key in keys:
+        values = metrics[key]
         count = values.notnull().sum(MEMBER) if MEMBER in values.dims else None
         error = None if count is None else values.std(MEMBER, ddof=1) / np.sqrt(count)
         columns.append((numbers.over_members(values).mean, error))
     status = dataset["status"]
     first = status.isel({MEMBER: 0}) if MEMBER in status.dims else status
     rows = []
-    for at in _each(first):
+    for at in _indices(first):
         varied = {dim: k for dim, k in at.items() if dim in axes or dim == SAMPLE}
-        rows.append((_place(dataset, varied), "", [_cell(*one, at) for one in columns]))
-    return [label_of(known[key], key) for key in shown], rows
+        rows.append((_place(dataset, varied), "", [_cell(*column, at) for column in columns]))
+    return [label_of(metrics[key], key) for key in keys], rows
 
 
 def _cell(mean: xr.DataArray, error: xr.DataArray | None, at: Mapping[str, int]) -> str:
@@ -227,17 +225,17 @@ def _cell(mean: xr.DataArray, error: xr.DataArray | None, at: Mapping[str, int])
     return with_error(value, stderr) if stderr > 0 else three(value)
 
 
-def _best_sentence(dataset: xr.Dataset, shown: Sequence[str]) -> str:
+def _best_sentence(dataset: xr.Dataset, keys: Sequence[str]) -> str:
     """Values of the first metric, where it is least, and how often errors are as stated."""
-    known = numbers.metrics_of(dataset)
-    if not shown:
+    metrics = numbers.metrics_of(dataset)
+    if not keys:
         return ""
-    key = shown[0]
-    mean = numbers.over_members(known[key]).mean
+    key = keys[0]
+    mean = numbers.over_members(metrics[key]).mean
     values = mean.values[np.isfinite(mean.values)]
     if not values.size:
         return ""
-    name, _, unit = label_of(known[key], key).partition(" / ")
+    name, _, unit = label_of(metrics[key], key).partition(" / ")
     text = f"{name[:1].upper()}{name[1:]}: {_from_to(values)} {unit}".rstrip()
     if values.size > 1:
         lowest = np.unravel_index(int(np.nanargmin(mean.values)), mean.shape)
@@ -246,12 +244,12 @@ def _best_sentence(dataset: xr.Dataset, shown: Sequence[str]) -> str:
         text += f", least at {_place(dataset, varied)}"
     if values.size < mean.size:
         text += f", none at {mean.size - values.size} of {mean.size} points"
-    head, found, component = key.rpartition(".rmse_")
-    covered = known.get(f"{head}.coverage_95_{component}") if found else None
+    head, split, component = key.rpartition(".rmse_")
+    covered = metrics.get(f"{head}.coverage_95_{component}") if split else None
     if covered is not None and np.isfinite(covered).any():
-        each = 100 * numbers.over_members(covered).mean.values
-        text += f"; {_from_to(each[np.isfinite(each)])} % of errors are within 1.96 standard errors"
-        text += " (95 % if as stated)"
+        fractions = 100 * numbers.over_members(covered).mean.values
+        text += f"; {_from_to(fractions[np.isfinite(fractions)])} % of errors are within 1.96 "
+        text += "standard errors (95 % if as stated)"
     return f"{text}. "
 
 
@@ -261,7 +259,7 @@ def _from_to(values: np.ndarray) -> str:
 
 
 def _lead(
-    dataset: xr.Dataset, shown: Sequence[str], axes: Mapping[str, Axis], margins: Margins
+    dataset: xr.Dataset, keys: Sequence[str], axes: Mapping[str, Axis], margins: Margins
 ) -> str:
     status = dataset["status"]
     runs, done = status.size, int((status == _DONE).sum())
@@ -269,7 +267,7 @@ def _lead(
     members = dataset.sizes.get(MEMBER, 1)
     points = runs // (status.sizes.get(MEMBER, 1))
     text = points_sentence(dataset, lambda at: _place(dataset, at))
-    text += _best_sentence(dataset, shown)
+    text += _best_sentence(dataset, keys)
     text += f"{points} point{'s' * (points != 1)} of {dataset.attrs.get('base', 'an experiment')}"
     if members > 1:
         text += f" with {members} members each"
@@ -287,16 +285,14 @@ def _lead(
         return text
     if not margins:
         return text + " No requirement was judged."
-    found, missed = [], []
-    for (application, phase), rows in margins.items():
-        each = [numbers.met(one) for one in rows.values()]
-        every = xr.concat(each, "row", coords="minimal", compat="override").min("row", skipna=False)
-        known = int(np.isfinite(every).sum())
-        found.append(
-            f"{application.replace('_', ' ')}, {phase}: at {int(every.sum())} of {known} points"
-        )
-        missed += _missed(dataset, f"{application.replace('_', ' ')}, {phase}", rows, every)
-    text += f" All rows of the requirements are met for {'; '.join(found)}."
+    counts, missed = [], []
+    for group, rows in margins.items():
+        met = [numbers.met(margin) for margin in rows.values()]
+        every = xr.concat(met, "row", coords="minimal", compat="override").min("row", skipna=False)
+        judged = int(np.isfinite(every).sum())
+        counts.append(f"{_title(group)}: at {int(every.sum())} of {judged} points")
+        missed += _missed(dataset, _title(group), rows, every)
+    text += f" All rows of the requirements are met for {'; '.join(counts)}."
     return " ".join([text, *missed])
 
 
@@ -304,19 +300,19 @@ def _missed(
     dataset: xr.Dataset, phase: str, rows: Mapping[str, numbers.Interval], every: xr.DataArray
 ) -> list[str]:
     """Where a row is not met, and which by most: each point if they are few, else the counts."""
-    where = [at for at in _each(every) if float(every.isel(at)) == 0]
+    where = [at for at in _indices(every) if float(every.isel(at)) == 0]
     if not where:
         return []
     if len(where) <= _FEW:
         texts = []
         for at in where:
-            margins = {name: float(one.mean.isel(at)) for name, one in rows.items()}
-            known = {name: value for name, value in margins.items() if np.isfinite(value)}
-            worst = min(known, key=lambda name: known[name])
+            margins = {name: float(margin.mean.isel(at)) for name, margin in rows.items()}
+            judged = {name: value for name, value in margins.items() if np.isfinite(value)}
+            worst = min(judged, key=lambda name: judged[name])
             place = _place(dataset, at) or "the point"
-            texts.append(f"{place} ({worst}: margin {100 * known[worst]:+.0f} %)")
+            texts.append(f"{place} ({worst}: margin {100 * judged[worst]:+.0f} %)")
         return [f"Not met for {phase}: {'; '.join(texts)}."]
-    counts = {name: int((numbers.met(one) == 0).sum()) for name, one in rows.items()}
+    counts = {name: int((numbers.met(margin) == 0).sum()) for name, margin in rows.items()}
     most = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
     texts = [f"{name} at {counts[name]}" for name in most[:_FEW]]
     return [f"Not met for {phase} at {len(where)} points, most often {', '.join(texts)}."]
@@ -331,22 +327,31 @@ def _range(dataset: xr.Dataset, name: str) -> str:
     return ends if SAMPLE in dataset.dims else f"{values.size} values, {ends}"
 
 
+def _title(group: tuple[str, str]) -> str:
+    """Application and phase of flight."""
+    return f"{group[0].replace('_', ' ')}, {group[1]}"
+
+
+def _along(array: xr.DataArray, dims: Container[Hashable]) -> xr.DataArray:
+    """An array without its other dimensions, which have the length 1."""
+    return array.squeeze([dim for dim in array.dims if dim not in dims], drop=True)
+
+
 def _requirement_rows(
     margins: Margins, axes: Mapping[str, Axis]
 ) -> list[tuple[str, str, list[str]]]:
     rows = []
-    for (application, phase), quantities in margins.items():
+    for group, quantities in margins.items():
         for name, margin in quantities.items():
             met = numbers.met(margin)
-            known, many = int(np.isfinite(met).sum()), int(met.sum())
+            judged, many = int(np.isfinite(met).sum()), int(met.sum())
             open_ = (
                 str(int(numbers.undecided(margin).sum()))
                 if np.isfinite(margin.low).any()
                 else "not known"
             )
             where = _boundary_text(margin, axes)
-            label = f"{application.replace('_', ' ')}, {phase}: {name}"
-            rows.append((label, "", [f"{many} of {known}", open_, where]))
+            rows.append((f"{_title(group)}: {name}", "", [f"{many} of {judged}", open_, where]))
     return rows
 
 
@@ -361,20 +366,20 @@ def _boundary_text(margin: Interval, axes: Mapping[str, Axis]) -> str:
         return "see the figures" if SAMPLE not in margin.mean.dims else "see the lead"
     axis, texts = numeric[0], []
     unit = margin.mean[axis.name].attrs.get("units", "")
-    others = [dim for dim in margin.mean.dims if dim != axis.name]
-    for labels in product(*(margin.mean[dim].values for dim in others)):
-        at = dict(zip(others, labels, strict=True))
-        line = Interval(*(each.sel(at) for each in (margin.mean, margin.low, margin.high)))
-        for one in numbers.boundaries(line, axis.logarithmic):
-            side = "from" if one.above else "up to"
-            words = f"{side} {three(one.value)} {unit}".strip()
-            if np.isnan(one.low):
+    remaining = [dim for dim in margin.mean.dims if dim != axis.name]
+    for labels in product(*(margin.mean[dim].values for dim in remaining)):
+        at = dict(zip(remaining, labels, strict=True))
+        line = Interval(*(part.sel(at) for part in (margin.mean, margin.low, margin.high)))
+        for boundary in numbers.boundaries(line, axis.logarithmic):
+            side = "from" if boundary.above else "up to"
+            words = f"{side} {three(boundary.value)} {unit}".strip()
+            if np.isnan(boundary.low):
                 words += " (uncertainty not known)"
             else:
-                low = three(one.low) if np.isfinite(one.low) else "beyond the sweep"
-                high = three(one.high) if np.isfinite(one.high) else "beyond the sweep"
+                low = three(boundary.low) if np.isfinite(boundary.low) else "beyond the sweep"
+                high = three(boundary.high) if np.isfinite(boundary.high) else "beyond the sweep"
                 words += f" (95 %: {low} to {high})"
-            place = [str(one) for dim, one in zip(others, labels, strict=True) if dim in axes]
+            place = [str(x) for dim, x in zip(remaining, labels, strict=True) if dim in axes]
             texts.append(": ".join([*place, words]))
     return "; ".join(texts)
 
@@ -397,26 +402,26 @@ def _layout(
 
 def _panels(dataset: xr.Dataset, names: Sequence[str]) -> list[tuple[str, dict[str, int]]]:
     """Title and selection of every panel."""
-    found = []
+    panels = []
     for index in product(*(range(dataset.sizes[name]) for name in names)):
         at = dict(zip(names, index, strict=True))
-        found.append((_place(dataset, at), at))
-    return found
+        panels.append((_place(dataset, at), at))
+    return panels
 
 
 def _sweep_block(
     dataset: xr.Dataset, key: str, values: xr.DataArray, axes: Mapping[str, Axis], points: Points
 ) -> Block:
     label = label_of(values, key)
-    values = values.squeeze([d for d in values.dims if d not in axes and d != MEMBER], drop=True)
-    flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
+    values = _along(values, (*axes, MEMBER))
+    flat = Points(*(_along(p, axes) for p in points))
     title = f"{label.partition(' / ')[0]}"
     if not axes:
         return Block(
             title, f"{_by_member(values)} Key: {key}.", _member_panel(dataset, values, label)
         )
-    at, lines, rest = _layout(axes, values.sizes)
-    selections = _panels(dataset, rest)
+    at, lines, remaining = _layout(axes, values.sizes)
+    selections = _panels(dataset, remaining)
     text = "Mean over members. " if MEMBER in values.dims else ""
     if len(selections) > _PANELS:
         text += f"The first {_PANELS} of {len(selections)} panels. "
@@ -430,23 +435,23 @@ def _sweep_block(
     is_fraction = re.search(r"\bcoverage_|fraction$", key)
     norm = Normalize(0, 1) if is_fraction else figures.colour_scale(mean)
     for name, where in selections[:_PANELS]:
-        here = Points(*(p.isel(where) for p in flat))
+        selected = Points(*(p.isel(where) for p in flat))
         if len(at) == 2:
-            bounds = {what: margin.isel(where) for what, margin in limits.items()}
+            bounds = {table: margin.isel(where) for table, margin in limits.items()}
             drawn.append(
                 figures.draw_map(
-                    name, mean.isel(where), at[0], at[1], here, label, norm, limits=bounds
+                    name, mean.isel(where), at[0], at[1], selected, label, norm, limits=bounds
                 )
             )
             continue
-        groups = {"": (values.isel(where), here)}
+        groups = {"": (values.isel(where), selected)}
         if lines:
             groups = {
-                one: (
+                line: (
                     values.isel(where).isel({lines.name: k}),
-                    Points(*(p.isel({lines.name: k}) for p in here)),
+                    Points(*(p.isel({lines.name: k}) for p in selected)),
                 )
-                for k, one in enumerate(lines.labels)
+                for k, line in enumerate(lines.labels)
             }
         drawn.append(figures.draw_lines(name, groups, at[0], label, bank))
     if len(at) == 1 and MEMBER in values.dims:
@@ -456,15 +461,14 @@ def _sweep_block(
 
 def _limits(dataset: xr.Dataset, key: str, axes: Mapping[str, Axis]) -> dict[str, xr.DataArray]:
     """Margins of the requirements of a metric, by application and phase of flight."""
-    found = {}
-    for (application, phase), rows in numbers.requirements(numbers.metrics_of(dataset)).items():
+    limits = {}
+    for group, rows in numbers.requirements(numbers.metrics_of(dataset)).items():
         row = rows.get(key.replace("sensor.rmse_", "error_"))
         if row is None:
             continue
         mean = numbers.over_members(numbers.judged(dataset, row)).mean
-        others = [dim for dim in mean.dims if dim not in axes]
-        found[f"{application.replace('_', ' ')}, {phase}"] = mean.squeeze(others, drop=True)
-    return found
+        limits[_title(group)] = _along(mean, axes)
+    return limits
 
 
 def _bank_limit(key: str, values: xr.DataArray) -> float | None:
@@ -475,16 +479,16 @@ def _bank_limit(key: str, values: xr.DataArray) -> float | None:
 
 
 def _by_member(values: xr.DataArray) -> str:
-    known = values.values[np.isfinite(values.values)]
-    if not known.size:
+    finite = values.values[np.isfinite(values.values)]
+    if not finite.size:
         return "No value."
-    if known.size == 1:
-        return f"{three(float(known[0]))}."
-    mean, spread = float(known.mean()), float(known.std(ddof=1))
+    if finite.size == 1:
+        return f"{three(float(finite[0]))}."
+    mean, spread = float(finite.mean()), float(finite.std(ddof=1))
     return (
-        f"Mean {with_error(mean, spread / np.sqrt(known.size))}, standard deviation "
-        f"{three(spread)}, from {three(float(known.min()))} to {three(float(known.max()))} over "
-        f"{known.size} members."
+        f"Mean {with_error(mean, spread / np.sqrt(finite.size))}, standard deviation "
+        f"{three(spread)}, from {three(float(finite.min()))} to {three(float(finite.max()))} over "
+        f"{finite.size} members."
     )
 
 
@@ -492,71 +496,65 @@ def _member_panel(dataset: xr.Dataset, values: xr.DataArray, label: str) -> list
     """A metric of every member of a single point."""
     if MEMBER not in values.dims:
         return []
-    one = dataset[["status", "folder"]].squeeze([d for d in dataset.dims if d != MEMBER], drop=True)
-    each = xr.Dataset(
+    runs = xr.Dataset(
         {
             "number": (MEMBER, np.zeros(values.size, int)),
-            "failed": one["status"] != _DONE,
-            "link": _links(dataset, dataset["folder"].astype(str)).squeeze(
-                [d for d in dataset.dims if d != MEMBER], drop=True
-            ),
+            "failed": _along(dataset["status"], (MEMBER,)) != _DONE,
+            "link": _along(_links(dataset, dataset["folder"].astype(str)), (MEMBER,)),
             "value": values,
         }
     ).rename({MEMBER: "run"})
-    points = Points(each["number"], each["failed"], each["link"])
+    points = Points(runs["number"], runs["failed"], runs["link"])
     along = Axis("run", "member", False)
-    return [figures.draw_lines("", {"": (each["value"], points)}, along, label)]
+    return [figures.draw_lines("", {"": (runs["value"], points)}, along, label)]
 
 
 def _requirement_maps(
     dataset: xr.Dataset, margins: Margins, axes: Mapping[str, Axis], points: Points
 ) -> Iterator[Block]:
-    for (application, phase), rows in margins.items():
+    for group, rows in margins.items():
         dims = next(iter(rows.values())).mean.sizes
-        at, _, rest = _layout(axes, dims) if axes else ([], None, [])
+        at, _, remaining = _layout(axes, dims) if axes else ([], None, [])
         if len(at) != 2:
             continue
-        flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
+        flat = Points(*(_along(p, axes) for p in points))
         drawn = []
-        for name, where in _panels(dataset, rest)[:_PANELS]:
-            here = {
+        for name, where in _panels(dataset, remaining)[:_PANELS]:
+            intervals = {
                 row: Interval(
-                    *(
-                        part.squeeze([d for d in part.dims if d not in axes], drop=True).isel(where)
-                        for part in (one.mean, one.low, one.high)
-                    )
+                    *(_along(x, axes).isel(where) for x in (margin.mean, margin.low, margin.high))
                 )
-                for row, one in rows.items()
+                for row, margin in rows.items()
             }
-            if not any(one.mean.notnull().any() for one in here.values()):
+            if not any(margin.mean.notnull().any() for margin in intervals.values()):
                 continue  # of another phase of flight
             spots = Points(*(p.isel(where) for p in flat))
-            drawn.append(figures.draw_requirements(name, here, at[0], at[1], spots))
-        known = any(np.isfinite(one.low).any() for one in rows.values())
+            drawn.append(figures.draw_requirements(name, intervals, at[0], at[1], spots))
+        with_members = any(np.isfinite(margin.low).any() for margin in rows.values())
         text = "Green: all rows are met. Lines: where the margin of a row is 0"
         text += (
             "; dashed: 95 % interval of that, from the members."
-            if known
+            if with_members
             else ". Their uncertainty is not known: there is one member."
         )
-        yield Block(f"{application.replace('_', ' ')}, {phase}", text, drawn)
+        yield Block(_title(group), text, drawn)
 
 
-def _coverage_rows(known: Mapping[str, xr.DataArray]) -> list[tuple[str, str, list[str]]]:
-    def shown(value: float, error: float) -> str:
+def _coverage_rows(metrics: Mapping[str, xr.DataArray]) -> list[tuple[str, str, list[str]]]:
+    def cell(value: float, error: float) -> str:
         if np.isnan(error):
             return f"{100 * value:.1f}"
         return with_error(100 * value, 100 * error) if error else f"{100 * value:.1f} ± 0"
 
     return [
         (
-            one.quantity,
+            row.quantity,
             "",
             [
-                str(one.count),
-                shown(one.within_68, one.stderr_68),
-                shown(one.within_95, one.stderr_95),
+                str(row.count),
+                cell(row.within_68, row.stderr_68),
+                cell(row.within_95, row.stderr_95),
             ],
         )
-        for one in numbers.coverages(known)
+        for row in numbers.coverages(metrics)
     ]

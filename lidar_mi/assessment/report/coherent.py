@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import xarray as xr
 
 from lidar_mi.assessment.digits import whole_percent
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.metrics.coherent import PREFIX, errors_by_age
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
 
@@ -35,7 +35,7 @@ def coherent_chapter(
         noise += f" {whole_percent(1 - signal)} of the gates have no signal and are flagged."
     tables: list[NumberTable] = []
     if vortices is not None and f"{_VORTICES}place_error" in metrics:
-        tables += [_by_age(vortices), _peer(metrics), _stated(metrics)]
+        tables += [_by_age(vortices), _peer(metrics), _coverages(metrics)]
     elif f"{_WINDS}rmse_u" in metrics:
         tables.append(_wind_errors(metrics))
     numbers = Tables(
@@ -53,7 +53,11 @@ def _by_age(vortices: xr.Dataset) -> NumberTable:
 
     def line(name: str, unit: str, key: str, scale: float) -> tuple[str, str, list[str]]:
         values = [row[key] for row in rows]
-        return name, unit, ["-" if math.isnan(one) else f"{scale * one:.3g}" for one in values]
+        return (
+            name,
+            unit,
+            ["-" if math.isnan(value) else f"{scale * value:.3g}" for value in values],
+        )
 
     return (
         "By age of the wake: medians of the sizes of the errors",
@@ -78,12 +82,14 @@ def _peer(metrics: Mapping[str, float]) -> NumberTable:
         ("valid_fraction", "slices with valid vortices"),
     ):
         values = [metrics.get(f"{start}{key}") for start in columns]
-        rows.append((label, "%", ["-" if one is None else f"{100 * one:.3g}" for one in values]))
+        rows.append(
+            (label, "%", ["-" if value is None else f"{100 * value:.3g}" for value in values])
+        )
     heads = ("fit to each slice", "all slices together", "method of radial velocities")
     return "Compared with the method of radial velocities", heads, rows
 
 
-def _stated(metrics: Mapping[str, float]) -> NumberTable:
+def _coverages(metrics: Mapping[str, float]) -> NumberTable:
     names = ("circulation", "y", "z")
     rows = [
         (label, unit, [f"{scale * metrics[f'{_VORTICES}{key}_{name}']:.3g}" for name in names])

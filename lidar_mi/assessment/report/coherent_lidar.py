@@ -38,7 +38,7 @@ def coherent_answer(metrics: Mapping[str, float]) -> Iterator[str]:
         covered = [metrics[f"{_VORTICES}coverage_95_{name}"] for name in ("circulation", "y", "z")]
         yield (
             "95 % intervals of circulation, distance and height hold "
-            f"{', '.join(whole_percent(one) for one in covered)} of the errors."
+            f"{', '.join(whole_percent(fraction) for fraction in covered)} of the errors."
         )
     elif metrics.get(f"{_WINDS}valid_fraction") == 0:
         yield "Coherent lidar: no valid wind."
@@ -55,20 +55,20 @@ def coherent_answer(metrics: Mapping[str, float]) -> Iterator[str]:
         )
 
 
-def coherent_described(lidar: CoherentDoppler, wake: Wake | None) -> list[tuple[str, str]]:
+def coherent_lidar_rows(lidar: CoherentDoppler, wake: Wake | None) -> list[tuple[str, str]]:
     """What was simulated, as (name, text)."""
     laser, scan = lidar.laser, lidar.scan
     rows = []
     if wake is not None:
-        what = f"{wake.file}, a plane that drifts as it is"
+        wake_text = f"{wake.file}, a plane that drifts as it is"
         if wake.vortex_pair:
             pair = wake.vortex_pair
-            what = (
+            wake_text = (
                 f"{pair.model.replace('_', '-').title()} vortices, circulation "
                 f"{pair.circulation:.4g} m²/s, separation {pair.separation:.4g} m, core radius "
                 f"{pair.core_radius:.3g} m"
             )
-        rows.append(("wake", f"{what}; at a height of {lidar.passage.height:g} m"))
+        rows.append(("wake", f"{wake_text}; at a height of {lidar.passage.height:g} m"))
     where = ", ".join(f"{place:g}" for place in lidar.position)
     rows += [
         (

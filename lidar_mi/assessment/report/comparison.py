@@ -14,7 +14,7 @@ from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod,
 from lidar_mi.units import usual
 
 if TYPE_CHECKING:
-    from lidar_mi.assessment.figures.plates import Drawn
+    from lidar_mi.assessment.figures.panels import Drawn
 
 
 # rows of the comparison: key, name, unit; {}: a method's winds
@@ -67,17 +67,17 @@ _METHODS = dict.fromkeys((*ImageMethod, *VolumeMethod))
 
 def flat(settings: Mapping[str, object], prefix: str = "") -> dict[str, object]:
     """Nested sections as dotted keys; lists are values."""
-    found: dict[str, object] = {}
+    dotted: dict[str, object] = {}
     for key, value in settings.items():
         name = f"{prefix}{key}"
-        found |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
-    return found
+        dotted |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return dotted
 
 
 def differences(settings: Mapping[str, Mapping[str, object]]) -> dict[str, list[object]]:
     """Keys in which the variants differ, with each one's value (None: has no such key)."""
-    keys = dict.fromkeys(key for one in settings.values() for key in one if key != "name")
-    values = {key: [one.get(key) for one in settings.values()] for key in keys}
+    keys = dict.fromkeys(key for variant in settings.values() for key in variant if key != "name")
+    values = {key: [variant.get(key) for variant in settings.values()] for key in keys}
     return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
 
 
@@ -97,7 +97,9 @@ def page(
 
     changed = [
         (key, "", [setting(value) for value in values])
-        for key, values in differences({key: flat(one) for key, one in settings.items()}).items()
+        for key, values in differences(
+            {key: flat(variant) for key, variant in settings.items()}
+        ).items()
     ]
     legend = (
         "Errors are those of valid vectors against the truth; an error near the true wind's own "
@@ -108,7 +110,7 @@ def page(
         version=__version__,
         variants=list(settings),
         answers=answers,
-        images=[picture(one) for one in drawn],
+        images=[picture(variant) for variant in drawn],
         stacking=script("panels.js"),
         tables=[
             ("Results", legend, list(results(metrics))),
@@ -126,7 +128,7 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
             continue
         for source, method in product(RENDERED, _METHODS):
             key = pattern.format(f"{source}.{method}")
-            yield from _row(metrics, key, f"{_named(source, method)}: {label}", unit)
+            yield from _row(metrics, key, f"{_method_and_source(source, method)}: {label}", unit)
     for method, centre in product(RingMethod, RingCentre):
         for measure, label in _RETRIEVALS:
             unit = "%" if measure == "retrieved_fraction" else "m/s"
@@ -138,21 +140,21 @@ def _row(
     metrics: Mapping[str, Mapping[str, float]], key: str, label: str, unit: str
 ) -> Iterator[tuple[str, str, list[str]]]:
     """A metric of all variants, if any of them has it."""
-    values = [one.get(key) for one in metrics.values()]
+    values = [variant.get(key) for variant in metrics.values()]
     if any(value is not None for value in values):
-        yield label, unit, _shown(values, unit)
+        yield label, unit, _cells(values, unit)
 
 
-def _shown(values: Sequence[float | None], unit: str) -> list[str]:
-    def shown(value: float) -> str:
+def _cells(values: Sequence[float | None], unit: str) -> list[str]:
+    def cell(value: float) -> str:
         if unit == "m/s":
             return fixed(value)
         return three(100 * value if unit == "%" else value)
 
-    return ["-" if value is None else shown(value) for value in values]
+    return ["-" if value is None else cell(value) for value in values]
 
 
-def _named(source: str, method: str) -> str:
+def _method_and_source(source: str, method: str) -> str:
     title = METHOD_NAMES[method]
     return f"{title}, with the detector's noise" if source == Source.NOISY else title
 

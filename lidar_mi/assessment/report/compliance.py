@@ -11,7 +11,7 @@ def compliance(judged: Judged, speed: float, legend: str) -> Tables | None:
 
     The legend says how the sensor's properties were measured.
     """
-    flown = [one for one in judged if one[0].applies_at(speed)]
+    flown = [table for table in judged if table[0].applies_at(speed)]
     if not flown:
         return None
     of_flight = " of flight control" if speed else ""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from lidar_mi.assessment.digits import fixed, three, with_error
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.metrics.names import REFERENCE_ERRORS, bound_key, reference_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
@@ -33,10 +33,10 @@ def doppler_chapter(
         f"the true winds to {metrics['doppler.render.largest_error']:.2g} m/s."
     )
     errors = {cause: metrics.get(reference_key(cause), 0.0) for cause in REFERENCE_ERRORS}
-    named = ", ".join(f"{cause} {error:.2g} m/s" for cause, error in errors.items() if error)
+    causes = ", ".join(f"{cause} {error:.2g} m/s" for cause, error in errors.items() if error)
     hidden = (
-        f"Errors between the laser's frame and the echo, which no image shows: {named}. Plates and "
-        f"pupil cause less than 0.5 m/s with at least "
+        f"Errors between the laser's frame and the echo, which no image shows: {causes}. Plates "
+        f"and pupil cause less than 0.5 m/s with at least "
         f"{metrics.get('doppler.reference.scrambling_needed', 0.0):.1%} of the light scrambled."
     )
     numbers = Tables(
@@ -51,7 +51,7 @@ def doppler_chapter(
         ],
     )
     return Chapter(
-        "The Doppler lidar", [purpose, light, rings, *([hidden] if named else [])], drawn, numbers
+        "The Doppler lidar", [purpose, light, rings, *([hidden] if causes else [])], drawn, numbers
     )
 
 
@@ -70,15 +70,15 @@ def _doppler_table(
     rows = []
     for method in settings.methods:
         for quantity, label in (("std", "standard deviation"), ("bias", "bias")):
-            shown = []
+            cells = []
             for n in settings.averaged:
                 key = ring_key(method, centre, n, quantity)
                 value, error = metrics.get(key), metrics.get(f"{key}_stderr")
                 if value is None:
-                    shown.append("-")
+                    cells.append("-")
                 else:
-                    shown.append(fixed(value) if error is None else with_error(value, error))
-            rows.append((f"{READERS[method]}: {label}", "m/s", shown))
+                    cells.append(fixed(value) if error is None else with_error(value, error))
+            rows.append((f"{READERS[method]}: {label}", "m/s", cells))
     bounds = [fixed(metrics[bound_key(centre, n)]) for n in settings.averaged]
     rows.append(("bound", "m/s", bounds))
     heads = [f"{n} image{'s' * (n > 1)}" for n in settings.averaged]

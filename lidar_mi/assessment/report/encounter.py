@@ -12,7 +12,7 @@ from lidar_mi.assessment.report.encounter_loads import loads_answer
 from lidar_mi.tables import Table
 
 if TYPE_CHECKING:
-    from lidar_mi.assessment.figures.plates import Drawn
+    from lidar_mi.assessment.figures.panels import Drawn
     from lidar_mi.assessment.report.page import Chapter, Film, Tables
 
 
@@ -111,7 +111,10 @@ def encounter_summary(
     heads = ("", *(flight_name(mode, controller) for mode in modes))
     tables = [Table(f"flights into the {met}", rows, heads, f"flight lost: {_UPSET}")]
     lidar = [
-        (f"{label} / {unit}" if unit else label, _shown(metrics.get(f"encounter.{key}"), factor))
+        (
+            f"{label} / {unit}" if unit else label,
+            _with_unit(metrics.get(f"encounter.{key}"), factor),
+        )
         for key, label, unit, factor in _OF_THE_LIDAR
         if f"encounter.{key}" in metrics
     ]
@@ -153,7 +156,7 @@ def encounter_chapter(
     )
     tables = [("The flights", [flight_name(mode, controller) for mode in modes], flights)]
     lidar = [
-        (label, unit, [_shown(metrics[f"encounter.{key}"], factor)])
+        (label, unit, [_with_unit(metrics[f"encounter.{key}"], factor)])
         for key, label, unit, factor in _OF_THE_LIDAR
         if f"encounter.{key}" in metrics
     ]
@@ -193,10 +196,10 @@ def encounter_answer(
             "missed, or both wings meet the same wind, as in a wake across the path.",
             *loads_answer(metrics),
         ]
-    parts = [
-        f"{'upset' if _lost(metrics, mode) else _degrees(roll)} ({flight_name(mode, controller)})"
-        for mode, roll in rolls.items()
-    ]
+    parts = []
+    for mode, roll in rolls.items():
+        size = "upset" if _lost(metrics, mode) else f"{three(math.degrees(roll))} degrees"
+        parts.append(f"{size} ({flight_name(mode, controller)})")
     best = "feedforward" if "feedforward" in rolls else "perfect" if "perfect" in rolls else "off"
     verdict = "stays below" if rolls[best] <= ACCEPTED_BANK else "exceeds"
     ratio = metrics[f"encounter.{best}.roll_control_ratio"]
@@ -228,8 +231,8 @@ def encounter_answer(
 def what_the_lidar_added(metrics: Mapping[str, float], controller: str = "") -> list[str]:
     """The verdict: what the lidar removes beyond the autopilot, of what perfect preview does.
 
-    Nothing without a flight with the lidar. A lidar that never had a preview, or too late, is said
-    first. Roll is always judged, the load factor where the aircraft rises.
+    Nothing without a flight with the lidar. It begins with a preview that came too late, or never.
+    Roll is always judged, the load factor where the aircraft rises.
     """
     if "encounter.feedforward.largest_roll" not in metrics:
         return []
@@ -240,18 +243,18 @@ def what_the_lidar_added(metrics: Mapping[str, float], controller: str = "") -> 
             f"The lidar never had a preview: {fits:.0f} fits of vortices accepted, in "
             f"{metrics.get('encounter.slabs', 0):.0f} slabs. It added nothing to {steers}."
         ]
-    said = []
+    sentences = []
     lead = metrics.get("encounter.lead_time", 0.0)
     if lead < 0:
-        said.append(f"The lidar's first preview came too late by {three(-lead)} s.")
+        sentences.append(f"The lidar's first preview came too late by {three(-lead)} s.")
     for quantity, (name, unit, factor) in _JUDGED.items():
         values = [metrics.get(f"encounter.{m}.{quantity}") for m in MODES[1:]]
-        known = [factor * value for value in values if value is not None]
-        if len(known) == len(values):
+        scaled = [factor * value for value in values if value is not None]
+        if len(scaled) == len(values):
             least = factor * LEAST_REMOVED[quantity]
             fraction = metrics.get(f"encounter.removed_beyond_autopilot.{quantity}")
-            said.append(_added(name, unit, steers, known, least, fraction))
-    return [" ".join(said)]
+            sentences.append(_added(name, unit, steers, scaled, least, fraction))
+    return [" ".join(sentences)]
 
 
 _JUDGED = {
@@ -288,19 +291,20 @@ def _latency(metrics: Mapping[str, float]) -> list[str]:
     """When the computer delivered its estimates, and what it skipped."""
     if "encounter.latency" not in metrics:
         return []
-    said = []
-    for what, name, skipped in (
+    sentences = []
+    for estimates, name, skipped in (
         ("The vortices", "latency", "skipped_slabs"),
         ("The wind", "wind_latency", "wind_skipped_slabs"),
     ):
         if f"encounter.{name}" in metrics:
             median, most = (three(metrics[f"encounter.{name}{end}"]) for end in ("", "_99"))
-            said.append(
-                f"{what} of a slab {'are' if what.endswith('s') else 'is'} delivered {median} s "
-                f"after its second scan (median; {most} s in 99 %); the computer was too busy for "
-                f"{metrics[f'encounter.{skipped}']:.0f} of {metrics['encounter.slabs']:.0f} slabs."
+            sentences.append(
+                f"{estimates} of a slab {'are' if estimates.endswith('s') else 'is'} delivered "
+                f"{median} s after its second scan (median; {most} s in 99 %); the computer was "
+                f"too busy for {metrics[f'encounter.{skipped}']:.0f} of "
+                f"{metrics['encounter.slabs']:.0f} slabs."
             )
-    return [" ".join(said)]
+    return [" ".join(sentences)]
 
 
 def _lead_time(metrics: Mapping[str, float]) -> str:
@@ -352,18 +356,14 @@ def _verdict(judged: Judged) -> "Tables":
 def _values(
     metrics: Mapping[str, float], modes: Sequence[str], key: str, factor: float
 ) -> list[str]:
-    return [_shown(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
+    return [_with_unit(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
 
 
 def _lost(metrics: Mapping[str, float], mode: str) -> bool:
     return metrics.get(f"encounter.{mode}.departed", 0) > 0
 
 
-def _degrees(angle: float) -> str:
-    return f"{three(math.degrees(angle))} degrees"
-
-
-def _shown(value: float | None, factor: float) -> str:
+def _with_unit(value: float | None, factor: float) -> str:
     if value is None:
         return "-"
     scaled = factor * value

@@ -16,8 +16,8 @@ _ADVERBS = {
 def loads_answer(metrics: Mapping[str, float]) -> list[str]:
     """Largest changes of the load factor."""
     key = "encounter.{}.largest_load_increment"
-    found = {mode: metrics[key.format(mode)] for mode in MODES if key.format(mode) in metrics}
-    if not found:
+    increments = {mode: metrics[key.format(mode)] for mode in MODES if key.format(mode) in metrics}
+    if not increments:
         return []
-    parts = [f"{three(value)} {_ADVERBS[mode]}" for mode, value in found.items()]
+    parts = [f"{three(value)} {_ADVERBS[mode]}" for mode, value in increments.items()]
     return [f"The load factor changes by up to {', '.join(parts)}."]

@@ -14,12 +14,12 @@ from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 from lidar_mi.assessment.report.block import Block
 
 
-def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
+def encounter_blocks(metrics: Mapping[str, xr.DataArray]) -> Iterator[Block]:
     """Distribution of the largest bank angle of all flights, and the fraction below the limit."""
     rolls = {
-        name: np.degrees(np.abs(known[f"encounter.{mode}.largest_roll"].values.ravel()))
+        name: np.degrees(np.abs(metrics[f"encounter.{mode}.largest_roll"].values.ravel()))
         for mode, (name, *_) in FLIGHTS.items()
-        if f"encounter.{mode}.largest_roll" in known
+        if f"encounter.{mode}.largest_roll" in metrics
     }
     rolls = {name: values[np.isfinite(values)] for name, values in rolls.items()}
     rolls = {name: values for name, values in rolls.items() if values.size}
@@ -36,21 +36,21 @@ def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
         against = {name: rolls[name] for name in steered}
         panels.append(draw_against(label, (off, rolls[off]), against, limit))
     yield Block("Bank angle", text, panels)
-    added = _added(known)
+    added = _added(metrics)
     if added:
         yield Block("What the lidar adds", added, [])
 
 
-def _added(known: Mapping[str, xr.DataArray]) -> str:
+def _added(metrics: Mapping[str, xr.DataArray]) -> str:
     """The verdict over all flights: sum and spread of what the lidar removes."""
     keys = [f"encounter.{mode}.largest_roll" for mode in ("autopilot", "feedforward", "perfect")]
-    if not all(key in known for key in keys):
+    if not all(key in metrics for key in keys):
         return ""
     names = ("preview_from", "lead_time")
-    nothing = xr.full_like(known[keys[0]], np.nan)
+    nothing = xr.full_like(metrics[keys[0]], np.nan)
     rows = np.stack(
-        [known[key].values.ravel() for key in keys]
-        + [known.get(f"encounter.{name}", nothing).values.ravel() for name in names]
+        [metrics[key].values.ravel() for key in keys]
+        + [metrics.get(f"encounter.{name}", nothing).values.ravel() for name in names]
     )
     blind, ours, perfect, start, lead = rows[:, np.isfinite(rows[:3]).all(0)]
     if not blind.size:
@@ -96,5 +96,5 @@ def _added(known: Mapping[str, xr.DataArray]) -> str:
 def _fraction(met: np.ndarray) -> str:
     """Percentage with its standard error, by Laplace's rule so that none and all have one, too."""
     mean, count = met.mean(), met.size
-    ruled = (met.sum() + 1) / (count + 2)
-    return f"{with_error(100 * mean, 100 * np.sqrt(ruled * (1 - ruled) / count))} %"
+    estimate = (met.sum() + 1) / (count + 2)
+    return f"{with_error(100 * mean, 100 * np.sqrt(estimate * (1 - estimate) / count))} %"

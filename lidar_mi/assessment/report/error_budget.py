@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from lidar_mi.assessment.digits import fixed, whole_percent
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.error_budget import (
     CAUSES,
@@ -74,12 +74,12 @@ def _fraction(value: float) -> str:
 
 def _table(budget: Mapping[str, float], method: str) -> NumberTable:
     def values(cause: str) -> list[str]:
-        shown = []
+        cells = []
         for place in PLACES:
             for key, style in (("rmse_v", fixed), ("rmse_w", fixed), ("fraction", _fraction)):
                 value = budget.get(f"{place}{cause}{key}")
-                shown.append("-" if value is None else style(value))
-        return shown
+                cells.append("-" if value is None else style(value))
+        return cells
 
     rows = [("with all causes", "", values(""))]
     rows += [(f"without: {CAUSES[c]}", "", values(f"{c}.")) for c in causes_of(budget)]

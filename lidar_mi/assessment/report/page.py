@@ -11,15 +11,14 @@ import jinja2
 from markupsafe import Markup
 
 from lidar_mi.assessment.digits import percent, whole_percent
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
-from lidar_mi.assessment.report.coherent_lidar import coherent_described
+from lidar_mi.assessment.report.coherent_lidar import coherent_lidar_rows
 from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.schema.encounter import Encounter
 from lidar_mi.schema.experiment import Experiment
-from lidar_mi.schema.platform import Platform
 from lidar_mi.units import shown
 
 # Models of an aircraft that are not JSBSim's, as the report calls them.
@@ -64,7 +63,7 @@ class Film(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A figure as a data URL, the fractions of its width at which panels part, and what is seen."""
+    """A figure as a data URL, its panel boundaries as fractions of the width, and its alt text."""
 
     title: str
     caption: str
@@ -127,14 +126,14 @@ def page(
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
         images = dict(zip(drawn, pool.map(picture, drawn), strict=True))
-    shown = [[images[figure] for figure in chapter.drawn] for chapter in chapters]
-    first = next((figures for figures in shown if figures), [])
+    pictures = [[images[figure] for figure in chapter.drawn] for chapter in chapters]
+    first = next((figures for figures in pictures if figures), [])
     overview, first[:1] = first[:1], []
     return template("report.html").render(
         name=experiment.name,
         simulated=simulated(experiment, versions, metrics),
         resolved=resolved,
-        metrics={key: _rounded(key, value) for key, value in metrics.items()},
+        metrics={key: f"{value:.4g} {unit_of(key)}".strip() for key, value in metrics.items()},
         answer=answer,
         overview=overview,
         data=data,
@@ -145,7 +144,7 @@ def page(
         chapters=[
             chapter._asdict()
             | {"images": figures, "film": _packed(chapter.film) if chapter.film else None}
-            for chapter, figures in zip(chapters, shown, strict=True)
+            for chapter, figures in zip(chapters, pictures, strict=True)
         ],
     )
 
@@ -182,7 +181,7 @@ def picture(figure: Drawn) -> Picture:
     """A figure for a page: lossless WebP, two thirds of its PNG."""
     source = f"data:image/webp;base64,{base64.b64encode(as_webp(figure.path)).decode()}"
     cuts = " ".join(f"{cut:.4f}" for cut in panel_cuts(figure.path))
-    alt = f"{figure.title}. {figure.seen}".strip()
+    alt = f"{figure.title}. {figure.alt_text}".strip()
     return Picture(figure.title, figure.caption, source, cuts, alt)
 
 
@@ -213,15 +212,17 @@ def simulated(
                 f"{percent(rotor.turbulence)}"
             )
         else:
-            when = "" if wake.time is None else f" at {wake.time:.15g} s"
-            flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
+            time = "" if wake.time is None else f" at {wake.time:.15g} s"
+            flow = f"{wake.file}{time}, {wake.spacing:g} m grid"
         texture = "no texture added"
         if wake.texture.rms:
             scale = f"outer scale {wake.texture.outer_scale:g} m"
             texture = f"texture of {percent(wake.texture.rms)} rms, {scale}"
         rows.append(("wake", f"{flow}; {texture}"))
         flight = experiment.encounter
-        rows.append(_flight(flight) if flight else _platform(experiment.platform))
+        steps = f"{shown(experiment.platform.dt, 's')} apart"
+        platform = "platform", f"{shown(experiment.platform.speed, 'm/s')}, images {steps}"
+        rows.append(_flight(flight) if flight else platform)
         distance = flight.look_ahead if flight else scan.range
         beam = (
             f"{shown(lidar.wavelength, 'nm')}, {shown(lidar.pulse_energy, 'mJ')}, "
@@ -244,30 +245,27 @@ def simulated(
         methods = ", ".join(METHOD_NAMES[name] for name in chosen.methods)
         rows.append(("winds by", methods))
     if experiment.coherent:
-        rows += coherent_described(experiment.coherent, experiment.wake)
+        rows += coherent_lidar_rows(experiment.coherent, experiment.wake)
     if experiment.fringes:
-        other = experiment.fringes.lidar
+        doppler = experiment.fringes.lidar
         beam = (
-            f"{shown(other.wavelength, 'nm')}, {shown(other.pulse_energy, 'mJ')}, "
-            f"{other.range_bin:g} m at {other.range:g} m, in air of {other.altitude:g} m altitude"
+            f"{shown(doppler.wavelength, 'nm')}, {shown(doppler.pulse_energy, 'mJ')}, "
+            f"{doppler.range_bin:g} m at {doppler.range:g} m, in air of {doppler.altitude:g} m "
+            "altitude"
         )
-        if other.pressure is not None and other.temperature is not None:
-            beam += f" ({other.pressure / 100:.4g} hPa, {other.temperature:.4g} K)"
+        if doppler.pressure is not None and doppler.temperature is not None:
+            beam += f" ({doppler.pressure / 100:.4g} hPa, {doppler.temperature:.4g} K)"
         rows.append(("Doppler lidar", beam))
     if experiment.sensor:
         lines = experiment.sensor.directions
-        both = (
+        combined = (
             f"{lines.columns} x {lines.rows} lines of sight of {experiment.sensor.pulses} pulses, "
             f"v and w by {METHOD_NAMES[experiment.sensor.method]}"
         )
-        rows.append(("both together", both))
+        rows.append(("both together", combined))
     rows.append(("seed", str(experiment.seed)))
     rows.append(("versions", ", ".join(f"{name} {version}" for name, version in versions.items())))
     return rows
-
-
-def _platform(platform: Platform) -> tuple[str, str]:
-    return "platform", f"{shown(platform.speed, 'm/s')}, images {shown(platform.dt, 's')} apart"
 
 
 def _flight(encounter: Encounter) -> tuple[str, str]:
@@ -279,8 +277,3 @@ def _flight(encounter: Encounter) -> tuple[str, str]:
         f"{kind}, at {shown(path.speed, 'm/s')}, {crossing if wake else ''}on a path of "
         f"{math.degrees(path.climb_angle):+.3g} degrees; {encounter.rate:g} slabs a second"
     )
-
-
-def _rounded(key: str, value: float) -> str:
-    """A metric with four digits and its unit."""
-    return f"{value:.4g} {unit_of(key)}".strip()

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from lidar_mi.assessment.digits import three
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.report.page import Chapter, Tables
 
 

@@ -25,8 +25,8 @@ _OBJECTIVES = (
 
 def sample_blocks(
     dataset: xr.Dataset,
-    known: Mapping[str, xr.DataArray],
-    shown: Sequence[str],
+    metrics: Mapping[str, xr.DataArray],
+    keys: Sequence[str],
     axes: Mapping[str, Axis],
     points: Points,
 ) -> Iterator[Block]:
@@ -34,8 +34,8 @@ def sample_blocks(
     logarithmic = [name for name, axis in axes.items() if axis.logarithmic]
     labels = {name: axis.label.partition(" / ")[0] for name, axis in axes.items()}
     places = {name: dataset[name].values for name in axes}
-    for key in shown:
-        values = known[key].transpose(SAMPLE, ...)
+    for key in keys:
+        values = metrics[key].transpose(SAMPLE, ...)
         label, mean = label_of(values, key), numbers.over_members(values).mean.values
         title, text, drawn = label.partition(" / ")[0], "", []
         y = Axis(key, label, False)
@@ -43,21 +43,21 @@ def sample_blocks(
             # errors vary by factors: so does their surrogate
             factors = numbers.varies_by_factors(values.values)
             analysed = np.log10(values.values) if factors else values.values
-            found = sobol_indices(places, analysed, logarithmic)
-            text = ("Of its logarithm. " if factors else "") + _sensitivity_text(found)
-            if found.determined:
-                drawn.append(figures.draw_indices("Sobol' indices", found, labels, title))
+            indices = sobol_indices(places, analysed, logarithmic)
+            text = ("Of its logarithm. " if factors else "") + _sensitivity_text(indices)
+            if indices.determined:
+                drawn.append(figures.draw_indices("Sobol' indices", indices, labels, title))
         for name, axis in axes.items():
             drawn.append(figures.draw_scatter("", axis, places[name], y, mean, points))
         yield Block(title, f"{text} Key: {key}.", drawn)
-    for key in shown:
+    for key in keys:
         if "rmse_" in key:
-            yield from _fronts(key, known, axes, places, points)
+            yield from _fronts(key, metrics, axes, places, points)
 
 
 def _fronts(
     key: str,
-    known: Mapping[str, xr.DataArray],
+    metrics: Mapping[str, xr.DataArray],
     axes: Mapping[str, Axis],
     places: Mapping[str, np.ndarray],
     points: Points,
@@ -65,10 +65,10 @@ def _fronts(
     varied = [(name, larger) for name, larger in _OBJECTIVES if name in axes]
     if not varied:
         return
-    values = numbers.over_members(known[key].transpose(SAMPLE, ...)).mean.values
+    values = numbers.over_members(metrics[key].transpose(SAMPLE, ...)).mean.values
     objectives = np.stack([values, *(places[name] for name, _ in varied)], axis=1)
     front = pareto_front(objectives, [False, *(larger for _, larger in varied)])
-    label = label_of(known[key], key)
+    label = label_of(metrics[key], key)
     y = Axis(key, label, False)
     better = ", ".join(
         f"{'larger' if larger else 'smaller'} {axes[name].label.partition(' / ')[0]}"
@@ -102,8 +102,8 @@ def margin_blocks(
     places = {name: dataset[name].values for name in numeric}
     drawn = []
     for (application, phase), rows in margins.items():
-        each = np.stack([one.mean.transpose(SAMPLE).values for one in rows.values()])
-        worst = each.min(0)  # NaN where any row has no value
+        of_rows = np.stack([margin.mean.transpose(SAMPLE).values for margin in rows.values()])
+        worst = of_rows.min(0)  # NaN where any row has no value
         x, y = sorted(_decisive(places, worst), key=numeric.index)
         title = f"{application.replace('_', ' ')}, {phase}"
         drawn.append(
@@ -118,27 +118,27 @@ def margin_blocks(
 
 def _decisive(places: Mapping[str, np.ndarray], values: np.ndarray) -> list[str]:
     """The two knobs of largest rank correlation with values; the first ones where none has any."""
-    known = np.isfinite(values)
-    if known.sum() < 3 or np.ptp(values[known]) == 0:
+    finite = np.isfinite(values)
+    if finite.sum() < 3 or np.ptp(values[finite]) == 0:
         return list(places)[:2]
     strength = {
-        name: abs(stats.spearmanr(at[known], values[known]).statistic)
+        name: abs(stats.spearmanr(at[finite], values[finite]).statistic)
         for name, at in places.items()
     }
     return sorted(strength, key=lambda name: -np.nan_to_num(strength[name]))[:2]
 
 
-def _sensitivity_text(found: SobolIndices) -> str:
-    luck = (
+def _sensitivity_text(indices: SobolIndices) -> str:
+    between_members = (
         ""
-        if np.isnan(found.luck)
-        else f" Luck (members of a point) is {percent(found.luck)} of it."
+        if np.isnan(indices.between_members)
+        else f" Members of a point differ by {percent(indices.between_members)} of it."
     )
-    if not found.determined:
-        return f"Sobol' indices are undetermined: {found.reason}.{luck}"
-    unexplained = max(0.0, 1 - found.explained)
+    if not indices.determined:
+        return f"Sobol' indices are undetermined: {indices.reason}.{between_members}"
+    unexplained = max(0.0, 1 - indices.explained)
     return (
-        f"Sobol' indices with 95 % intervals, from {found.points} points. The knobs explain "
-        f"{percent(found.explained)} of the variance (cross-validated Q²); "
-        f"{percent(unexplained)} is luck or too sharp for so few points.{luck}"
+        f"Sobol' indices with 95 % intervals, from {indices.points} points. The knobs explain "
+        f"{percent(indices.explained)} of the variance (cross-validated Q²); "
+        f"{percent(unexplained)} is random or too sharp for so few points.{between_members}"
     )

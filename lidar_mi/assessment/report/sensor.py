@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lidar_mi.assessment.digits import in_row, percent, three
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.metrics.requirements import Judged, look_ahead
 from lidar_mi.assessment.report.compliance import compliance
 from lidar_mi.assessment.report.page import Chapter, NumberTable, Tables
@@ -96,7 +96,7 @@ def _limit_of_u(metrics: Mapping[str, float]) -> list[str]:
 
 
 def _not_stated(errors: PlatformErrors) -> list[str]:
-    """That the platform has errors which standard errors do not include."""
+    """A sentence on errors of the platform that standard errors do not include."""
     if errors == PlatformErrors():
         return []
     text = (
@@ -107,14 +107,14 @@ def _not_stated(errors: PlatformErrors) -> list[str]:
 
 
 def _costs(metrics: Mapping[str, float]) -> list[str]:
-    needed = metrics.get("sensor.doppler.pulses_needed")
+    pulses = metrics.get("sensor.doppler.pulses_needed")
     text = (
         f"The Doppler lidar's directions require {_rate(metrics, 'doppler')}, and give "
         f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each"
         + (
-            f"; the required error of v_LOS needs {needed} pulse{'s' * (needed != 1)} per "
+            f"; the required error of v_LOS needs {pulses} pulse{'s' * (pulses != 1)} per "
             "direction."
-            if needed
+            if pulses
             else "."
         )
         + f" The images require {_rate(metrics, 'backscatter')}."
@@ -141,8 +141,8 @@ def _rate(metrics: Mapping[str, float], name: str) -> str:
     rate, power, beams = (
         metrics[f"sensor.{name}.{key}"] for key in ("pulses_per_second", "average_power", "beams")
     )
-    at_once = f", {beams} directions at a time" if beams > 1 else ""
-    return f"{three(rate)} pulses per second{at_once}, {three(power)} W of light"
+    parallel = f", {beams} directions at a time" if beams > 1 else ""
+    return f"{three(rate)} pulses per second{parallel}, {three(power)} W of light"
 
 
 def _numbers(metrics: Mapping[str, float]) -> NumberTable:

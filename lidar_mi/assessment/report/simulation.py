@@ -14,17 +14,17 @@ from lidar_mi.schema.experiment import Experiment
 
 _FRACTION = f"{Source.NOISY}.monte_carlo_fraction"
 _SAMPLES = f"{Source.BACKSCATTER}.samples_per_beam"
-# Of an error: what the rest of it is, and so the number of samples, follows from a small difference
-_NEARLY_ALL = 0.9
-# Of a mean square error that is the simulation's, 5 % of the rms error: worth a sentence.
+# Above this fraction of the error the remainder, and so the number of samples, is ill-determined.
+_LARGEST_PART = 0.9
+# Least fraction of the mean square error that is mentioned: 5 % of the rms error.
 _LEAST_PART = 0.1
 
 
 def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) -> str:
-    """Which part of the wind's error is the simulation's; empty where it is as small as asked for.
+    """The part of the wind's error by the simulation; empty where it is as small as requested.
 
-    Which part of the images' noise it is, of volumes, whose winds are not retrieved once more, and
-    where no method has a vector that is valid with this noise and with as much again.
+    The part of the images' noise for volumes, whose winds are not retrieved again, and where no
+    vector is valid with twice this noise.
     """
     if _SAMPLES not in metrics:
         return ""
@@ -49,7 +49,7 @@ def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) ->
     large = [part for part in parts if part.exceeds(allowed)]
     if not large:
         return ""
-    named = " and ".join(
+    methods = " and ".join(
         f"{whole_percent(part.fraction)} ({METHOD_NAMES[part.method]})" for part in large
     )
     beyond = " beyond two core radii" if large[0].place else ""
@@ -57,8 +57,8 @@ def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) ->
     if _FRACTION in metrics:
         ratio = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
     return (
-        f"Noise of the simulation, which a lidar does not have, causes {named} of the mean square "
-        f"error of v and w{beyond} ({number}{ratio})."
+        f"Noise of the simulation, which a lidar does not have, causes {methods} of the mean "
+        f"square error of v and w{beyond} ({number}{ratio})."
     )
 
 
@@ -68,14 +68,18 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
     if not sentence:
         return ""
     text = sentence[0].lower() + sentence[1:].removesuffix(".")
-    samples, needed = metrics[_SAMPLES], _needed(experiment, metrics)
+    samples, sufficient = metrics[_SAMPLES], _sufficient_samples(experiment, metrics)
     allowed = experiment.render.monte_carlo_fraction
     if experiment.render.samples_per_beam == "auto" and experiment.detector:
-        times = f"; expected {float(f'{needed / samples:.2g}'):g} times as many" if needed else ""
+        times = (
+            f"; expected {float(f'{sufficient / samples:.2g}'):g} times as many"
+            if sufficient
+            else ""
+        )
         return f"render.max_samples: {text}{times}"
-    # two digits of it are known
-    expected = f"{float(f'{needed:.2g}'):.0f} or more" if needed else "more"
-    visible = 0.0 if needed else _texture_visible(experiment, metrics)
+    # it is known to two digits
+    expected = f"{float(f'{sufficient:.2g}'):.0f} or more" if sufficient else "more"
+    visible = 0.0 if sufficient else _texture_visible(experiment, metrics)
     if visible > samples:
         expected += (
             f": with {visible:.2g} its variance is {whole_percent(allowed)} of that of the texture"
@@ -86,9 +90,9 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
 
 def samples_of(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     """The number of samples of a run's images, and whether it was chosen."""
-    asked = experiment.render.samples_per_beam
-    number = f"{metrics.get(_SAMPLES, asked):.4g}" if _SAMPLES in metrics else str(asked)
-    chosen = " chosen by the detector noise" if asked == "auto" and _SAMPLES in metrics else ""
+    samples = experiment.render.samples_per_beam
+    number = f"{metrics.get(_SAMPLES, samples):.4g}" if _SAMPLES in metrics else str(samples)
+    chosen = " chosen by the detector noise" if samples == "auto" and _SAMPLES in metrics else ""
     return f"{number} samples per beam{chosen if experiment.detector else ''}"
 
 
@@ -122,7 +126,7 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
 
 
 def _texture_visible(experiment: Experiment, metrics: Mapping[str, float]) -> float:
-    """Samples per beam at which the noise is as small a part of the texture; 0: no texture."""
+    """Samples per beam for the same fraction of the texture's variance; 0: no texture."""
     texture = experiment.wake.texture.rms if experiment.wake else 0.0
     if not texture:
         return 0.0
@@ -130,11 +134,11 @@ def _texture_visible(experiment: Experiment, metrics: Mapping[str, float]) -> fl
     return metrics[_SAMPLES] * ratio**2 / experiment.render.monte_carlo_fraction
 
 
-def _needed(experiment: Experiment, metrics: Mapping[str, float]) -> float:
-    """Samples per beam that are enough; 0: not known, as hardly any error is of something else."""
+def _sufficient_samples(experiment: Experiment, metrics: Mapping[str, float]) -> float:
+    """Samples per beam that suffice; 0: unknown, as nearly all of the error is the simulation's."""
     samples, allowed = metrics[_SAMPLES], experiment.render.monte_carlo_fraction
     if _FRACTION in metrics:
         return samples * metrics[_FRACTION] / allowed
     parts = () if experiment.volume else simulation_parts(metrics, experiment.retrieval.methods)
     largest = max((part.fraction for part in parts), default=1.0)
-    return samples * largest / (1 - largest) / allowed if largest < _NEARLY_ALL else 0.0
+    return samples * largest / (1 - largest) / allowed if largest < _LARGEST_PART else 0.0

@@ -59,18 +59,18 @@ def _winds(metrics: Mapping[str, float]) -> Table:
     """Rms errors of the winds from every source, by every method."""
     components = "uvw" if "true_wind.rms_u" in metrics else "vw"
     places = [""] + [OUTSIDE_CORES] * bool(far_from_cores(metrics, "true_wind.", "rms_"))
-    wanted = [(place, name) for place in places for name in components]
+    columns = [(place, name) for place in places for name in components]
     rows = []
     for source, method in product(Source, _METHODS):
         valid = metrics.get(wind_key(source, method, "valid_fraction"))
         if valid is not None:
-            keys = [wind_key(source, method, f"{place}rmse_{name}") for place, name in wanted]
+            keys = [wind_key(source, method, f"{place}rmse_{name}") for place, name in columns]
             label = source.replace("_", " ").replace("extinction ", "")
-            errors = (_shown(metrics.get(key)) for key in keys)
-            shown = "no skill" if has_no_skill(metrics, source, method) else f"{valid:.0%}"
-            rows.append((label, str(method), *errors, shown))
-    strength = [_shown(metrics.get(f"true_wind.{place}rms_{name}")) for place, name in wanted]
-    heads = [f"far {name}" if place else name for place, name in wanted]
+            errors = (_decimals(metrics.get(key)) for key in keys)
+            validity = "no skill" if has_no_skill(metrics, source, method) else f"{valid:.0%}"
+            rows.append((label, str(method), *errors, validity))
+    strength = [_decimals(metrics.get(f"true_wind.{place}rms_{name}")) for place, name in columns]
+    heads = [f"far {name}" if place else name for place, name in columns]
     far = " (far: beyond two core radii)" if len(places) > 1 else ""
     return Table(
         f"rms error of the wind in m/s, valid vectors{far}",
@@ -91,7 +91,7 @@ def _sensor(metrics: Mapping[str, float]) -> Table:
     ):
         values = [metrics.get(f"{key}{name}") for name in "uvw"]
         if any(value is not None for value in values):
-            rows.append((label, *map(_shown, values)))
+            rows.append((label, *map(_decimals, values)))
     title = f"rms error of the wind from both lidars{', beyond cores' if place else ''}, m/s"
     return Table(title, rows, ("", "u", "v", "w"))
 
@@ -100,9 +100,9 @@ def _with_error(metrics: Mapping[str, float], key: str) -> str:
     """A statistic with its standard error, where it has one."""
     value, stderr = metrics.get(key), metrics.get(f"{key}_stderr")
     if value is None or stderr is None:
-        return _shown(value, 3)
+        return _decimals(value, 3)
     return with_error(value, stderr)
 
 
-def _shown(value: float | None, decimals: int = 2) -> str:
+def _decimals(value: float | None, decimals: int = 2) -> str:
     return "-" if value is None else f"{value:.{decimals}f}"

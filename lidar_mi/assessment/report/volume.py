@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 from lidar_mi.assessment.digits import fixed, in_row, percent
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.volume import COMPONENTS
@@ -53,8 +53,8 @@ def _tables(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[Nu
             ):
                 values = [metrics.get(wind_key(source, method, key.format(n))) for n in COMPONENTS]
                 rows.append((label, unit, in_row(values, unit)))
-            own = [fixed(metrics[f"true_wind.rms_{name}"]) for name in COMPONENTS]
-            rows.append(("the true wind itself, rms", "m/s", own))
+            strength = [fixed(metrics[f"true_wind.rms_{name}"]) for name in COMPONENTS]
+            rows.append(("the true wind itself, rms", "m/s", strength))
             valid = metrics[wind_key(source, method, "valid_fraction")]
             name = METHOD_NAMES[method]
             title = f"{SOURCE_NAMES[source]}, {name}: {percent(valid)} of the vectors are valid"

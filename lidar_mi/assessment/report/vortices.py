@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from lidar_mi.assessment.digits import fixed, with_error
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import vortex_key
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES
@@ -63,11 +63,11 @@ def vortex_chapter(
     ]
     heads = ["truth", *(f"from the {ORIGIN_NAMES[name]}" for name in fits)]
     pair = [
-        (label, unit, [_shown(metrics, vortex_key(name, key)) for name in ("truth", *fits)])
+        (label, unit, [_cell(metrics, vortex_key(name, key)) for name in ("truth", *fits)])
         for key, label, unit in _ROWS
     ]
     errors = [
-        (label, unit, [_shown(metrics, vortex_key(name, key)) for name in fits])
+        (label, unit, [_cell(metrics, vortex_key(name, key)) for name in fits])
         for key, label, unit in _ERRORS
     ]
     tables = [("The vortex pair", heads, pair)]
@@ -91,12 +91,14 @@ def _verdict(metrics: Mapping[str, float], name: str) -> str | None:
     if any(metrics.get(vortex_key("truth", key)) is None for key in circulations):
         return None
 
-    def both(key: str) -> tuple[float, float]:
+    def estimate_and_truth(key: str) -> tuple[float, float]:
         return metrics[vortex_key(name, key)], metrics[vortex_key("truth", key)]
 
-    deviations = [abs(found / true - 1) for found, true in map(both, circulations)]
+    deviations = [abs(fit / true - 1) for fit, true in map(estimate_and_truth, circulations)]
     places = [
-        math.hypot(*(found - true for found, true in (both(f"{side}_y"), both(f"{side}_z"))))
+        math.hypot(
+            *(fit - true for fit, true in map(estimate_and_truth, (f"{side}_y", f"{side}_z")))
+        )
         for side in sides
     ]
     return (
@@ -106,7 +108,7 @@ def _verdict(metrics: Mapping[str, float], name: str) -> str | None:
     )
 
 
-def _shown(metrics: Mapping[str, float], key: str) -> str:
+def _cell(metrics: Mapping[str, float], key: str) -> str:
     value, stderr = metrics.get(key), metrics.get(f"{key}_stderr")
     if value is None:
         return "-"

@@ -42,11 +42,11 @@ class LevelFrame:
         x, y, z, time = place_and_time
         level_x, height = self.places(x, z)
         shape = np.broadcast_shapes(*(np.shape(a) for a in place_and_time))
-        found = np.zeros((3, *shape))
+        wind = np.zeros((3, *shape))
         for part in parts:
-            found += np.stack(part.velocity(level_x, y, height, time))
+            wind += np.stack(part.velocity(level_x, y, height, time))
         c, s = math.cos(self.climb_angle), math.sin(self.climb_angle)
-        u, v, w = found
+        u, v, w = wind
         return c * u + s * w, v, c * w - s * u
 
 
@@ -78,11 +78,11 @@ class AirAlongPath:
 
     def wind(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:
         """u, v, w (m s^-1) at places (m) and times (s), which broadcast."""
-        found = self.frame.wind(self.parts, x, y, z, time)
+        ambient = self.frame.wind(self.parts, x, y, z, time)
         if self.wake is None:
-            return found
-        own = self.wake.wind(*self._in_the_wake(x, y, z, time), time)
-        u, v, w = (a + b for a, b in zip(found, own, strict=True))
+            return ambient
+        swirl = self.wake.wind(*self._in_the_wake(x, y, z, time), time)
+        u, v, w = (a + b for a, b in zip(ambient, swirl, strict=True))
         return u, v, w
 
     def extinction(
@@ -105,7 +105,7 @@ class AirAlongPath:
             raise InputError("encounter.air.wake: false leaves no vortices; expected true")
         along, left, up = (speed * (time - self.t_c) for speed in self.drift)
         port, starboard = (
-            replace(one, y=one.y + left, z=one.z + up)
-            for one in self.wake.vortices(x - along, time)
+            replace(vortex, y=vortex.y + left, z=vortex.z + up)
+            for vortex in self.wake.vortices(x - along, time)
         )
         return port, starboard

@@ -59,8 +59,8 @@ class Gust:
         inside = (s >= 0) & (s <= 2)
         profile = np.where(inside, self.speed / 2 * (1 - np.cos(np.pi * s)), 0.0)
         shape = np.broadcast_shapes(*(np.shape(a) for a in (x, y, z, time)))
-        found = np.zeros((3, *shape))
+        wind = np.zeros((3, *shape))
         axis, sign = _TOWARDS[self.direction]
-        found[axis] = sign * profile
-        u, v, w = found
+        wind[axis] = sign * profile
+        u, v, w = wind
         return u, v, w

@@ -19,8 +19,6 @@ OUTFLOW_HEIGHT = 0.22
 BOUNDARY_LAYER = 12.5
 """z* over the height of the boundary layer."""
 
-OUTFLOW_RADIUS = 1.1212
-"""Radius of the largest outflow over that of the downdraft."""
 
 LARGEST_OUTFLOW = 0.2357
 """Largest outflow over lambda R."""
@@ -74,9 +72,9 @@ class Microburst:
         radial = np.divide(-np.expm1(-q), q, out=np.ones_like(q), where=q > 1e-300)
         shape = np.exp(-above / depth) - np.exp(-above / layer)
         down = layer * np.expm1(-above / layer) - depth * np.expm1(-above / depth)
-        found = np.broadcast_arrays(
+        wind = np.broadcast_arrays(
             *(rate / 2 * d * radial * shape for d in from_axis),
             -rate * np.exp(-q) * down,
             np.asarray(time, float),
         )
-        return found[0], found[1], found[2]
+        return wind[0], wind[1], wind[2]

@@ -68,8 +68,8 @@ def energy_spectrum(k: ArrayLike, sigma: float, length: float, spectrum: Spectru
 class Turbulence:
     """One realisation of turbulence: a Gaussian field without divergence.
 
-    u(x, t) = sum over modes of a cos(k x - w t) + b sin(k x - w t) with a and b normal to k. Each
-    octave of wavenumbers has as many modes as any other; they hold the energy of the spectrum.
+    u(x, t) = sum over modes of a cos(k x - w t) + b sin(k x - w t) with a and b normal to k. Every
+    octave of wavenumbers has the same number of modes, with the energy of the spectrum.
 
     Attributes
     ----------
@@ -84,9 +84,9 @@ class Turbulence:
 
     def velocity(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:
         """u, v, w (m/s) at places (m) and times (s), which broadcast; to 1e-5 of the rms."""
-        given = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
-        shape, at = given[0].shape, np.stack([a.ravel() for a in given], axis=-1)
-        found = np.empty((len(at), 3))
+        broadcast = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
+        shape, at = broadcast[0].shape, np.stack([a.ravel() for a in broadcast], axis=-1)
+        wind = np.empty((len(at), 3))
         waves = self.waves.astype(np.float32)
         even, odd = self.amplitudes.astype(np.float32)
         for start in range(0, len(at), _CHUNK):
@@ -95,8 +95,8 @@ class Turbulence:
             middle = part.mean(axis=0)
             offset = np.mod(middle @ self.waves, 2 * np.pi).astype(np.float32)
             phase = (part - middle).astype(np.float32) @ waves + offset
-            found[start : start + _CHUNK] = np.cos(phase) @ even + np.sin(phase) @ odd
-        u, v, w = np.moveaxis(found.reshape(*shape, 3), -1, 0)
+            wind[start : start + _CHUNK] = np.cos(phase) @ even + np.sin(phase) @ odd
+        u, v, w = np.moveaxis(wind.reshape(*shape, 3), -1, 0)
         return u, v, w
 
 

@@ -90,7 +90,7 @@ class AirVolume:
 
     @cached_property
     def times(self) -> np.ndarray:
-        """Of the states, s; of frozen air one."""
+        """Times of the states, s; one for frozen air."""
         return self.flow["time"].values if "time" in self.flow.dims else np.zeros(1)
 
     def _state(self, index: int) -> xr.Dataset:
@@ -99,27 +99,27 @@ class AirVolume:
     @cached_property
     def mean_wind(self) -> tuple[float, float]:
         """Mean u and v of the volume at the height, m/s, over all states."""
-        over = [name for name in ("time", "x", "y") if name in self.flow.dims]
-        level = self.flow[["u", "v"]].mean(over).interp(z=self.height)
-        # below the lowest or above the highest nodes that of the nearest
-        nearest = self.flow[["u", "v"]].mean(over).sel(z=self.height, method="nearest")
-        found = level.where(np.isfinite(level), nearest)
-        return float(found["u"]), float(found["v"])
+        averaged = [name for name in ("time", "x", "y") if name in self.flow.dims]
+        level = self.flow[["u", "v"]].mean(averaged).interp(z=self.height)
+        # beyond the lowest and highest nodes, the nearest
+        nearest = self.flow[["u", "v"]].mean(averaged).sel(z=self.height, method="nearest")
+        wind = level.where(np.isfinite(level), nearest)
+        return float(wind["u"]), float(wind["v"])
 
     def _moved(self, last: float) -> tuple[tuple[float, float], tuple[float, float]]:
         """How far the mean wind has carried the air at the first and at the last state needed, m.
 
-        Frozen air is looked up where it was at the only state.
+        Frozen air has a single state.
         """
-        needed = min(int(np.searchsorted(self.times, last)), len(self.times) - 1)
+        state = min(int(np.searchsorted(self.times, last)), len(self.times) - 1)
         u, v = self.mean_wind
-        ends = float(self.times[0]), float(self.times[needed])
+        ends = float(self.times[0]), float(self.times[state])
         return (u * ends[0], u * ends[1]), (v * ends[0], v * ends[1])
 
     def missing(
         self, x: ArrayLike, y: ArrayLike, z: ArrayLike, last: float = 0.0
     ) -> dict[str, tuple[float, float, float, float]]:
-        """Along each axis that does not hold all places: its extent, and that of the places; m.
+        """Axes too short for the places: extent of the axis and of the places, m.
 
         With states until the time ``last`` (s) of a series.
         """
@@ -129,14 +129,14 @@ class AirVolume:
             np.add.outer(np.asarray(y, float) + self.centre, across),
             z,
         )
-        found = {}
+        extents = {}
         for name, place in zip("xyz", places, strict=True):
             nodes = self.flow[name].values
             low, high = float(np.min(place)), float(np.max(place))
             step = nodes[1] - nodes[0]
             if low < nodes[0] - step / 2 or high > nodes[-1] + step / 2:
-                found[name] = (float(nodes[0]), float(nodes[-1]), low, high)
-        return found
+                extents[name] = (float(nodes[0]), float(nodes[-1]), low, high)
+        return extents
 
     @cached_property
     def _splines(self) -> dict[int, list[np.ndarray]]:
@@ -157,29 +157,31 @@ class AirVolume:
 
     def velocity(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:
         """u, v, w (m/s) at places (m) and times (s), which broadcast."""
-        given = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
-        shape = given[0].shape
-        at_x, at_y, at_z, when = (one.ravel() for one in given)
-        found, count = np.zeros((3, when.size)), len(self.times)
-        # 2.0: halfway between the states 1 and 2 is 1.5
-        position = np.interp(when, self.times, np.arange(count)) if count > 1 else 0.0 * when
-        u, v = self.mean_wind
+        places = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
+        shape = places[0].shape
+        at_x, at_y, at_z, times = (part.ravel() for part in places)
+        wind, count = np.zeros((3, times.size)), len(self.times)
+        # as an index: halfway between the states 1 and 2 is 1.5
+        position = np.interp(times, self.times, np.arange(count)) if count > 1 else 0.0 * times
+        mean_u, mean_v = self.mean_wind
         for index in np.unique([np.floor(position), np.ceil(position)]).astype(int):
             weight = np.clip(1 - np.abs(position - index), 0, None)
-            here = weight > 0
+            weighted = weight > 0
             passed = self.times[index]
-            own = (
-                at_x[here] + self.start + u * passed,
-                at_y[here] + self.centre + v * passed,
-                at_z[here],
+            in_volume = (
+                at_x[weighted] + self.start + mean_u * passed,
+                at_y[weighted] + self.centre + mean_v * passed,
+                at_z[weighted],
             )
-            at = np.stack([self._index(n, place) for n, place in zip("xyz", own, strict=True)])
-            for component, one in enumerate(self._spline(index)):
-                found[component, here] += weight[here] * map_coordinates(
-                    one, at, output=float, mode="nearest", prefilter=False
+            at = np.stack(
+                [self._index(n, place) for n, place in zip("xyz", in_volume, strict=True)]
+            )
+            for component, coefficients in enumerate(self._spline(index)):
+                wind[component, weighted] += weight[weighted] * map_coordinates(
+                    coefficients, at, output=float, mode="nearest", prefilter=False
                 )
-        u_found, v_found, w_found = found.reshape(3, *shape)
-        return u_found, v_found, w_found
+        u, v, w = wind.reshape(3, *shape)
+        return u, v, w
 
     def _index(self, name: str, place: np.ndarray) -> np.ndarray:
         """Fractional index of places along an axis, within it."""

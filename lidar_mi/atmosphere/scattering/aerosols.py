@@ -128,12 +128,12 @@ class Aerosol:
         nodes = [node for node, _ in self.index]
         # a relative 1e-9 forgives the rounding of "532 nm"
         if not nodes[0] * (1 - 1e-9) <= wavelength <= nodes[-1] * (1 + 1e-9):
-            known = f"{nodes[0] * 1e9:g}"
+            span = f"{nodes[0] * 1e9:g}"
             if len(nodes) > 1:
-                known += f" to {nodes[-1] * 1e9:g}"
+                span += f" to {nodes[-1] * 1e9:g}"
             raise InputError(
                 f"wavelength: {wavelength * 1e9:g} nm is not allowed for aerosol {self.name!r}; "
-                f"its refractive index is given for {known} nm"
+                f"its refractive index is given for {span} nm"
             )
         values = [complex(m) for _, m in self.index]
         return complex(
@@ -287,18 +287,18 @@ def changed(
     changes: dict[str, Any] = {key: x for key, x in numbers.items() if x is not None}
     if index is not None:
         changes["index"] = ((wavelength, index),)
-    given: dict[str, Any] = {key: x for key, x in sizes.items() if x is not None}
-    if "radius" in given:
+    new_sizes: dict[str, Any] = {key: x for key, x in sizes.items() if x is not None}
+    if "radius" in new_sizes:
         of = "median" if isinstance(particles.sizes, LogNormal) else "mode"
-        given[of] = given.pop("radius")
-    for key, value in given.items():
+        new_sizes[of] = new_sizes.pop("radius")
+    for key, value in new_sizes.items():
         if not hasattr(particles.sizes, key):
             raise InputError(
                 f"{key}: {value:g} is not allowed; the sizes of {name!r} have no {key}, "
                 f"expected one of {', '.join(vars(particles.sizes))}"
             )
-    if given:
-        changes["sizes"] = replace(particles.sizes, **given)
+    if new_sizes:
+        changes["sizes"] = replace(particles.sizes, **new_sizes)
     if not changes:
         return particles if new_name is None else replace(particles, name=new_name)
     if new_name is None or new_name in AEROSOLS:

@@ -82,11 +82,11 @@ def make_table(
     m = particles.refractive_index(wavelength)
     sphere = particles.elongation == 1
     nodes = nodes or (SPHERE_NODES if sphere else SPHEROID_NODES)
-    one = _sphere if sphere else _spheroid
+    scatter = _sphere if sphere else _spheroid
     sizes = particles.sizes
     low, high = math.log(sizes.smallest), math.log(sizes.largest)
-    # Equal steps in ln r: the integrand vanishes at both ends, where the rule is as good as
-    # Gauss's, and it spends no nodes on the largest sizes, which cost most.
+    # Equal steps in ln r: as accurate as Gauss's rule for an integrand that vanishes at both ends,
+    # and with fewer nodes at the largest sizes, which cost most.
     radius = np.exp(low + (high - low) * (np.arange(nodes) + 0.5) / nodes)
     number = sizes(radius) * radius
     number /= number.sum()
@@ -99,7 +99,7 @@ def make_table(
     # largest first: a size that cannot be computed fails at once
     for done, i in enumerate(range(nodes - 1, -1, -1)):
         size_parameter = 2 * math.pi * radius[i] / wavelength
-        q_ext, q_sca, matrix = one(size_parameter, m, particles.elongation, cosine)
+        q_ext, q_sca, matrix = scatter(size_parameter, m, particles.elongation, cosine)
         extinction += area[i] * q_ext
         scattering += area[i] * q_sca
         elements += area[i] * q_sca * matrix

@@ -15,6 +15,7 @@ from lidar_mi.atmosphere.vortices.wake_path import (
     Components,
     PairAlongPath,
     check_cut,
+    cut_radius,
 )
 from lidar_mi.errors import InputError
 
@@ -48,7 +49,7 @@ class FilamentsAlongPath:
 
     @property
     def wavelength(self) -> float:
-        """m."""
+        """Wavelength, m."""
         return self.pair.crow_wavelength or CROW_WAVELENGTH * self.pair.separation
 
     @cached_property
@@ -83,10 +84,10 @@ class FilamentsAlongPath:
 
     def centre_at(self, time: ArrayLike) -> np.ndarray:
         """Place (3, ...) at a time of the point that is at x_c and ``miss`` at t_c, m."""
-        straight, met = (np.stack(self.pair.centre_at(t)) for t in (time, self.pair.t_c))
-        met = met.reshape(3, *[1] * np.ndim(time))
-        up = self.pair.axes[2].reshape(met.shape)
-        sunk = ((straight - met) * up).sum(0)
+        straight, at_arrival = (np.stack(self.pair.centre_at(t)) for t in (time, self.pair.t_c))
+        at_arrival = at_arrival.reshape(3, *[1] * np.ndim(time))
+        up = self.pair.axes[2].reshape(at_arrival.shape)
+        sunk = ((straight - at_arrival) * up).sum(0)
         return straight + (self._descent - 1) * sunk * up
 
     def wind(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:
@@ -124,16 +125,16 @@ class FilamentsAlongPath:
         check_cut(pair.axes[0], pair.crossing_angle)
         rotation = np.stack(pair.axes)
         centre, strength = self.centre_at(time), float(pair.circulation_at(time))
-        found: list[Vortex] = []
+        vortices: list[Vortex] = []
         for curve in self.filaments.curves:
             places, steps = curve.places @ rotation + centre, curve.steps @ rotation
             # the period whose nodes are nearest to the plane, and its neighbours
             advance = self.wavelength * rotation[0]
             nearest = round((x - places[:, 0].mean()) / advance[0])
             for number in range(nearest - 2, nearest + 3):
-                found += self._crossings(places + number * advance, steps, x, strength)
-        port = [one for one in found if one.circulation > 0]
-        starboard = [one for one in found if one.circulation < 0]
+                vortices += self._crossings(places + number * advance, steps, x, strength)
+        port = [vortex for vortex in vortices if vortex.circulation > 0]
+        starboard = [vortex for vortex in vortices if vortex.circulation < 0]
         if len(port) != 1 or len(starboard) != 1:
             raise InputError(
                 f"x: the plane at {x:g} m cuts {len(port)} port and {len(starboard)} starboard "
@@ -150,13 +151,11 @@ class FilamentsAlongPath:
         if not self.rings:
             following[-1] = places[0] + self.wavelength * self.pair.axes[0]
         before, after = places[:, 0] - x, following[:, 0] - x
-        found = []
+        vortices = []
         for k in np.flatnonzero((before < 0) != (after < 0)):
             part = before[k] / (before[k] - after[k])
             _, y, z = places[k] + part * (following[k] - places[k])
-            tangent = steps[k] / np.linalg.norm(steps[k])
-            # the plane cuts an ellipse, longer by 1 / steep; the circle has its area
-            radius = self.pair.core_radius / np.sqrt(abs(tangent[0]))
-            circulation = float(np.sign(tangent[0])) * strength
-            found.append(Vortex(circulation, float(radius), float(y), float(z), self.pair.model))
-        return found
+            radius = cut_radius(self.pair.core_radius, steps[k])
+            circulation = float(np.sign(steps[k][0])) * strength
+            vortices.append(Vortex(circulation, radius, float(y), float(z), self.pair.model))
+        return vortices

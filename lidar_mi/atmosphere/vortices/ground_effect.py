@@ -74,7 +74,7 @@ class PairAboveGround:
         if not self.height > 0:
             raise InputError(f"height: {self.height} m is not allowed; expected above 0 m")
         half = self.separation / 2
-        found = solve_ivp(
+        solution = solve_ivp(
             self._speeds,
             (-self.age, max(self.last, -self.age) + 1e-6),
             [half, -half, self.height, self.height],
@@ -83,7 +83,7 @@ class PairAboveGround:
             atol=_TOLERANCE,
             dense_output=True,
         )
-        object.__setattr__(self, "_path", found.sol)
+        object.__setattr__(self, "_path", solution.sol)
 
     def _speeds(self, time: float, state: np.ndarray) -> np.ndarray:
         y, z = state[:2], state[2:]
@@ -102,8 +102,8 @@ class PairAboveGround:
         time = np.asarray(time, float)
         # lines hold a time for all of their gates
         moments, index = np.unique(time, return_inverse=True)
-        found = self._path(moments)[:, index.reshape(time.shape)]
-        return found[:2], found[2:]
+        states = self._path(moments)[:, index.reshape(time.shape)]
+        return states[:2], states[2:]
 
     def vortices(self, time: float) -> tuple[Vortex, Vortex]:
         """Port and starboard vortex at a time."""

@@ -12,7 +12,8 @@ from lidar_mi.errors import InputError
 
 MOST_NODES = 10**8
 
-# how far the extent may be from a whole number of cells, in cells: axes of files are even to this
+# largest deviation of the extent from a whole number of cells, in cells: axes of files are even to
+# this
 _UNEVEN = 1e-3
 
 
@@ -79,25 +80,25 @@ def resample(
         {name: (name, values, {"units": "m"}) for name, values in nodes.items()}
     )
     old = [wake[axis].values.astype(float) for axis in "xyz"]
-    targets = [nodes.get(axis, own) for axis, own in zip("xyz", old, strict=True)]
+    targets = [nodes.get(axis, same) for axis, same in zip("xyz", old, strict=True)]
     errors = {}
     for variable_name, variable in wake.data_vars.items():
-        own = variable.transpose("x", "y", "z").values.astype(float)
-        values = own
+        field = variable.transpose("x", "y", "z").values.astype(float)
+        values = field
         if divided:
             for axis in axes:
                 values = scipy.interpolate.CubicSpline(
                     wake[axis].values, values, axis="xyz".index(axis)
                 )(nodes[axis])
         else:
-            values, errors[str(variable_name)] = interpolated(own, old, targets)
+            values, errors[str(variable_name)] = interpolated(field, old, targets)
         if variable_name in ("tracer", "aerosol"):
-            values = values.clip(own.min(), own.max())
+            values = values.clip(field.min(), field.max())
         fine[variable_name] = ("x", "y", "z"), values, variable.attrs
     units = {name: wake[name].attrs.get("units", "") for name in errors}
-    said = [wake.attrs.get("interpolated", ""), statement(errors, units)]
-    if any(said):
-        fine.attrs["interpolated"] = ", then ".join(filter(None, said))
+    notes = [wake.attrs.get("interpolated", ""), statement(errors, units)]
+    if any(notes):
+        fine.attrs["interpolated"] = ", then ".join(filter(None, notes))
     return fine
 
 

@@ -64,6 +64,11 @@ def wake_axes(
     )
 
 
+def cut_radius(core_radius: float, tangent: np.ndarray) -> float:
+    """Radius of the circle with the area of the ellipse that a plane across x cuts from a core."""
+    return core_radius / math.sqrt(abs(tangent[0]) / float(np.linalg.norm(tangent)))
+
+
 def check_cut(along: np.ndarray, crossing_angle: float) -> None:
     """Whether planes across the path cut a wake with this axis.
 
@@ -186,8 +191,8 @@ class PairAlongPath:
             above = speed * (self.t_c - time)
         else:
             ages = (self.age + time, self.age + self.t_c)
-            now, met = (np.exp(-np.asarray(age) / self.decay_time) for age in ages)
-            above = speed * self.decay_time * (now - met)
+            now, at_arrival = (np.exp(-np.asarray(age) / self.decay_time) for age in ages)
+            above = speed * self.decay_time * (now - at_arrival)
         arrival, wind = (self.x_c, *self.miss), (0.0, *self.mean_wind)
         x, y, z = (
             place + speed * (time - self.t_c) + axis * above
@@ -208,12 +213,12 @@ class PairAlongPath:
             if self.crow_amplitude:
                 s = _dot(d, along)
                 offset, slope = self._deformation(s, side)
-                # from where the deformed line is, at the same place along its mean axis
+                # relative to the deformed line at the same place along its mean axis
                 d = [a - s * b - c for a, b, c in zip(d, along, offset, strict=True)]
                 length = np.sqrt(1 + slope[3] ** 2)
                 tangent = tuple((a + b) / length for a, b in zip(along, slope[:3], strict=True))
             axial = _dot(d, tangent)
-            # rounding can make it negative on the axis
+            # rounding can make it negative
             r2 = np.maximum(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - axial**2, 0.0)
             omega = angular_velocity(r2, side * strength, self.core_radius, self.model)
             # omega times the vector product of tangent and distance
@@ -239,7 +244,7 @@ class PairAlongPath:
         along, left, _ = self.axes
         check_cut(along, self.crossing_angle)
         centre, strength = np.array(self.centre_at(time)), float(self.circulation_at(time))
-        found = []
+        vortices = []
         for side in (1, -1):
             start = centre + side * self.separation / 2 * left
             offset, slope = np.zeros(3), np.zeros(3)
@@ -252,12 +257,9 @@ class PairAlongPath:
                     miss = start[0] + axial * along[0] + offset[0] - x
                     axial -= miss / (along[0] + slope[0])
             _, y, z = start + axial * along + offset
-            tangent = along + slope
-            # the plane cuts an ellipse, longer by 1 / steep; the circle has its area
-            steep = tangent[0] / float(np.linalg.norm(tangent))
-            radius = self.core_radius / math.sqrt(steep)
-            found.append(Vortex(side * strength, radius, float(y), float(z), self.model))
-        return found[0], found[1]
+            radius = cut_radius(self.core_radius, along + slope)
+            vortices.append(Vortex(side * strength, radius, float(y), float(z), self.model))
+        return vortices[0], vortices[1]
 
     def _deformation(
         self, axial: np.ndarray, side: int

@@ -14,21 +14,20 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
-from lidar_mi.atmosphere.vortices.wake_path import Components, check_cut, wake_axes
+from lidar_mi.atmosphere.vortices.wake_path import Components, check_cut, cut_radius, wake_axes
 
 # Nodes beyond the period's ends that a cubic spline needs.
-_BEYOND = 3
+_SPLINE_MARGIN = 3
 
 
 @dataclass(frozen=True, eq=False)
 class VolumeAlongPath:
     """A simulated wake, repeated along an axis that crosses the flight path.
 
-    The state of one instant moves with ``drift`` and does not change: what the vortices do to each
-    other and to themselves in the seconds of an encounter beyond that is neglected. Values are
-    interpolated by cubic splines, periodic along the axis. Outside of the volume the wind is that
-    of two straight vortices at the mean places with the mean circulations, the extinction the
-    background.
+    The state of one instant moves with ``drift`` and does not change: any further induction in the
+    seconds of an encounter is neglected. Values are interpolated by cubic splines, periodic along
+    the axis. Outside of the volume the wind is that of two straight vortices at the mean places
+    with the mean circulations, the extinction the background.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ class VolumeAlongPath:
 
     @property
     def period(self) -> float:
-        """Of the wake along its axis, m."""
+        """Period of the wake along its axis, m."""
         x = self.flow["x"].values
         return float(x[-1] - x[0]) + self._steps[0]
 
@@ -85,7 +84,7 @@ class VolumeAlongPath:
     @cached_property
     def _splines(self) -> dict[str, np.ndarray]:
         """Coefficients of cubic splines, repeated beyond the ends of the period."""
-        found = {}
+        coefficients = {}
         for name in self.flow.data_vars:
             values = self.flow[name].transpose("x", "y", "z").values.astype(float)
             if len(values) > 1:
@@ -93,10 +92,10 @@ class VolumeAlongPath:
                 values = scipy.ndimage.spline_filter1d(values, axis=0, mode="grid-wrap")
             for axis in (1, 2):
                 values = scipy.ndimage.spline_filter1d(values, axis=axis, mode="mirror")
-            found[str(name)] = np.take(
-                values, range(-_BEYOND, len(values) + _BEYOND), axis=0, mode="wrap"
+            coefficients[str(name)] = np.take(
+                values, range(-_SPLINE_MARGIN, len(values) + _SPLINE_MARGIN), axis=0, mode="wrap"
             )
-        return found
+        return coefficients
 
     def centre_at(self, time: ArrayLike) -> np.ndarray:
         """Place (3, ...) of the volume's ``origin`` at a time, path frame, m."""
@@ -110,7 +109,7 @@ class VolumeAlongPath:
             ]
         )
 
-    def _own(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> np.ndarray:
+    def _in_volume(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> np.ndarray:
         """Places in the volume's axes, (3, ...), m, from its origin's coordinates on."""
         centre = self.centre_at(time)
         place = [np.asarray(a, float) - c for a, c in zip((x, y, z), centre, strict=True)]
@@ -121,15 +120,15 @@ class VolumeAlongPath:
             ]
         )
 
-    def _indices(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _indices(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Indices into the splines, and where the volume has values."""
-        index, inside = [], np.ones(own.shape[1:], bool)
+        index, inside = [], np.ones(places.shape[1:], bool)
         for k, name in enumerate("xyz"):
             nodes = self.flow[name].values
-            place = (own[k] - nodes[0]) / self._steps[k]
+            place = (places[k] - nodes[0]) / self._steps[k]
             if name == "x":
                 # the coefficients begin so many nodes before the first plane
-                place = np.mod(place, len(nodes)) + _BEYOND
+                place = np.mod(place, len(nodes)) + _SPLINE_MARGIN
             else:
                 # nodes at the rim are inside, whatever the rounding
                 inside &= (place >= -1e-9) & (place <= len(nodes) - 1 + 1e-9)
@@ -138,17 +137,17 @@ class VolumeAlongPath:
 
     def _at(self, name: str, index: np.ndarray) -> np.ndarray:
         flat = index.reshape(3, -1)
-        found = scipy.ndimage.map_coordinates(
+        values = scipy.ndimage.map_coordinates(
             self._splines[name], flat, prefilter=False, mode="mirror"
         )
-        return found.reshape(index.shape[1:])
+        return values.reshape(index.shape[1:])
 
     def wind(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:
         """u, v, w (m s^-1) at places (m) and times (s), which broadcast."""
-        own = self._own(x, y, z, time)
-        index, inside = self._indices(own)
-        components = np.zeros_like(own)
-        components[1:] = velocity(self._mean_pair, own[1], own[2])
+        places = self._in_volume(x, y, z, time)
+        index, inside = self._indices(places)
+        components = np.zeros_like(places)
+        components[1:] = velocity(self._mean_pair, places[1], places[2])
         for k, name in enumerate("uvw"):
             if name in self.flow:
                 components[k] = np.where(inside, self._at(name, index), components[k])
@@ -158,11 +157,11 @@ class VolumeAlongPath:
 
     def extinction(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> np.ndarray:
         """Aerosol and exhaust without texture, m^-1, at places (m) and times (s)."""
-        index, inside = self._indices(self._own(x, y, z, time))
+        index, inside = self._indices(self._in_volume(x, y, z, time))
         values = self.flow["extinction"].values
         # a spline exceeds its data at sharp edges
-        found = self._at("extinction", index).clip(values.min(), values.max())
-        return np.where(inside, found, self.background)
+        extinction = self._at("extinction", index).clip(values.min(), values.max())
+        return np.where(inside, extinction, self.background)
 
     @cached_property
     def _tracks(self) -> tuple[scipy.interpolate.CubicSpline, ...]:
@@ -170,15 +169,15 @@ class VolumeAlongPath:
         x = self.flow["x"].values
         # a periodic spline needs its first value again at the end
         nodes = np.append(x, x[0] + self.period)
-        found = []
+        tracks = []
         for side in (self.port, self.starboard):
             rows = np.array([[v.y, v.z, v.core_radius, v.circulation] for v in side])
-            found.append(
+            tracks.append(
                 scipy.interpolate.CubicSpline(
                     nodes, np.vstack([rows, rows[:1]]), bc_type="periodic"
                 )
             )
-        return tuple(found)
+        return tuple(tracks)
 
     def vortices(self, x: float, time: float) -> tuple[Vortex, Vortex]:
         """Port and starboard vortex in the plane x at a time.
@@ -193,20 +192,16 @@ class VolumeAlongPath:
         """
         check_cut(self.axes[0], self.crossing_angle)
         centre, rotation = self.centre_at(time), np.stack(self.axes)
-        found = []
+        vortices = []
         for track in self._tracks:
             s = 0.0
             # by Newton's method: the line is nearly along the axis
             for _ in range(30):
                 row, slope = track(self.origin[0] + s), track(self.origin[0] + s, 1)
-                own = np.array([s, row[0] - self.origin[1], row[1] - self.origin[2]])
+                place_along = np.array([s, row[0] - self.origin[1], row[1] - self.origin[2]])
                 tangent = np.array([1.0, slope[0], slope[1]]) @ rotation
-                place = centre + own @ rotation
+                place = centre + place_along @ rotation
                 s -= (place[0] - x) / tangent[0]
-            # the plane cuts an ellipse, longer by 1 / steep; the circle has its area
-            steep = tangent[0] / float(np.linalg.norm(tangent))
-            radius, circulation = float(row[2]), float(row[3])
-            found.append(
-                Vortex(circulation, radius / np.sqrt(steep), float(place[1]), float(place[2]))
-            )
-        return found[0], found[1]
+            radius, circulation = cut_radius(float(row[2]), tangent), float(row[3])
+            vortices.append(Vortex(circulation, radius, float(place[1]), float(place[2])))
+        return vortices[0], vortices[1]

@@ -100,15 +100,6 @@ class LineSpeeds:
         )
 
     def _with(self, frames: LineFrames, found: np.ndarray) -> xr.Dataset:
-        v_los, std, systematic, laser_std = found
         return with_speeds(
-            frames.lines,
-            v_los,
-            std,
-            systematic,
-            laser_std,
-            self._doppler,
-            self._pulses,
-            self._experiment.seed,
-            frames.scan,
+            frames.lines, found, self._doppler, self._pulses, self._experiment.seed, frames.scan
         )

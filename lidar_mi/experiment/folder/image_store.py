@@ -1,4 +1,4 @@
-"""Rendered images in a folder, finished and unfinished, each signed by what it was made from."""
+"""Rendered images in a folder, finished and unfinished, each with a signature of its inputs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,8 +23,7 @@ BATCHES = "_batches.npz"
 class ImageStore:
     """Images of both lidars, by the names of the parts of their stages.
 
-    Rendered images are read back, so that they have the same float32 values whether they were
-    rendered just now or found.
+    Rendered images are read back, so that new and stored ones have the same float32 values.
 
     Attributes
     ----------
@@ -82,9 +81,9 @@ class ImageStore:
     def store_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
         """Write a rendered image; returns it as it is read."""
         self.write(part, value)
-        found = self.stored(part)
-        assert found is not None
-        return found
+        stored = self.stored(part)
+        assert stored is not None
+        return stored
 
     def write(self, part: str, value: xr.Dataset) -> None:
         """Write an image with its signature."""

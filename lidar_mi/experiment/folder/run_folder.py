@@ -122,23 +122,25 @@ class RunFolder:
     def _begin(self, overwrite: bool) -> None:
         """Write the record; keep the files of an earlier run that are of this experiment."""
         folder, marker = self.path, self.path / RECORD
-        images = self._those(RENDERED)
+        images = self._matching(RENDERED)
         results = [folder / name for name in (METRICS, REPORT, SUMMARY, *RESULTS.values())]
         results = [path for path in results if path.exists()] + [*folder.glob(f"*{BATCHES}")]
-        other = _difference(read_record(folder), self.record) if marker.is_file() else None
+        difference = _difference(read_record(folder), self.record) if marker.is_file() else None
         foreign = [path for path in images if self._is_foreign(path)]
-        if other:
-            what, old = f"a run of {other}", [*results, *images]
+        if difference:
+            contents, old = f"a run of {difference}", [*results, *images]
         else:
-            what, old = f"{foreign[0].name} of another experiment" if foreign else "", foreign
-        self._refuse_inputs(changed=bool(other))
+            contents, old = f"{foreign[0].name} of another experiment" if foreign else "", foreign
+        self._refuse_inputs(changed=bool(difference))
         if old and not overwrite:
             raise InputError(
-                f"{folder}: holds {what}; expected an empty folder (-o DIR), or --overwrite to "
+                f"{folder}: holds {contents}; expected an empty folder (-o DIR), or --overwrite to "
                 "replace it"
             )
         # results of another experiment must not be mistaken for those of this one
-        drawn = [*self.figures.glob("*.png"), *self._those(PREVIEWS), self.log] if other else []
+        drawn = (
+            [*self.figures.glob("*.png"), *self._matching(PREVIEWS), self.log] if difference else []
+        )
         previews = [path.with_suffix(".png") for path in foreign]
 
         def remove_old() -> None:
@@ -150,16 +152,16 @@ class RunFolder:
 
     def _refuse_inputs(self, *, changed: bool) -> None:
         """Do not overwrite files that this run reads."""
-        here = self.path.resolve()
-        written = {METRICS, REPORT, SUMMARY, LOG, *RESULTS.values()}
+        folder = self.path.resolve()
+        outputs = {METRICS, REPORT, SUMMARY, LOG, *RESULTS.values()}
         for field, path in self._inputs.items():
             rendered = any(path.match(pattern) for pattern in (*RENDERED, *PREVIEWS))
-            if path.resolve().parent == here and (path.name in written or rendered):
+            if path.resolve().parent == folder and (path.name in outputs or rendered):
                 raise InputError(
                     f"{field}: {path} lies where this run writes; expected another folder (-o DIR)"
                 )
         # the record of a run is an experiment file, too
-        if changed and self._search_path.resolve() == here:
+        if changed and self._search_path.resolve() == folder:
             raise InputError(
                 f"{self.path}: holds the experiment that this one was made from; expected another "
                 "folder (-o DIR)"
@@ -203,24 +205,24 @@ class RunFolder:
             self._store_noise(value)
         write_result(self.path, name, value, self._experiment.name, self.made_by)
 
-    def _those(self, patterns: Sequence[str]) -> list[Path]:
+    def _matching(self, patterns: Sequence[str]) -> list[Path]:
         return [path for pattern in patterns for path in self.path.glob(pattern)]
 
     def write_previews(self) -> None:
         """Write a PNG of its layer Y beside each rendered image without one, to look at."""
         from lidar_mi.io.png import write_preview
 
-        for image in self._those(RENDERED):
+        for image in self._matching(RENDERED):
             preview = image.with_suffix(".png")
             if not preview.exists():
                 write_preview(preview, read_pixels(image))
 
     def data_files(self) -> list[str]:
         """Names of the files beside the report, for links to them."""
-        there = self._those((*RENDERED, *PREVIEWS))
+        paths = self._matching((*RENDERED, *PREVIEWS))
         names = dict.fromkeys(RESULTS.values())
-        there += [self.path / name for name in names if (self.path / name).exists()]
-        return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
+        paths += [self.path / name for name in names if (self.path / name).exists()]
+        return [*sorted(path.name for path in paths), METRICS, SUMMARY, RECORD, LOG]
 
     def store_verdict(
         self, metrics: Mapping[str, float], page: str, answer: Sequence[str] = ()
@@ -251,7 +253,7 @@ def write_verdict(
     (folder / METRICS).unlink(missing_ok=True)
     checked = {**record, "metrics": hashlib.sha256(text.encode()).hexdigest()}
     samples = metrics.get(f"{Source.BACKSCATTER}.samples_per_beam")
-    if samples is not None:  # which the experiment may have left to be chosen
+    if samples is not None:  # which the experiment may leave open
         checked["samples_per_beam"] = int(samples)
     write_text(folder / RECORD, to_yaml(checked))
     write_text(folder / REPORT, page)
@@ -290,7 +292,7 @@ def write_result(folder: Path, name: str, value: Any, experiment: str, signature
 
 @contextmanager
 def held(folder: Path, kind: str) -> Iterator[None]:
-    """A folder with a record, made if missing and locked, that holds nothing of others.
+    """Create and lock a folder with a record; one with other contents is refused.
 
     Raises
     ------
@@ -300,7 +302,7 @@ def held(folder: Path, kind: str) -> Iterator[None]:
     refuse_strangers(folder, RECORD, kind)
     make_folder(folder)
     with locked(folder):
-        # the former holder of the lock may have changed its experiment
+        # the former holder of the lock may have written an experiment
         refuse_strangers(folder, RECORD, kind)
         yield
 
@@ -339,7 +341,7 @@ def _versions() -> dict[str, str]:
 
 
 def made_by(record: Mapping[str, Any], keys: Keys | None = None) -> str:
-    """Hash of what a record says of settings, files and versions that rendered images depend on.
+    """Hash of the settings, files and versions in a record on which rendered images depend.
 
     Parameters
     ----------
@@ -372,7 +374,7 @@ def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None
 
 
 def _inputs(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
-    """The files named by an experiment, by key: a changed file makes another experiment."""
+    """The files named by an experiment, by key: an experiment differs if a file changes."""
     if experiment.wake is None:
         return {}
     paths = table_files(experiment.scattering, search_path)

@@ -12,13 +12,14 @@ from lidar_mi.assessment.digits import three
 from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
 from lidar_mi.assessment.metrics.requirements import RequirementTable, look_ahead
 from lidar_mi.atmosphere.vortices.cores import find_cores
-from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.memory import Footprint
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.preflight.coherent import coherent_rows, passage_rows
+from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.stages.eye_safety import scan_safety
 from lidar_mi.experiment.stages.image_remarks import window_reach
 from lidar_mi.experiment.stages.light_budget import (
@@ -30,7 +31,6 @@ from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
 from lidar_mi.experiment.stages.sensor_cost import lidar_costs
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth.clear_air import air_in_words
-from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.experiment.truth.in_time import values_of_states
 from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.lidar import BackscatterLidar
@@ -51,7 +51,7 @@ LEAST_SHOWN = 0.5
 
 
 def sections(
-    asked: Experiment,
+    experiment: Experiment,
     search_path: str | Path = ".",
     notice: Notice = silent,
     *,
@@ -77,51 +77,56 @@ def sections(
     InputError
         Anything that a run would refuse before it starts.
     """
-    # of the processor: other programs do not lengthen it
+    # processor time, which other programs do not affect
     start = time.process_time()
-    prepared = experiment.prepare(asked, search_path, without_warnings(notice))
-    asked, results = prepared.experiment, prepared.results
-    if timed and asked.wake:
+    prepared = prepare(experiment, search_path, without_warnings(notice))
+    experiment, results = prepared.experiment, prepared.results
+    if timed and experiment.wake:
         _ = results["truth"].extinction[1]  # which a run advects
     preparation = time.process_time() - start
     chosen: Samples | None = None
-    if asked.imaged_wake:
-        if sampled and asked.detector:
-            needed = {name: results[name] for name in ("truth", "plans", "air", "flows")}
-            chosen = call(chosen_samples, asked, **needed, log=Log(notice))
-        yield from _backscatter(asked, asked.imaged_wake, results, chosen)
-        if asked.scan.timing:
-            schedule = scan_schedule(asked.scan, results["plans"][0], prepared.search_path)
-            yield "scan of the backscatter lidar", _timing(asked, schedule)
-        yield "eye safety (IEC 60825-1:2014)", _eye_safety(asked, results, prepared.search_path)
-    if asked.fringes:
-        yield _doppler(asked.fringes)
-    if asked.coherent:
-        yield "coherent lidar", coherent_rows(asked.coherent)
-        yield "air that passes it", passage_rows(asked.coherent, results["passing_air"])
-    if asked.sensor:
-        yield _sensor(asked.sensor, asked.platform.speed, results["requirements"])
-        if asked.sensor.timing:
+    if experiment.imaged_wake:
+        if sampled and experiment.detector:
+            inputs = {name: results[name] for name in ("truth", "plans", "air", "flows")}
+            chosen = call(chosen_samples, experiment, **inputs, log=Log(notice))
+        yield from _backscatter(experiment, experiment.imaged_wake, results, chosen)
+        if experiment.scan.timing:
+            schedule = scan_schedule(experiment.scan, results["plans"][0], prepared.search_path)
+            yield "scan of the backscatter lidar", _timing(experiment, schedule)
+        yield (
+            "eye safety (IEC 60825-1:2014)",
+            _eye_safety(experiment, results, prepared.search_path),
+        )
+    if experiment.fringes:
+        yield _doppler(experiment.fringes)
+    if experiment.coherent:
+        yield "coherent lidar", coherent_rows(experiment.coherent)
+        yield "air that passes it", passage_rows(experiment.coherent, results["passing_air"])
+    if experiment.sensor:
+        yield _sensor(experiment.sensor, experiment.platform.speed, results["requirements"])
+        if experiment.sensor.timing:
             yield (
                 "scan of the Doppler lidar",
-                _timing(asked, call(lines_schedule, asked, search_path=prepared.search_path)),
+                _timing(
+                    experiment, call(lines_schedule, experiment, search_path=prepared.search_path)
+                ),
             )
     if timed:
         from lidar_mi.experiment.preflight.cost import with_number
 
         notice("timing a few samples and a retrieval", None)
-        # with the number that is chosen already: choosing it takes pilots
-        whole = with_number(asked, chosen.number) if chosen else asked
-        rows = [*_time(whole, results, preparation), _memory(asked, results)]
+        # with the chosen number: another choice would cost pilots
+        sampled_experiment = with_number(experiment, chosen.number) if chosen else experiment
+        rows = [*_time(sampled_experiment, results, preparation), _memory(experiment, results)]
         yield "cost of the run, to a factor of 2", rows
     else:
-        yield "cost of the run", [_memory(asked, results)]
+        yield "cost of the run", [_memory(experiment, results)]
     if prepared.warnings:
-        yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
+        yield f"{experiment.name}: warnings", [(text,) for text in prepared.warnings]
 
 
 def _backscatter(
-    asked: Experiment, wake: Wake, results: Results, chosen: Samples | None
+    experiment: Experiment, wake: Wake, results: Results, chosen: Samples | None
 ) -> Iterator[Section]:
     truth, plan = results["truth"], results["plans"][0]
     wind, extinction = truth.wind, truth.extinction[0]
@@ -130,15 +135,15 @@ def _backscatter(
     if not wake.turbine:
         rows.append(("vortices", sense_of_rotation(wind, find_cores(wind))))
     divergence = relative_divergence(wind)
-    # NaN without vorticity to compare with
+    # NaN without vorticity
     if divergence == divergence:
         rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
     rows.append(("extinction", _span(1e3 * extinction.values, "1/km")))
     rows.append(("texture, rms", f"{wake.texture.rms:.0%}"))
     title = wake.file or ("vortex_pair" if wake.vortex_pair else "turbine")
-    yield f"{asked.name}: extinction in the gates ({title}, about the scan's axis)", rows
+    yield f"{experiment.name}: extinction in the gates ({title}, about the scan's axis)", rows
 
-    scan, lidar, platform = asked.scan, asked.lidar, asked.platform
+    scan, lidar, platform = experiment.scan, experiment.lidar, experiment.platform
     pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
     rows = [
         ("laser", _laser(lidar)),
@@ -149,47 +154,47 @@ def _backscatter(
         ("1/e^2 beam radius at the gates", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
         ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
         ("look-ahead time", _look_ahead(plan.gate_start, platform.speed)),
-        ("samples per beam", _samples(asked, chosen)),
+        ("samples per beam", _samples(experiment, chosen)),
         ("time between the images", f"{platform.dt:g} s"),
-        ("second image", _second(asked, wake)),
-        *_light(asked, results),
+        ("second image", _second(experiment, wake)),
+        *_light(experiment, results),
     ]
-    if not asked.volume:
-        rows += _displacements(asked, wind, plan)
+    if not experiment.volume:
+        rows += _displacements(experiment, wind, plan)
     yield "backscatter lidar", rows
 
 
-def _second(asked: Experiment, wake: Wake) -> str:
+def _second(experiment: Experiment, wake: Wake) -> str:
     """Where the state at t2 is from."""
     if wake.stored is not None:
         return f"the state stored at {wake.stored:.15g} s"
-    along = wake.second == "advect_3d" or moves_along(wake, asked.volume)
+    along = wake.second == "advect_3d" or call(Observation, experiment).moves_along
     return "air of the first, advected by " + ("u, v and w" if along else "v and w")
 
 
-def _samples(asked: Experiment, chosen: Samples | None) -> str:
+def _samples(experiment: Experiment, chosen: Samples | None) -> str:
     """Monte Carlo samples, and the variance of their noise over that of the detector's."""
-    number: object = asked.render.samples_per_beam
+    number: object = experiment.render.samples_per_beam
     if chosen:
-        number = samples_text(asked.render, chosen)
-    elif number == "auto" and asked.detector:
+        number = samples_text(experiment.render, chosen)
+    elif number == "auto" and experiment.detector:
         number = "auto (how many: --forecast)"
-    elif asked.detector is None:
-        number = asked.render.without_detector(asked.scan.gate_count)
-    return f"{number}, orders 1 to {asked.render.max_order}"
+    elif experiment.detector is None:
+        number = experiment.render.without_detector(experiment.scan.gate_count)
+    return f"{number}, orders 1 to {experiment.render.max_order}"
 
 
-def _light(asked: Experiment, results: Results) -> list[tuple[str, str]]:
+def _light(experiment: Experiment, results: Results) -> list[tuple[str, str]]:
     """What scatters, how much of it arrives, and with how much noise."""
-    kind = asked.scattering
+    kind = experiment.scattering
     truth, plan, air = results["truth"], results["plans"][0], results["air"]
     clear = results["clear_air"]
-    light = call(light_budget, asked, truth=truth, plan=plan, air=air, clear_air=clear)
-    fractions = call(backscatter_fractions, asked, truth=truth, air=air, clear_air=clear)
-    named = kind.aerosol or kind.table
-    what = f"{kind.phase} {named}" if named else kind.phase.replace("_", "-")
+    light = call(light_budget, experiment, truth=truth, plan=plan, air=air, clear_air=clear)
+    fractions = call(backscatter_fractions, experiment, truth=truth, air=air, clear_air=clear)
+    particles = kind.aerosol or kind.table
+    kind_in_words = f"{kind.phase} {particles}" if particles else kind.phase.replace("_", "-")
     rows = [
-        ("scattering", f"{what}, lidar ratio {light.lidar_ratio:.3g} sr"),
+        ("scattering", f"{kind_in_words}, lidar ratio {light.lidar_ratio:.3g} sr"),
         ("molecules", clear.origin),
         ("backscatter in the gates", fractions_in_words(fractions, kind)),
         ("overlap with the field of view", f"{light.overlap:.1%}"),
@@ -203,11 +208,11 @@ def _light(asked: Experiment, results: Results) -> list[tuple[str, str]]:
     return rows
 
 
-def _time(asked: Experiment, results: Results, preparation: float) -> list[tuple[str, str]]:
+def _time(experiment: Experiment, results: Results, preparation: float) -> list[tuple[str, str]]:
     """Time of the parts of a run on one core of this machine."""
     from lidar_mi.experiment.preflight.cost import cost
 
-    found = cost(asked, results, preparation)
+    estimate = cost(experiment, results, preparation)
     names = {
         "preparation": "reading, advection of the air",
         "rendering": "rendering (all cores share it)",
@@ -216,25 +221,31 @@ def _time(asked: Experiment, results: Results, preparation: float) -> list[tuple
         "lines": "lines of sight",
         "figures": "figures and report",
     }
-    parts = found._asdict()
+    parts = estimate._asdict()
     rows = [
         (text, f"about {duration(parts[key])}")
         for key, text in names.items()
         if parts[key] >= LEAST_SHOWN
     ]
-    return [*rows, ("all, on one core", f"about {duration(found.total)}")]
+    return [*rows, ("all, on one core", f"about {duration(estimate.total)}")]
 
 
-def _memory(asked: Experiment, results: Results) -> tuple[str, str]:
+def _memory(experiment: Experiment, results: Results) -> tuple[str, str]:
     """Memory that a run takes, and that it may take."""
     beams = in_states = 0
-    if asked.imaged_wake:
+    if experiment.imaged_wake:
         plan = results["plans"][0]
         beams = plan.y.size * plan.z.size
-        in_states = call(values_of_states, asked, flows=results["flows"], plans=results["plans"])
-    expected = call(Footprint, asked).bytes(beams, in_states) / 1e9
+        in_states = call(
+            values_of_states, experiment, flows=results["flows"], plans=results["plans"]
+        )
+    expected = call(Footprint, experiment).bytes(beams, in_states) / 1e9
     # an experiment without a wake has a Doppler lidar
-    render = asked.render if asked.wake or not asked.fringes else asked.fringes.render
+    render = (
+        experiment.render
+        if experiment.wake or not experiment.fringes
+        else experiment.fringes.render
+    )
     allowed = ceiling(render.memory) / 1e9
     return "memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"
 
@@ -247,10 +258,12 @@ def duration(seconds: float) -> str:
     return f"{max(seconds, 1):.0f} s"
 
 
-def _displacements(asked: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[tuple[str, str]]:
+def _displacements(
+    experiment: Experiment, wind: xr.Dataset, plan: ScanPlan
+) -> list[tuple[str, str]]:
     """The fastest wind and the fastest that windows of this size can follow, per axis."""
-    settings = asked.retrieval
-    reach = window_reach(settings, asked.platform, plan)
+    settings = experiment.retrieval
+    reach = window_reach(settings, experiment.platform, plan)
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     rows = [("methods", ", ".join(settings.methods))]
     if {ImageMethod.CC, ImageMethod.WS} & set(settings.methods):
@@ -259,9 +272,11 @@ def _displacements(asked: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[
     return rows
 
 
-def _eye_safety(asked: Experiment, results: Results, search_path: Path) -> list[tuple[str, str]]:
+def _eye_safety(
+    experiment: Experiment, results: Results, search_path: Path
+) -> list[tuple[str, str]]:
     """From which distance eyes are safe in the beams, as a run computes it."""
-    safety = call(scan_safety, asked, plans=results["plans"], search_path=search_path)
+    safety = call(scan_safety, experiment, plans=results["plans"], search_path=search_path)
     if safety is None:
         return [("backscatter lidar", "not assessed: lidar.pulse_duration is 0")]
     beam = _safe(safety.hazard_distance, safety.aided_hazard_distance)
@@ -270,12 +285,12 @@ def _eye_safety(asked: Experiment, results: Results, search_path: Path) -> list[
         ("the whole scan", _safe(safety.scan_hazard_distance)),
         ("permissible", f"{safety.permissible_exposure:.3g} J/m^2 per pulse"),
     ]
-    if asked.sensor:
+    if experiment.sensor:
         slab = results["slab_wind"]
-        cost = call(lidar_costs, asked, slab_wind=slab, search_path=search_path)["doppler"]
+        cost = call(lidar_costs, experiment, slab_wind=slab, search_path=search_path)["doppler"]
         if cost.permissible_exposure is not None:
-            found = _safe(cost.hazard_distance, cost.aided_hazard_distance)
-            rows.append(("Doppler lidar's beam", found))
+            distance = _safe(cost.hazard_distance, cost.aided_hazard_distance)
+            rows.append(("Doppler lidar's beam", distance))
     return rows
 
 
@@ -283,10 +298,10 @@ def _safe(distance: float | None, aided: float | None = 0.0) -> str:
     """Where eyes are safe; None and infinity: nowhere."""
     if distance is None or math.isinf(distance):
         return "safe nowhere"
-    found = f"safe beyond {three(distance)} m" if distance > 0 else "safe where it leaves"
+    text = f"safe beyond {three(distance)} m" if distance > 0 else "safe where it leaves"
     if aided is None or math.isinf(aided):
-        return f"{found}, with binoculars nowhere"
-    return f"{found}, with binoculars beyond {three(aided)} m" if aided > 0 else found
+        return f"{text}, with binoculars nowhere"
+    return f"{text}, with binoculars beyond {three(aided)} m" if aided > 0 else text
 
 
 def _doppler(doppler: Doppler) -> Section:
@@ -310,9 +325,9 @@ def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
     return ", ".join(parts)
 
 
-def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
+def _timing(experiment: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
     """What a scan in time asks of the laser and of the scanner, and the distance flown."""
-    distance = asked.platform.speed * schedule.duration
+    distance = experiment.platform.speed * schedule.duration
     return [
         ("duration", f"{schedule.duration:.4g} s"),
         ("distance flown", f"{distance:.3g} m"),

@@ -30,12 +30,12 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
         angle = scan.rate * scan.accumulation
         # lines of a cone are nearer to each other the steeper they look
         level = math.cos(scan.elevation) if scan.kind == "ppi" else 1.0
-        apart = f"{angle * level * signal.range:.3g} m at {signal.range:g} m"
-        step = f", {math.degrees(angle):.3g} deg or {apart} apart"
+        spacing = f"{angle * level * signal.range:.3g} m at {signal.range:g} m"
+        step = f", {math.degrees(angle):.3g} deg or {spacing} apart"
     count = int(np.unique(lines.sweep).size)
-    stated = f"{noise:.2g} m/s in uniform air at {signal.range:g} m"
+    noise_text = f"{noise:.2g} m/s in uniform air at {signal.range:g} m"
     if noise > random_velocity(bandwidth):
-        stated = f"no signal at {signal.range:g} m: velocities there are random"
+        noise_text = f"no signal at {signal.range:g} m: velocities there are random"
     return [
         ("laser", f"{shown(laser.wavelength, 'nm')}, pulses of {laser.pulse_length:g} m"),
         (
@@ -46,7 +46,7 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
         ("scan", f"{scan.kind}, {count} of {scan.duration:.3g} s"),
         ("lines", f"{lines.time.size} of {shown(scan.accumulation, 's')}{step}"),
         ("duration", f"{lines.time[-1] + scan.accumulation / 2:.4g} s"),
-        ("noise of a velocity", stated),
+        ("noise of a velocity", noise_text),
         ("largest velocity", f"{bandwidth / 2:.3g} m/s"),
     ]
 
@@ -64,15 +64,17 @@ def passage_rows(doppler: CoherentDoppler, air: PassingWake) -> Rows:
         rows.append(("turbulence", f"{rms:.2g} m/s rms of a component"))
     times = line_scan(doppler.scan).time
     for name, time in (("first", float(times[0])), ("last", float(times[-1]))):
-        for side, one in zip(("port", "starboard"), air.vortices(time) or (), strict=False):
-            where = f"y = {one.y:.4g} m, z = {one.z:.3g} m"
+        for side, vortex in zip(("port", "starboard"), air.vortices(time) or (), strict=False):
+            where = f"y = {vortex.y:.4g} m, z = {vortex.z:.3g} m"
             if doppler.scan.kind == "rhi":
-                where = f"{plane_place(doppler, one.y):.4g} m from the lidar, {one.z:.3g} m high"
+                where = (
+                    f"{plane_place(doppler, vortex.y):.4g} m from the lidar, {vortex.z:.3g} m high"
+                )
             age = doppler.passage.age + time
             rows.append(
                 (
                     f"{side} vortex at the {name} line",
-                    f"{abs(one.circulation):.4g} m^2/s, {where}, age {age:.3g} s",
+                    f"{abs(vortex.circulation):.4g} m^2/s, {where}, age {age:.3g} s",
                 )
             )
     return rows

@@ -1,8 +1,8 @@
 """Time of a run before it is started, calibrated on this machine by a probe of about a second.
 
 Rendering is timed with the experiment's own scene and few samples. All other steps have a cost per
-pixel that was measured on one machine, together with a fixed piece of work, the probe. The time of
-the probe here and now over its time there is the factor between the machines.
+pixel, measured on a reference machine together with a fixed piece of work, the probe. The ratio of
+the times of the probe is the factor between the machines.
 """
 
 import functools
@@ -82,7 +82,7 @@ class Cost(NamedTuple):
 
     @property
     def total(self) -> float:
-        """Of all parts."""
+        """Sum of all parts."""
         return START + sum(self)
 
 
@@ -97,15 +97,15 @@ def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> 
         Processor time that it took, s.
     """
     # the constants are of another machine; rendering is timed on this one
-    here = slowness()
+    factor = slowness()
     rendering = 2 * render_seconds(experiment, results) if experiment.imaged_wake else 0.0
     return Cost(
         preparation,
         rendering,
-        here * _images(experiment, results),
-        here * _rings(experiment),
-        here * _lines(experiment),
-        here * _figures(experiment),
+        factor * _images(experiment, results),
+        factor * _rings(experiment),
+        factor * _lines(experiment),
+        factor * _figures(experiment),
     )
 
 
@@ -121,10 +121,10 @@ def flight_seconds(first: Experiment, results: Results, scans: float) -> float:
     scans : float
         Of the lidar; each is of two slabs. Flights without it take hardly any time.
     """
-    here = slowness()
-    each = here * (FLIGHT_SLAB + FLIGHT_LINES * _lines(first))
-    lidar = scans * (2 * render_seconds(first, results) + each) if scans else 0.0
-    return START + lidar + here * FLIGHT_FIGURES
+    factor = slowness()
+    slab = factor * (FLIGHT_SLAB + FLIGHT_LINES * _lines(first))
+    lidar = scans * (2 * render_seconds(first, results) + slab) if scans else 0.0
+    return START + lidar + factor * FLIGHT_FIGURES
 
 
 @functools.cache
@@ -132,7 +132,7 @@ def slowness() -> float:
     """Time of `probe` here over `PROBE_SECONDS`; once per process."""
     probe()  # loads libraries
     start = time.process_time()
-    # the mean of several: other programs disturb a single one
+    # the mean of several, as other programs disturb a single one
     for _ in range(_PROBES):
         probe()
     return (time.process_time() - start) / (_PROBES * PROBE_SECONDS)
@@ -153,16 +153,16 @@ def probe() -> None:
 def render_seconds(experiment: Experiment, results: Results) -> float:
     """Time of one image, from the first one with few samples and with four times as many.
 
-    Their difference has no part of what is done once, such as compiling. Where the number of
-    samples is to be chosen, with the time of doing so.
+    Their difference excludes work that is done once, such as compiling. If the number of samples is
+    chosen, the time of the choice is included.
     """
     plan, render = results["plans"][0], experiment.render
-    needed = {name: results[name] for name in ("truth", "plans", "air", "flows")}
+    inputs = {name: results[name] for name in ("truth", "plans", "air", "flows")}
     if render.samples_per_beam == "auto":
         begin = time.process_time()
         number = render.without_detector(plan.gate_count)
         if experiment.detector:
-            number = call(chosen_samples, experiment, **needed).number
+            number = call(chosen_samples, experiment, **inputs).number
         choosing = time.process_time() - begin
         # callers time two images, which share one choice
         return choosing / 2 + render_seconds(with_number(experiment, number), results)
@@ -172,7 +172,7 @@ def render_seconds(experiment: Experiment, results: Results) -> float:
 
     def timed(samples: int) -> float:
         start = time.process_time()
-        rendered = call(render_images, experiment, **needed, samples=samples, missing=IMAGES[:1])
+        rendered = call(render_images, experiment, **inputs, samples=samples, missing=IMAGES[:1])
         for _ in rendered:
             pass
         return time.process_time() - start
@@ -190,8 +190,8 @@ def render_seconds(experiment: Experiment, results: Results) -> float:
 def with_number(experiment: Experiment, samples: int) -> Experiment:
     """The experiment with a number of samples per beam."""
     render = experiment.render.model_copy(update={"samples_per_beam": samples})
-    found = experiment.model_copy(update={"render": render})
-    return found.read_from(experiment.folder)
+    changed = experiment.model_copy(update={"render": render})
+    return changed.read_from(experiment.folder)
 
 
 def _images(experiment: Experiment, results: Results) -> float:
@@ -224,8 +224,8 @@ def _rings(experiment: Experiment) -> float:
     settings, pixels = doppler.retrieval, doppler.camera.width * doppler.camera.height
     cases = len(settings.averaged) * len(doppler.v_los)
     slow = cases * settings.slow_images * len(settings.centre)
-    asked = doppler.calibration
-    calibrated = 0 if asked is None or asked.file else asked.frames
+    calibration = doppler.calibration
+    calibrated = 0 if calibration is None or calibration.file else calibration.frames
     peaks = [m for m in settings.methods if m not in (RingMethod.ANNULAR, RingMethod.PIXELS)]
     return pixels * (
         RING_IMAGE * (len(doppler.v_los) + 1) * doppler.render.samples_per_pixel / 16
@@ -263,7 +263,7 @@ def _figures(experiment: Experiment) -> float:
         "sensor": experiment.sensor,
         "coherent": experiment.coherent,
     }
-    return sum(FIGURES[name] for name, there in parts.items() if there)
+    return sum(FIGURES[name] for name, present in parts.items() if present)
 
 
 def _at(line: tuple[float, float], pixels: float) -> float:

@@ -16,8 +16,9 @@ from lidar_mi.assessment.metrics.error_budget import (
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.advection import advect, advect_to
 from lidar_mi.atmosphere.vortices.cores import Core, find_cores
-from lidar_mi.experiment.graph import call
+from lidar_mi.experiment.graph import bundle, call
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.stages.image_pair import noise_without
 from lidar_mi.experiment.stages.rendering import scan_plans
@@ -40,37 +41,31 @@ from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.retrieval import Retrieval
-from lidar_mi.schema.volume import Volume
-from lidar_mi.schema.wake import Wake
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
 Times = list[xr.DataArray] | None
 
 
-@dataclass(frozen=True)
+@bundle
 class _Sensor:
     """The air and the backscatter lidar: what images without a cause of error differ in."""
 
-    wake: Wake
-    platform: Platform
-    scan: Scan
+    observation: Observation
     lidar: BackscatterLidar
     detector: Detector | None
-    volume: Volume | None
     seed: int
     search_path: Path
     device: str | None = None
 
     def plans(self, truth: Truth) -> list[ScanPlan]:
         """The scans of both images."""
-        return scan_plans(self.scan, self.platform, self.seed, truth, self.search_path)
+        scan, platform = self.observation.scan, self.observation.platform
+        return scan_plans(scan, platform, self.seed, truth, self.search_path)
 
-    def slab_images(
-        self, truth: Truth, flows: Flows | None, plans: Sequence[ScanPlan]
-    ) -> list[xr.DataArray]:
-        """As of `ideal_images.slab_images`."""
-        return slab_images(self.wake, self.platform, self.scan, self.volume, truth, flows, plans)
+    def on(self, platform: Platform) -> "_Sensor":
+        """The same on another platform."""
+        return replace(self, observation=replace(self.observation, platform=platform))
 
 
 @dataclass(frozen=True)
@@ -83,26 +78,17 @@ class _Images:
 
 
 def error_budgets(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    lidar: BackscatterLidar,
-    detector: Detector | None,
+    sensor: _Sensor,
     retrieval: Retrieval,
-    volume: Volume | None,
-    seed: int,
-    device: str | None,
     flows: Flows,
     truth: Truth,
     scans: Sequence[xr.Dataset],
     wind: xr.Dataset,
     cores: Sequence[Core],
-    search_path: Path,
     log: Log,
 ) -> dict[str, dict[str, float]]:
     """`budgets` from a run's winds, where these need not be retrieved again."""
     log("retrieving winds without each cause of error")
-    sensor = _Sensor(wake, platform, scan, lidar, detector, volume, seed, search_path, device)
     return _budgets(sensor, retrieval, truth, scans, flows, log.bar, wind, cores)
 
 
@@ -150,7 +136,7 @@ def _budgets(
     images, blurred = _images(sensor, truth, flows, plans, scans)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = retrieval.methods
-    dt, sizes = sensor.platform.dt, window_sizes(retrieval)
+    dt, sizes = sensor.observation.platform.dt, window_sizes(retrieval)
     settings: dict[str, Any] = {"dt": dt, **window_settings(retrieval, sensor.device)}
     blur = known_blur(retrieval, sensor.lidar, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
@@ -215,10 +201,12 @@ def _images(
 
     Also the air averaged over the beams.
     """
-    rendered = rendered_pairs(sensor.wake, sensor.scan, sensor.detector, scans)
+    observation = sensor.observation
+    wake, scan, platform = observation.wake, observation.scan, observation.platform
+    rendered = rendered_pairs(wake, scan, scans)
     pair, noise = rendered[Source.BACKSCATTER]
     measured, level = rendered.get(Source.NOISY, (pair, noise))
-    air = sensor.slab_images(truth, flows, plans)
+    air = slab_images(observation, truth, flows, plans)
     noises = [xr.zeros_like(image) + noise for image in pair]
     ideal, _ = _without_noise(sensor, air, plans, pair)
     # one scale of all cases, so that they differ by their cause alone
@@ -233,18 +221,18 @@ def _images(
 
     advected = None
     # a single plane that its own flow advects has no out-of-plane motion to leave out
-    if truth.extinction[0].sizes["x"] > 1 or sensor.wake.second != "advect":
-        advected = as_measured(_advected_by_the_mean(sensor.platform.dt, truth, air))
+    if truth.extinction[0].sizes["x"] > 1 or wake.second != "advect":
+        advected = as_measured(_advected_by_the_mean(platform.dt, truth, air))
     photographs = [truth.image(k) for k in (0, 1)]
     blurred = as_measured(air)
     timed: dict[str, list[xr.DataArray]] = {}
     times: dict[str, Times] = {}
     if any("time" in image.dims for image in air):
         timed["scan_time"], times["scan_time"] = as_measured(photographs), None
-    for cause, platform in platforms_without(sensor.platform).items():
-        other = replace(sensor, platform=platform)
+    for cause, without_it in platforms_without(platform).items():
+        other = sensor.on(without_it)
         its_plans = other.plans(truth)
-        its_air = other.slab_images(truth, flows, its_plans)
+        its_air = slab_images(other.observation, truth, flows, its_plans)
         timed[cause] = as_measured(its_air, its_plans)
         times[cause] = _without_noise(other, its_air, its_plans, pair)[1]
     without = images_without(
@@ -258,8 +246,8 @@ def _images(
     # without the simulation's noise the detector's remains, if there is one
     counts = noise_without(level, noise) if sensor.detector else 0.0
     levels = {"detector_noise": noise, "monte_carlo": counts}
-    known = pixel_times(sensor.wake, sensor.scan, scans)
-    on_grid = _on_grid(sensor.scan, photographs, pair)
+    known = pixel_times(wake, scan, scans)
+    on_grid = _on_grid(scan, photographs, pair)
     sharp = [gain * image + offset for image in on_grid]
     return {
         "measured": _Images(measured, level, known),
@@ -302,7 +290,7 @@ def _without_noise(
     from lidar_mi.retrieval.images.common_grid import resample_pair
     from lidar_mi.retrieval.wind.synchronised import synchronised
 
-    scan = sensor.scan
+    wake, scan = sensor.observation.wake, sensor.observation.scan
     depth = scan.thickness / scan.gate_count
     lidar = sensor.lidar if blurred else None
     if all(plan.beams is None for plan in plans):
@@ -319,11 +307,11 @@ def _without_noise(
         )
         for image, plan in zip(air, plans, strict=True)
     ]
-    scans = synchronised(scans, [sensor.platform.dt], "Y")
+    scans = synchronised(scans, [sensor.observation.platform.dt], "Y")
     images = [one["Y"] for one in scans]
     if scan.aim == "angles":
-        images = list(resample_pair(images[0], images[1], sensor.wake.spacing))
-    return images, pixel_times(sensor.wake, scan, scans)
+        images = list(resample_pair(images[0], images[1], wake.spacing))
+    return images, pixel_times(wake, scan, scans)
 
 
 def _on_grid(

@@ -6,26 +6,18 @@ import numpy as np
 import scipy
 import xarray as xr
 
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.experiment.truth.in_time import air_in_time
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.lidar import BackscatterLidar
-from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.schema.platform import Platform
-from lidar_mi.schema.volume import Volume
-from lidar_mi.schema.wake import Wake
+from lidar_mi.instrument.scan import ScanPlan
 
 
 def slab_images(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    truth: Truth,
-    flows: Flows | None,
-    plans: Sequence[ScanPlan],
+    observation: Observation, truth: Truth, flows: Flows | None, plans: Sequence[ScanPlan]
 ) -> list[xr.DataArray]:
     """The extinction of both scans averaged over the first gate's depth, m^-1.
 
@@ -35,10 +27,10 @@ def slab_images(
     images = []
     for which, plan in enumerate(plans):
         # the truth's image is of the scan's reference time, that of all beams here
-        if plan.beams is None or flows is None or scan.air == "frozen":
+        if plan.beams is None or flows is None or observation.scan.air == "frozen":
             images.append(truth.image(which))
             continue
-        air = air_in_time(wake, platform, scan, volume, truth, flows, which, plan.beams.time)
+        air = air_in_time(observation, truth, flows, which, plan.beams.time)
         images.append(slab_mean(air.astype(float), gates))
     return images
 

@@ -1,6 +1,6 @@
 """Warnings before images are rendered: of what is allowed and likely wrong."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
 from lidar_mi.atmosphere.vortices.cores import find_cores
 from lidar_mi.description import Description
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.stages.brightness import overlap
 from lidar_mi.experiment.stages.light_budget import (
     LEAST_OVERLAP,
@@ -16,8 +17,7 @@ from lidar_mi.experiment.stages.light_budget import (
     fractions_in_words,
 )
 from lidar_mi.experiment.truth.clear_air import ClearAir
-from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.experiment.truth.flows import Flows
+from lidar_mi.experiment.truth.extinction import ObservedAir, Truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.phase import Scatterer
@@ -26,7 +26,6 @@ from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.retrieval import Retrieval
 from lidar_mi.schema.scattering import Scattering
 from lidar_mi.schema.site import Site
-from lidar_mi.schema.volume import Volume
 from lidar_mi.schema.wake import ExtinctionMapping, Wake
 from lidar_mi.units import shown
 
@@ -35,30 +34,26 @@ MOST_WIND = 150.0
 
 
 def image_remarks(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
+    observed: ObservedAir,
     lidar: BackscatterLidar,
     retrieval: Retrieval,
-    volume: Volume | None,
-    flows: Flows,
-    truth: Truth,
-    plans: Sequence[ScanPlan],
     scattering: Scattering,
     air: Scatterer,
     clear_air: ClearAir,
     site: Site,
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each."""
+    observation, truth, plan = observed.observation, observed.truth, observed.plans[0]
+    wake = observation.wake
     flow = _of_the_flow(wake, truth.wind) if wake.file else []
-    interpolated = flows[0].attrs.get("interpolated")
+    interpolated = observed.flows[0].attrs.get("interpolated")
     grid = [f"wake.file: {interpolated}"] if interpolated else []
     return [
         *grid,
         *flow,
-        *_of_the_speed(wake, platform, retrieval, volume, truth.wind, plans[0]),
-        *_of_the_light(lidar, scan, plans[0]),
-        *_of_the_pattern(scan),
+        *_of_the_speed(observation, retrieval, truth.wind, plan),
+        *_of_the_light(lidar, observation.scan, plan),
+        *_of_the_pattern(observation.scan),
         *_of_the_molecules(wake.extinction, truth, scattering, air, clear_air, site),
     ]
 
@@ -99,14 +94,10 @@ def _of_the_flow(wake: Wake, wind: xr.Dataset) -> list[str]:
 
 
 def _of_the_speed(
-    wake: Wake,
-    platform: Platform,
-    retrieval: Retrieval,
-    volume: Volume | None,
-    wind: xr.Dataset,
-    plan: ScanPlan,
+    observation: Observation, retrieval: Retrieval, wind: xr.Dataset, plan: ScanPlan
 ) -> list[str]:
     """Winds that no wake has, or that windows of this size cannot follow."""
+    wake, platform = observation.wake, observation.platform
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     if fastest > MOST_WIND:
         doubt = "is the unit of v and w in the file right (attribute units)"
@@ -117,7 +108,7 @@ def _of_the_speed(
             f"turbines stay below {MOST_WIND:g} m/s: {doubt}?"
         ]
     reach = window_reach(retrieval, platform, plan)
-    taken = () if volume else retrieval.methods
+    taken = () if observation.volume else retrieval.methods
     methods = [method for method in (ImageMethod.CC, ImageMethod.WS) if method in taken]
     if not methods or fastest <= reach:
         return []

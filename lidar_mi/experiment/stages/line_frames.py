@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import xarray as xr
 
 from lidar_mi.atmosphere.scattering.line import laser_line
 from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, reference_photons
@@ -76,9 +77,8 @@ def line_frames(
     doppler: Doppler,
     rings: Rings,
     images: LineImages,
-    lines: Sequence[int],
-    speeds: np.ndarray,
-    ranges: np.ndarray,
+    lines: xr.Dataset,
+    numbers: Sequence[int],
     pulses: int,
     seed: int,
     scan: int = 0,
@@ -87,10 +87,10 @@ def line_frames(
 
     Parameters
     ----------
-    lines : sequence of int
-        Numbers of the lines in their scan.
-    speeds, ranges : arrays
-        Of these lines, m/s and m.
+    lines : xr.Dataset, dim (line)
+        All lines of the scan, with ``v_los_true`` (m/s) and ``range`` (m).
+    numbers : sequence of int
+        Those whose frames are made.
     pulses : int
         Of a line.
     scan : int
@@ -109,17 +109,18 @@ def line_frames(
     summed, sharing = reference_frames(pulses, doppler.reference.every, PULSES)
     light, first = photons(doppler.lidar), scan * _A_SCAN
     air = []
-    for number, speed, distance in zip(lines, speeds, ranges, strict=True):
-        lidar = doppler.lidar.model_copy(update={"range": float(distance)})
+    speeds, ranges = (lines[name].values for name in ("v_los_true", "range"))
+    for number in numbers:
+        lidar = doppler.lidar.model_copy(update={"range": float(ranges[number])})
         # the range changes the light, not the rings
-        mean = images.at(speed) * (photons(lidar) / light)
+        mean = images.at(speeds[number]) * (photons(lidar) / light)
         # random streams different from those of the images of the Doppler lidar's chapter
         streams = [first + _LINES + number]
         air.append(exposed_frames(doppler, rings, mean, pulses, seed, streams))
-    groups = sorted({number // sharing for number in lines})
+    groups = sorted({number // sharing for number in numbers})
     streams = [first + _LASER + _LINES + group for group in groups]
     laser = exposed_frames(doppler, rings, images.laser, summed, seed, streams)
-    return torch.cat(air), laser, [groups.index(number // sharing) for number in lines]
+    return torch.cat(air), laser, [groups.index(number // sharing) for number in numbers]
 
 
 def _nodes() -> np.ndarray:

@@ -9,6 +9,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requirements
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import bundle
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings
@@ -25,7 +26,8 @@ from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.beams import Beams
-from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_lines
+from lidar_mi.instrument.doppler import DopplerLidar
+from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind, sight_volumes, wind_of_lines
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.combined.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
@@ -41,6 +43,31 @@ if TYPE_CHECKING:
 
 # Selects the random streams of the drifts of the first scan.
 _DRIFTS = 1 << 24
+
+
+@bundle
+class LineScan:
+    """The lines of sight of the Doppler lidar, and the wind, or its states, that they meet."""
+
+    sensor: Sensor
+    doppler: Doppler
+    platform: Platform
+    seed: int
+    states: xr.Dataset
+    line_beams: Beams | None
+
+    def true_lines(self, lidar: DopplerLidar, errors: PlatformErrors) -> xr.Dataset:
+        """Lines of sight of a lidar with these errors of pointing, without noise: `scan_wind`."""
+        return scan_wind(
+            self.states,
+            self.sensor.directions,
+            lidar,
+            0.0,
+            self.seed,
+            self.platform.speed,
+            errors,
+            self.line_beams,
+        )
 
 
 def requirement_tables(
@@ -83,15 +110,7 @@ def states_of_wind(platform: Platform, slab_wind: xr.Dataset, flows: Flows) -> x
     return xr.concat(states, xr.Variable("time", [0.0, platform.dt]))
 
 
-def check_lines(
-    sensor: Sensor,
-    doppler: Doppler,
-    scan: Scan,
-    platform: Platform,
-    states: xr.Dataset,
-    rings: Rings,
-    line_beams: Beams | None,
-) -> None:
+def check_lines(line_scan: LineScan, scan: Scan, rings: Rings) -> None:
     """Check that both lidars observe the same air, in the Doppler lidar's velocity range.
 
     Raises
@@ -100,8 +119,9 @@ def check_lines(
         Lidars that do not observe the same slab, lines that leave the wake, speeds beyond the
         unambiguous range.
     """
-    reference_frames(sensor.pulses, doppler.reference.every, PULSES)
-    lidar, beams = doppler.lidar, line_beams
+    sensor, states, speed = line_scan.sensor, line_scan.states, line_scan.platform.speed
+    reference_frames(sensor.pulses, line_scan.doppler.reference.every, PULSES)
+    lidar, beams = line_scan.doppler.lidar, line_scan.line_beams
     middle = scan.range + scan.thickness / 2
     if abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
@@ -119,26 +139,16 @@ def check_lines(
     except InputError as error:
         raise InputError(f"sensor.directions: {error}") from None
     # a bound for all directions
-    fastest = platform.speed + float(np.sqrt(sum(states[n] ** 2 for n in COMPONENTS)).max())
+    fastest = speed + float(np.sqrt(sum(states[n] ** 2 for n in COMPONENTS)).max())
     limit = rings.model.velocity_range / 2
     if fastest > limit:
         raise InputError(
-            f"platform.speed: {platform.speed:g} m/s is not allowed with sensor; "
+            f"platform.speed: {speed:g} m/s is not allowed with sensor; "
             f"expected less than {limit:.0f} m/s with the wind, half an order of doppler.etalon"
         )
 
 
-def measure_lines(
-    sensor: Sensor,
-    doppler: Doppler,
-    platform: Platform,
-    seed: int,
-    states: xr.Dataset,
-    rings: Rings,
-    line_beams: Beams | None,
-    assumed_rings: Rings,
-    log: Log,
-) -> xr.Dataset:
+def measure_lines(line_scan: LineScan, rings: Rings, assumed_rings: Rings, log: Log) -> xr.Dataset:
     """Line-of-sight velocities retrieved from the Doppler lidar's rings.
 
     ``assumed_rings`` has the models of the instrument that the retrieval assumes.
@@ -152,17 +162,9 @@ def measure_lines(
         From `scan_wind`, with ``v_los``, its random ``v_los_std`` and ``v_los_systematic``, which
         are common to all lines (m s^-1), as retrieved; NaN where an image gives none.
     """
-    lines = scan_wind(
-        states,
-        sensor.directions,
-        doppler.lidar,
-        0.0,
-        seed,
-        platform.speed,
-        sensor.errors,
-        line_beams,
-    )
-    true, ranges = (lines[name].values for name in ("v_los_true", "range"))
+    sensor, doppler, seed = line_scan.sensor, line_scan.doppler, line_scan.seed
+    lines = line_scan.true_lines(doppler.lidar, sensor.errors)
+    true = lines["v_los_true"].values
     log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")
     images = line_images(doppler, rings, true.min(), true.max())
     noises = line_noises(doppler, sensor.pulses, rings)
@@ -172,20 +174,12 @@ def measure_lines(
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
         chunk = slice(start, min(start + FRAMES, len(true)))
         air, laser, own = line_frames(
-            doppler,
-            rings,
-            images,
-            range(chunk.start, chunk.stop),
-            true[chunk],
-            ranges[chunk],
-            sensor.pulses,
-            seed,
+            doppler, rings, images, lines, range(chunk.start, chunk.stop), sensor.pulses, seed
         )
         retrieved[:, chunk] = speeds_to_laser(
             air, laser[own], doppler, assumed_rings, noises, RingMethod.ANNULAR, RingCentre.FREE
         )
-    v_los, std, systematic, laser_std = retrieved
-    return with_speeds(lines, v_los, std, systematic, laser_std, doppler, sensor.pulses, seed)
+    return with_speeds(lines, retrieved, doppler, sensor.pulses, seed)
 
 
 def line_noises(doppler: Doppler, pulses: int, rings: Rings) -> "list[PixelNoise]":
@@ -195,22 +189,16 @@ def line_noises(doppler: Doppler, pulses: int, rings: Rings) -> "list[PixelNoise
 
 
 def with_speeds(
-    lines: xr.Dataset,
-    v_los: np.ndarray,
-    std: np.ndarray,
-    systematic: np.ndarray,
-    laser_std: np.ndarray,
-    doppler: Doppler,
-    pulses: int,
-    seed: int,
-    scan: int = 0,
+    lines: xr.Dataset, speeds: np.ndarray, doppler: Doppler, pulses: int, seed: int, scan: int = 0
 ) -> xr.Dataset:
     """Lines with the speeds that were read, the drifts behind the laser's frames and their errors.
 
-    Lines are of `scan_wind`, v_los and its errors (m/s) of `speeds_to_laser`; pulses are those of a
-    line. Where one frame of the laser serves several lines there is a ``v_los_covariance`` (line,
-    other_line), m^2 s^-2. The seed and the number of the scan select the drifts.
+    Lines are of `scan_wind`, speeds (4, lines) with their errors, m/s, of `speeds_to_laser`; pulses
+    are those of a line. Where one frame of the laser serves several lines there is a
+    ``v_los_covariance`` (line, other_line), m^2 s^-2. The seed and the number of the scan select
+    the drifts.
     """
+    v_los, std, systematic, laser_std = speeds
     streams = [seed, _DRIFTS + scan]
     drift, drift_std = drifts(doppler, pulses, streams, range(len(v_los)), PULSES)
     # all at once: each variable that a data set takes later copies and aligns it again

@@ -12,10 +12,10 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import But, Only, Store
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.memory import Footprint
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.stages.brightness import check_brightness, least_samples
 from lidar_mi.experiment.stages.timed_beams import timed_plans
-from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.experiment.truth.flows import Flows
+from lidar_mi.experiment.truth.extinction import ObservedAir, Truth
 from lidar_mi.experiment.truth.in_time import air_in_time, values_of_states
 from lidar_mi.instrument.detector import Detector, gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
@@ -32,7 +32,6 @@ from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import check_variant, use_variant
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.scattering import Scattering
-from lidar_mi.schema.volume import Volume
 from lidar_mi.schema.wake import Wake
 
 IMAGES = ("image_t1", "image_t2")
@@ -88,16 +87,11 @@ def environment_extinction(wake: Wake, truth: Truth) -> float:
 
 
 def check_light(
-    wake: Wake,
-    scan: Scan,
+    observed: ObservedAir,
     lidar: BackscatterLidar,
     detector: Detector | None,
     render: RenderSettings,
-    volume: Volume | None,
     footprint: Footprint,
-    flows: Flows,
-    truth: Truth,
-    plans: Sequence[ScanPlan],
     air: Scatterer,
 ) -> None:
     """Check that the images will not be dark or their noise undetermined.
@@ -108,9 +102,10 @@ def check_light(
         Air that does not scatter, a detector inconsistent with the pulse, beams too wide for the
         largest medium, moving air in more states than the memory holds.
     """
+    truth, plans = observed.truth, observed.plans
     # refuses beams that are too wide for a medium
     _media(lidar, [truth.extinction[0]], plans)
-    in_states = values_of_states(wake, scan, volume, flows, plans)
+    in_states = values_of_states(observed.observation, observed.flows, plans)
     columns, rows = len(plans[0].y), len(plans[0].z)
     # the flow may be that of another point of a campaign, with another footprint
     footprint.check_size(columns, rows)
@@ -127,8 +122,9 @@ def check_light(
         )
     if not air.albedo > 0:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
+    mapping = observed.observation.wake.extinction
     for plan in plans:
-        check_brightness(lidar, render, detector, wake.extinction, truth, plan, air.albedo)
+        check_brightness(lidar, render, detector, mapping, truth, plan, air.albedo)
 
 
 def image_names() -> tuple[str, ...]:
@@ -145,39 +141,27 @@ def given_samples(
 
 
 def samples_by_noise(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
+    observed: ObservedAir,
     lidar: BackscatterLidar,
     detector: Detector,
     scattering: Scattering,
     render: RenderSettings,
     seed: int,
-    truth: Truth,
-    plans: Sequence[ScanPlan],
     air: Scatterer,
     log: Log,
 ) -> int:
     """Monte Carlo samples per beam, by the noise of the detector; see `chosen_samples`."""
-    chosen = chosen_samples(
-        wake, platform, scan, lidar, detector, scattering, render, seed, truth, plans, air, log
-    )
+    chosen = chosen_samples(observed, lidar, detector, scattering, render, seed, air, log)
     log(samples_text(render, chosen))
     return chosen.number
 
 
 def render_images(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
+    observed: ObservedAir,
     lidar: Annotated[BackscatterLidar, But("pulse_energy")],
     scattering: Scattering,
     render: Annotated[RenderSettings, But(*CHOOSING)],
-    volume: Volume | None,
     seed: int,
-    flows: Flows,
-    truth: Truth,
-    plans: Sequence[ScanPlan],
     air: Scatterer,
     samples: int,
     log: Log,
@@ -194,6 +178,7 @@ def render_images(
         From `render_scans`, with the depolarisation and what else it gives.
     """
     use_variant(render.variant)
+    platform, scan, plans = observed.observation.platform, observed.observation.scan, observed.plans
     wanted = [IMAGES.index(name) for name in missing]
     log(f"rendering {len(wanted)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
 
@@ -202,16 +187,14 @@ def render_images(
 
     chosen = samples if render.samples_per_beam == "auto" else None
     rendered = _rendered(
-        _fields(wake, platform, scan, volume, flows, truth, plans, wanted, log),
-        wake,
-        truth,
+        observed,
+        _fields(observed, wanted, log),
         lidar,
         scattering,
         with_samples(render, samples),
         seed,
-        plans,
         air,
-        wanted,
+        scans=wanted,
         progress=progress,
         batches=batches_of(IMAGES, store, log, chosen),
     )
@@ -227,69 +210,55 @@ def render_images(
         yield IMAGES[index], image
 
 
-def _fields(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    flows: Flows,
-    truth: Truth,
-    plans: Sequence[ScanPlan],
-    wanted: Sequence[int],
-    log: Log,
-) -> list[xr.DataArray]:
+def _fields(observed: ObservedAir, wanted: Sequence[int], log: Log) -> list[xr.DataArray]:
     """The extinction that the beams of each scan meet, at their times if the air moves."""
+    observation, flows, truth, plans = (
+        observed.observation,
+        observed.flows,
+        observed.truth,
+        observed.plans,
+    )
     fields = list(truth.extinction)
-    if scan.air == "moving":
+    if observation.scan.air == "moving":
         for index, plan in enumerate(plans):
             if index in wanted and plan.beams is not None:
                 log.bar(f"moving the air of scan {index + 1} of {len(plans)}", None)
-                times = plan.beams.time
-                fields[index] = air_in_time(
-                    wake, platform, scan, volume, truth, flows, index, times
-                )
+                fields[index] = air_in_time(observation, truth, flows, index, plan.beams.time)
     return fields
 
 
 def _rendered(
+    observed: ObservedAir,
     fields: Sequence[xr.DataArray],
-    wake: Wake,
-    truth: Truth,
     lidar: BackscatterLidar,
     scattering: Scattering,
     render: RenderSettings,
     seed: int,
-    plans: Sequence[ScanPlan],
     air: Scatterer,
-    wanted: Sequence[int],
     **how: Any,
 ) -> Iterator[xr.Dataset]:
-    """Some of the scans, from `render_scans`."""
+    """The scans of these fields, from `render_scans`."""
+    truth, plans = observed.truth, observed.plans
     return render_scans(
         _media(lidar, fields, plans),
         plans,
         lidar,
-        environment_extinction(wake, truth),
+        environment_extinction(observed.observation.wake, truth),
         *air,
         render.for_winds(),
         seed,
-        scans=wanted,
         molecules=molecules(truth.molecules, lidar.wavelength, scattering.band),
         **how,
     )
 
 
 def chosen_samples(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
+    observed: ObservedAir,
     lidar: BackscatterLidar,
     detector: Detector,
     scattering: Scattering,
     render: RenderSettings,
     seed: int,
-    truth: Truth,
-    plans: Sequence[ScanPlan],
     air: Scatterer,
     log: Log,
 ) -> Samples:
@@ -300,19 +269,20 @@ def chosen_samples(
     """
     use_variant(render.variant)
     log.bar("choosing the number of samples", None)
+    observation, truth, plans = observed.observation, observed.truth, observed.plans
     beams, gates = len(plans[0].y) * len(plans[0].z), plans[0].gate_count
     number, seed = pilot_samples(render, beams, gates), seed + PILOT_SEED
     # noise is that of air at the scan's reference time, which need not be moved for it
-    fields, wanted = truth.extinction, range(len(plans))
     few = with_samples(render, number)
-    pilots = list(_rendered(fields, wake, truth, lidar, scattering, few, seed, plans, air, wanted))
-    pilots = with_pair_stderr(pilots, truth.wind, platform.dt)
-    found = []
+    pilots = list(_rendered(observed, truth.extinction, lidar, scattering, few, seed, air))
+    pilots = with_pair_stderr(pilots, truth.wind, observation.platform.dt)
+    pulses, mapping = observation.scan.pulses_per_beam, observation.wake.extinction
+    choices = []
     for plan, pilot in zip(plans, pilots, strict=True):
-        noisy = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, scan.pulses_per_beam)
-        least = least_samples(lidar, render, wake.extinction, truth, plan)
-        found.append(choose_samples(noisy, number, render, least))
-    return max(found, key=lambda one: (one.number, one.fraction))
+        noisy = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, pulses)
+        least = least_samples(lidar, render, mapping, truth, plan)
+        choices.append(choose_samples(noisy, number, render, least))
+    return max(choices, key=lambda choice: (choice.number, choice.fraction))
 
 
 def with_samples(render: RenderSettings, number: int) -> RenderSettings:
@@ -366,9 +336,7 @@ def batches_of(
 
 
 def detect_images(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
+    observation: Observation,
     lidar: BackscatterLidar,
     detector: Detector | None,
     seed: int,
@@ -385,19 +353,18 @@ def detect_images(
         _on_nodes(images[name].assign_attrs(pulse_energy=lidar.pulse_energy), plan)
         for name, plan in zip(IMAGES, plans, strict=True)
     ]
-    scans = with_pair_stderr(scans, truth.wind, platform.dt)
+    scans = with_pair_stderr(scans, truth.wind, observation.platform.dt)
     if detector is None:
         return scans
     # geometry and air are in single precision in a file: here they are known exactly
-    air = {"environment_extinction": environment_extinction(wake, truth)}
+    air = {"environment_extinction": environment_extinction(observation.wake, truth)}
+    pulses = observation.scan.pulses_per_beam
     # random numbers different from those of the light transport
-    found = [
-        noisy_scan(
-            one.assign_attrs(air), lidar, detector, [seed, index, 1], plan, scan.pulses_per_beam
-        )
-        for index, (one, plan) in enumerate(zip(scans, plans, strict=True))
+    noisy = [
+        noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan, pulses)
+        for index, (scan, plan) in enumerate(zip(scans, plans, strict=True))
     ]
-    return [one.assign_attrs(monte_carlo_fraction=monte_carlo_fraction(one)) for one in found]
+    return [scan.assign_attrs(monte_carlo_fraction=monte_carlo_fraction(scan)) for scan in noisy]
 
 
 def with_pair_stderr(scans: Sequence[xr.Dataset], wind: xr.Dataset, dt: float) -> list[xr.Dataset]:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from lidar_mi.atmosphere.scattering.line import Line, backscatter_line, laser_line
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.graph import Only, Store
+from lidar_mi.experiment.graph import Only, Store, bundle
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.stages.rendering import batches_of
 from lidar_mi.experiment.stages.ring_instrument import air_rings, laser_rings, pixel_noise
@@ -200,13 +200,20 @@ def ring_image_names(doppler_v_los: tuple[float, ...], doppler_path_samples: int
     return [EMITTED, *single_paths, *_received(doppler_v_los)]
 
 
+@bundle
+class RingScene:
+    """The laser's light through etalon and lens onto the CCD, and how its images are rendered."""
+
+    doppler_lidar: Annotated[DopplerLidar, Only("wavelength", "laser_width")]
+    doppler_etalon: Etalon
+    doppler_camera: FringeCamera
+    doppler_render: FringeSettings
+    doppler_v_los: tuple[float, ...]
+    doppler_path_samples: int
+
+
 def render_ring_images(
-    doppler_lidar: Annotated[DopplerLidar, Only("wavelength", "laser_width")],
-    doppler_etalon: Etalon,
-    doppler_camera: FringeCamera,
-    doppler_render: FringeSettings,
-    doppler_v_los: tuple[float, ...],
-    doppler_path_samples: int,
+    scene: RingScene,
     seed: int,
     air_line: Line,
     log: Log,
@@ -222,26 +229,27 @@ def render_ring_images(
     image : xr.Dataset, dims (y, x)
         From `render_fringes`.
     """
-    use_variant(doppler_render.variant)
-    laser = laser_line(doppler_lidar.wavelength, doppler_lidar.laser_width)
+    camera, render, speeds_of_air = scene.doppler_camera, scene.doppler_render, scene.doppler_v_los
+    use_variant(render.variant)
+    laser = laser_line(scene.doppler_lidar.wavelength, scene.doppler_lidar.laser_width)
     # what to render: line, settings, speeds, names
     plan: list[tuple[Line, FringeSettings, tuple[float, ...], list[str]]]
-    plan = [(laser, doppler_render, (0.0,), [EMITTED])]
-    if doppler_path_samples:
-        single = _path_by_path(doppler_render, doppler_path_samples)
+    plan = [(laser, render, (0.0,), [EMITTED])]
+    if scene.doppler_path_samples:
+        single = _path_by_path(render, scene.doppler_path_samples)
         plan.append((laser, single, (0.0,), [PHOTONS]))
-    plan.append((air_line, doppler_render, doppler_v_los, _received(doppler_v_los)))
+    plan.append((air_line, render, speeds_of_air, _received(speeds_of_air)))
     total = sum(len(names) for *_, names in plan)
     before = 0
     for line, settings, speeds, names in plan:
         absent = [k for k, name in enumerate(names) if name in missing]
         if absent:
-            size = f"{doppler_camera.width} x {doppler_camera.height}"
+            size = f"{camera.width} x {camera.height}"
             log(f"rendering {names[absent[0]]} ... {names[absent[-1]]}, {size} pixels")
             # the seed depends on the number of an image: a resumed run renders the same ones
             rendered = render_fringes(
-                doppler_etalon,
-                doppler_camera,
+                scene.doppler_etalon,
+                camera,
                 line,
                 speeds,
                 settings,

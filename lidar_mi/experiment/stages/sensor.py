@@ -16,17 +16,14 @@ from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.truth.flows import moves_along
-from lidar_mi.instrument.beams import Beams
+from lidar_mi.experiment.observation import Observation
+from lidar_mi.experiment.stages.lines import LineScan
 from lidar_mi.instrument.detector import Detector
-from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
+from lidar_mi.instrument.doppler_scan import PlatformErrors
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS
-from lidar_mi.schema.doppler import Doppler
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.sensor import Sensor
-from lidar_mi.schema.volume import Volume
-from lidar_mi.schema.wake import Wake
 
 # Lines of sight per least-squares vector of the Doppler lidar alone: one and those around it.
 _AROUND = 9
@@ -36,10 +33,7 @@ _SURE, _SHORT = 0.01, 0.1
 
 def combined_wind(
     name: str,
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
+    observation: Observation,
     detector: Detector | None,
     sensor: Sensor,
     slab_wind: xr.Dataset,
@@ -55,8 +49,8 @@ def combined_wind(
     log("combining both lidars")
     try:
         images = crossflow(sensor, detector, wind)
-        settings = combine_settings(wake, platform, scan, volume, sensor, images)
-        found = with_truth(name, scan, slab_wind, lines, images, settings)
+        settings = combine_settings(observation, sensor, images)
+        found = with_truth(name, observation.scan, slab_wind, lines, images, settings)
     except InputError as error:
         log.remark(f"no wind from both lidars: {error}")
         return None
@@ -125,12 +119,11 @@ def crossflow(sensor: Sensor, detector: Detector | None, wind: xr.Dataset) -> xr
     return wind.sel(source=source, algorithm=sensor.method)
 
 
-def _oblique_view(
-    wake: Wake, platform: Platform, scan: Scan, volume: Volume | None
-) -> dict[str, float]:
+def _oblique_view(observation: Observation) -> dict[str, float]:
     """Settings of `combine` for the apparent motion in the images by motion along x."""
-    if not moves_along(wake, volume):
+    if not observation.moves_along:
         return {}
+    platform, scan = observation.platform, observation.scan
     # the telescope's distance at mid-time
     advance = (platform.speed - scan.follow) * platform.dt
     distance = scan.range + scan.thickness / 2 - advance / 2
@@ -149,17 +142,11 @@ def _in_time(platform: Platform, sensor: Sensor, crossflow: xr.Dataset) -> dict[
 
 
 def combine_settings(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    sensor: Sensor,
-    crossflow: xr.Dataset,
+    observation: Observation, sensor: Sensor, crossflow: xr.Dataset
 ) -> dict[str, Any]:
     """Settings of `combine` for the cross-flow wind of a sensor."""
-    oblique = _oblique_view(wake, platform, scan, volume)
-    settings = {"crossflow_std": sensor.crossflow_std, **oblique}
-    return settings | _in_time(platform, sensor, crossflow)
+    settings = {"crossflow_std": sensor.crossflow_std, **_oblique_view(observation)}
+    return settings | _in_time(observation.platform, sensor, crossflow)
 
 
 def with_truth(
@@ -199,62 +186,32 @@ def with_truth(
 
 
 def limits_of_u(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
+    observation: Observation,
+    line_scan: LineScan,
     detector: Detector | None,
-    doppler: Doppler,
-    sensor: Sensor,
-    seed: int,
     slab_wind: xr.Dataset,
     lines: xr.Dataset,
     wind: xr.Dataset,
     wind3d: xr.Dataset | None,
     cores: Sequence[Core],
-    line_beams: Beams | None,
-    states: xr.Dataset,
 ) -> dict[str, float]:
     """Error budget of u, see `mean_squares_without`. Empty without a wind from both lidars."""
     if wind3d is None:
         return {}
-    return mean_squares_without(
-        wake,
-        platform,
-        scan,
-        volume,
-        doppler,
-        sensor,
-        seed,
-        slab_wind,
-        lines,
-        crossflow(sensor, detector, wind),
-        wind3d,
-        cores,
-        line_beams,
-        states,
-    )
+    images = crossflow(line_scan.sensor, detector, wind)
+    return mean_squares_without(observation, line_scan, slab_wind, lines, images, wind3d, cores)
 
 
 def mean_squares_without(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    doppler: Doppler,
-    sensor: Sensor,
-    seed: int,
+    observation: Observation,
+    line_scan: LineScan,
     truth: xr.Dataset,
     lines: xr.Dataset,
     crossflow: xr.Dataset,
     found: xr.Dataset,
     cores: Sequence[Core],
-    beams: Beams | None = None,
-    states: xr.Dataset | None = None,
 ) -> dict[str, float]:
     """Mean square error of u without each cause, and without all of them at once, m^2 s^-2.
-
-    The lines see ``states``, from `lines.states_of_wind`; by default the truth.
 
     Causes: `line_noise` (from the rings' noise), `range_bin` (averaging along it, here over
     `_SHORT`), `crossflow` (errors of v and w) and, where there are any, `pointing`
@@ -273,6 +230,7 @@ def mean_squares_without(
     from lidar_mi.retrieval.combined.combine import combine
     from lidar_mi.retrieval.combined.vectors import COMPONENTS
 
+    sensor = line_scan.sensor
     at = {axis: crossflow[axis] for axis in ("z", "y")}
     true = {name: truth[name].interp(at).transpose("z", "y").values for name in COMPONENTS}
     surely = {f"{name}_stderr": np.full_like(true[name], _SURE) for name in ("v", "w")}
@@ -284,21 +242,12 @@ def mean_squares_without(
     chosen = (found["flag"].values == 0) & outside_cores(y, z, list(cores))
 
     def square(causes: Sequence[str]) -> float:
-        lidar, missed = doppler.lidar, sensor.errors
+        lidar, missed = line_scan.doppler.lidar, sensor.errors
         if "range_bin" in causes:
             lidar = lidar.model_copy(update={"range_bin": _SHORT})
         if "pointing" in causes:
             missed = PlatformErrors()
-        changed = scan_wind(
-            truth if states is None else states,
-            sensor.directions,
-            lidar,
-            0.0,
-            seed,
-            platform.speed,
-            missed,
-            beams,
-        )
+        changed = line_scan.true_lines(lidar, missed)
         # lines without a velocity remain without
         # the draw of the measurement: cases differ by their cause alone
         noise, std = lines["v_los"] - lines["v_los_true"], lines["v_los_std"]
@@ -311,8 +260,7 @@ def mean_squares_without(
         settings: dict[str, Any] = {}
         if "crossflow" not in causes:
             flow = crossflow
-            oblique = _oblique_view(wake, platform, scan, volume)
-            settings = {"crossflow_std": sensor.crossflow_std, **oblique}
+            settings = {"crossflow_std": sensor.crossflow_std, **_oblique_view(observation)}
         # time and drift are no causes: they are the same in all cases
         settings |= timed
         u = combine(flow, changed, **settings)["u"].transpose("z", "y").values
@@ -320,7 +268,7 @@ def mean_squares_without(
 
     if not chosen.any():
         return {}
-    timed = _in_time(platform, sensor, crossflow)
+    timed = _in_time(observation.platform, sensor, crossflow)
     full = square(())
     if not full > 0:
         return {}

@@ -6,32 +6,26 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.stages.rendering import gridded_scans
 from lidar_mi.experiment.stages.winds import (
+    Estimation,
     attenuated_backscatter_stderr,
     known_blur,
     pixel_times,
     rendered_pairs,
     window_settings,
 )
-from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
-from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.settings import RenderSettings
-from lidar_mi.schema.platform import Platform
-from lidar_mi.schema.retrieval import Retrieval
-from lidar_mi.schema.wake import Wake
 
 
 def simulation_noise(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
+    observation: Observation,
     lidar: BackscatterLidar,
-    detector: Detector | None,
     render: RenderSettings,
-    retrieval: Retrieval,
-    device: str | None,
+    estimation: Estimation,
     seed: int,
     detected: Sequence[xr.Dataset],
     plans: Sequence[ScanPlan],
@@ -59,12 +53,14 @@ def simulation_noise(
     if fraction <= render.monte_carlo_fraction:
         return None
     log.bar("retrieving winds with more noise of the simulation", None)
+    wake, platform, scan = observation.wake, observation.platform, observation.scan
+    retrieval = estimation.retrieval
     random = np.random.default_rng([seed, 2])
     noisier = [_with_more_noise(one, random) for one in detected]
-    pairs = rendered_pairs(wake, scan, detector, gridded_scans(platform, noisier))
+    pairs = rendered_pairs(wake, scan, gridded_scans(platform, noisier))
     source, (changed, _) = pairs.popitem()
     # methods that weight by noise are to do so as before
-    before, noise = rendered_pairs(wake, scan, detector, scans)[source]
+    before, noise = rendered_pairs(wake, scan, scans)[source]
     # which pixels scattered beams reach depends on the wind between them, and so on the noise
     pair = [one.where(first.notnull()) for one, first in zip(changed, before, strict=True)]
     times = pixel_times(wake, scan, scans)
@@ -79,7 +75,7 @@ def simulation_noise(
             times=times,
             blur=known_blur(retrieval, lidar, plans[0]),
             standard_errors=False,
-            **window_settings(retrieval, device),
+            **window_settings(retrieval, estimation.device),
         )
         first = wind.sel(source=source, algorithm=method)
         valid = (found["flag"].values == 0) & (first["flag"].values == 0)

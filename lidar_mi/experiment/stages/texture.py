@@ -1,32 +1,26 @@
 """Errors of winds retrieved from the extinction against its sub-grid texture."""
 
+from dataclasses import replace
+
 import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import error_statistics, truth_at_vectors
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.stages.winds import window_settings
+from lidar_mi.experiment.observation import Observation
+from lidar_mi.experiment.stages.winds import Estimation, window_settings
 from lidar_mi.experiment.truth.clear_air import ClearAir
 from lidar_mi.experiment.truth.extinction import true_air
 from lidar_mi.experiment.truth.flows import Flows, advection_by
-from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.schema.platform import Platform
-from lidar_mi.schema.retrieval import Retrieval
-from lidar_mi.schema.volume import Volume
-from lidar_mi.schema.wake import Wake
 
 LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Relative rms of the texture."""
 
 
 def texture_sweep(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    retrieval: Retrieval,
-    device: str | None,
+    observation: Observation,
+    estimation: Estimation,
     seed: int,
     flows: Flows,
     clear_air: ClearAir,
@@ -42,20 +36,19 @@ def texture_sweep(
     """
     from lidar_mi.retrieval.wind.pair import retrieve_wind
 
-    points, advected = [], advection_by(wake, platform, scan, volume, flows)
+    wake = observation.wake
+    points, advected = [], advection_by(observation, flows)
     for index, rms in enumerate(LEVELS):
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))
         texture = wake.texture.model_copy(update={"rms": rms})
-        textured = wake.model_copy(update={"texture": texture})
-        truth = true_air(
-            textured, platform, scan, volume, seed, flows, clear_air, advected=advected
-        )
+        textured = replace(observation, wake=wake.model_copy(update={"texture": texture}))
+        truth = true_air(textured, seed, flows, clear_air, advected=advected)
         wind = retrieve_wind(
             truth.image(0),
             truth.image(1),
-            dt=platform.dt,
+            dt=observation.platform.dt,
             method=ImageMethod.CC,
-            **window_settings(retrieval, device),
+            **window_settings(estimation.retrieval, estimation.device),
         )
         true = truth_at_vectors(wind, truth.wind)
         v, w = (wind[name].values - true[name].values for name in ("v", "w"))

@@ -12,19 +12,18 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.stages.winds import (
+    Estimation,
     common_error,
     pixel_times,
     rendered_pairs,
     retrieval_device,
 )
-from lidar_mi.instrument.detector import Detector
-from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
-from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.retrieval import Retrieval
 from lidar_mi.schema.sensor import Sensor
-from lidar_mi.schema.wake import Wake
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -51,7 +50,7 @@ class VortexFits:
 
 def combined_vectors(wind3d: xr.Dataset | None) -> xr.Dataset | None:
     """Cross-flow wind of both lidars, with the flags of v and w; None: there is none."""
-    from lidar_mi.retrieval.combined.combine import CombinedFlag
+    from lidar_mi.flags import CombinedFlag
 
     if wind3d is None:
         return None
@@ -76,13 +75,9 @@ def vectors_method(sensor: Sensor | None, retrieval: Retrieval) -> str | None:
 
 
 def fit_pairs(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    detector: Detector | None,
-    retrieval: Retrieval,
+    observation: Observation,
+    estimation: Estimation,
     sensor: Sensor | None,
-    device: str | None,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
     vectors: xr.Dataset | None,
@@ -92,10 +87,12 @@ def fit_pairs(
     from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
     from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 
+    wake, platform, scan = observation.wake, observation.platform, observation.scan
+    retrieval, device = estimation.retrieval, estimation.device
     with_vectors = sensor is not None or vectors is not None
     method = vectors_method(sensor, retrieval) if with_vectors else None
     log(f"fitting vortex pairs to the images{f' and to the vectors by {method}' if method else ''}")
-    pair, noise = list(rendered_pairs(wake, scan, detector, scans).values())[-1]
+    pair, noise = list(rendered_pairs(wake, scan, scans).values())[-1]
     times = pixel_times(wake, scan, scans)
     common, rotation = common_error(retrieval, platform, plans)
     # as functions: a refused fit to the images must not prevent that to the vectors

@@ -9,11 +9,12 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.assessment.metrics.errors import commonest_flag, truth_at_vectors
 from lidar_mi.assessment.metrics.names import EXACT, RENDERED, Source
+from lidar_mi.experiment.graph import bundle
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.stages.image_pair import Noise, Pair, both, combined_noise
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.pair_error import pair_stderr
@@ -32,6 +33,14 @@ _OF_TEMPLATES = (ImageMethod.CC, ImageMethod.MULTIPASS)
 """Methods that find each vector by itself; below that fraction, chance correlations are many."""
 
 
+@bundle
+class Estimation:
+    """How winds are retrieved from images, and on which device."""
+
+    retrieval: Retrieval
+    device: str | None
+
+
 def check_windows(retrieval: Retrieval, plans: Sequence[ScanPlan]) -> None:
     """Check that windows fit into the images.
 
@@ -46,13 +55,9 @@ def check_windows(retrieval: Retrieval, plans: Sequence[ScanPlan]) -> None:
 
 def cross_flow_winds(
     name: str,
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
+    observation: Observation,
     lidar: BackscatterLidar,
-    detector: Detector | None,
-    retrieval: Retrieval,
-    device: str | None,
+    estimation: Estimation,
     truth: Truth,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
@@ -77,9 +82,11 @@ def cross_flow_winds(
     from lidar_mi.retrieval.wind.pair import retrieve_wind
 
     log("retrieving winds")
+    wake, platform, scan = observation.wake, observation.platform, observation.scan
+    retrieval, device = estimation.retrieval, estimation.device
     _warn_of_wide_beams(lidar, retrieval, truth, plans, log)
     blur, times = known_blur(retrieval, lidar, plans[0]), pixel_times(wake, scan, scans)
-    pairs = _image_pairs(wake, scan, lidar, detector, retrieval, truth, plans, scans)
+    pairs = _image_pairs(wake, scan, lidar, retrieval, truth, plans, scans)
     lost = resampled_noise(scans)
     sources, said = [], set()
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
@@ -144,14 +151,13 @@ def _image_pairs(
     wake: Wake,
     scan: Scan,
     lidar: BackscatterLidar,
-    detector: Detector | None,
     retrieval: Retrieval,
     truth: Truth,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
 ) -> dict[str, tuple[Pair, Noise]]:
     """Both images and their noise by source: of the truth, then of the lidar."""
-    rendered = rendered_pairs(wake, scan, detector, scans)
+    rendered = rendered_pairs(wake, scan, scans)
     if retrieval.sources == "measured":
         # the last ones: with the detector's noise, if there is a detector
         return dict([rendered.popitem()])
@@ -171,7 +177,7 @@ def _image_pairs(
 
 
 def rendered_pairs(
-    wake: Wake, scan: Scan, detector: Detector | None, scans: Sequence[xr.Dataset]
+    wake: Wake, scan: Scan, scans: Sequence[xr.Dataset]
 ) -> dict[str, tuple[Pair, Noise]]:
     """Images that winds are retrieved from, on one grid, and their noise (a map or its level).
 
@@ -183,7 +189,7 @@ def rendered_pairs(
     images = both(lambda k: scans[k]["Y"])
     maps: dict[str, tuple[Pair, xr.DataArray]]
     maps = {Source.BACKSCATTER: (images, with_resampling(noise, scans, "Y"))}
-    if detector:
+    if "Y_noisy" in scans[0]:
         noisy = combined_noise(noise, scans[0]["Y_noise_std"])
         noisy = with_resampling(noisy, scans, "Y_noisy")
         maps[Source.NOISY] = both(lambda k: scans[k]["Y_noisy"]), noisy

@@ -19,7 +19,8 @@ def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | Fil
     InputError
         A deformation of more than half of the separation, of filaments that are linked at age 0.
     """
-    path, wake, met = encounter.path, encounter.wake, encounter.path.start / encounter.path.speed
+    path, wake = encounter.path, encounter.wake
+    arrival = path.start / path.speed
     decay_time, crow = _decay_time(pair, wake), wake.crow
     bent = crow.model == "filaments"
     aged = PairAlongPath(
@@ -30,7 +31,7 @@ def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | Fil
         crossing_angle=path.crossing_angle,
         climb_angle=path.climb_angle,
         x_c=path.start,
-        t_c=met,
+        t_c=arrival,
         miss=(path.miss.y, path.miss.z),
         decay_time=decay_time,
         crow_amplitude=0.0 if bent else crow.amplitude,
@@ -46,7 +47,7 @@ def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | Fil
             f"expected below half of the separation, {pair.separation / 2:.4g} m"
         )
     # growth is that of the vortices at age 0, which decay little before they link
-    amplitude = grown(crow.amplitude, wake.age + met, pair.circulation, pair.separation)
+    amplitude = grown(crow.amplitude, wake.age + arrival, pair.circulation, pair.separation)
     return _filaments(aged, amplitude)
 
 
@@ -64,8 +65,8 @@ def _decay_time(pair: VortexPair, wake: WakeInTime) -> float | None:
 
 def described_pair(pair: VortexPair, encounter: Encounter) -> list[tuple[str, str]]:
     """The analytic wake in words: a name and a line for each of its properties."""
-    wake, found = encounter.wake, analytic_wake(pair, encounter)
-    aged = found.pair if isinstance(found, FilamentsAlongPath) else found
+    wake, analytic = encounter.wake, analytic_wake(pair, encounter)
+    aged = analytic.pair if isinstance(analytic, FilamentsAlongPath) else analytic
     left_by = "" if pair.aircraft is None else f"of an {pair.aircraft}, "
     rows = [
         (
@@ -76,13 +77,13 @@ def described_pair(pair: VortexPair, encounter: Encounter) -> list[tuple[str, st
     ]
     if aged.decay_time is not None:
         rows.append(("decay of the vortices", f"to 1/e in {aged.decay_time:.3g} s"))
-    if isinstance(found, FilamentsAlongPath) and wake.crow.amplitude:
+    if isinstance(analytic, FilamentsAlongPath) and wake.crow.amplitude:
         age = linking_age(wake.crow.amplitude, pair.circulation, pair.separation)
         since = wake.age + aged.t_c - age
         text = (
             f"rings since {since:.3g} s"
-            if found.rings
-            else f"waves of {found.amplitude:.3g} m, linking in {-since:.3g} s"
+            if analytic.rings
+            else f"waves of {analytic.amplitude:.3g} m, linking in {-since:.3g} s"
         )
-        rows.append(("Crow instability", f"{text}, {found.wavelength:.3g} m long"))
+        rows.append(("Crow instability", f"{text}, {analytic.wavelength:.3g} m long"))
     return rows

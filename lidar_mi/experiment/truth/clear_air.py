@@ -1,4 +1,4 @@
-"""The molecules of the air at the site: what they take from a beam and send back."""
+"""The molecules of the air at the site: extinction and backscatter."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -49,12 +49,12 @@ def clear_air(
         there is below half or above twice that of the standard atmosphere; a wavelength at
         which the refractive index of air is not known.
     """
-    stated = wake_extinction.molecules
-    if stated == 0:
+    molecules = wake_extinction.molecules
+    if molecules == 0:
         return ClearAir(0.0, 0.0, "none, as wake.extinction.molecules says")
-    if stated == "auto" and not are_particles(scattering):
+    if molecules == "auto" and not are_particles(scattering):
         return ClearAir(0.0, 0.0, f"none beside scattering.phase {scattering.phase}")
-    if stated == "auto" and lidar.wavelength > LONGEST_WAVELENGTH:
+    if molecules == "auto" and lidar.wavelength > LONGEST_WAVELENGTH:
         return ClearAir(0.0, 0.0, "none worth mention at this wavelength")
     if lidar.wavelength < SHORTEST_WAVELENGTH:
         raise InputError(
@@ -65,8 +65,8 @@ def clear_air(
     altitude = site_altitude(site, encounter)
     pressure, temperature = _air_at(altitude, site, search_path)
     air = molecular_scattering(lidar.wavelength, pressure, temperature, scattering.band)
-    if stated != "auto":
-        return ClearAir(stated, stated / air.lidar_ratio, "as wake.extinction.molecules says")
+    if molecules != "auto":
+        return ClearAir(molecules, molecules / air.lidar_ratio, "as wake.extinction.molecules says")
     source = site.sounding or "standard atmosphere"
     origin = f"{source} at {altitude:g} m: {pressure / 100:.4g} hPa, {temperature:.4g} K"
     return ClearAir(air.extinction, air.backscatter, origin)
@@ -76,9 +76,9 @@ def in_air_of_its_site(experiment: Experiment, search_path: Path) -> Experiment:
     """The experiment with its fringe-imaging Doppler lidar in the air of the site.
 
     Altitude, pressure, temperature, backscatter and extinction are those of the site where
-    ``doppler.lidar`` does not state its own. Backscatter is that of molecules and of as much
-    aerosol as ``aerosol_fraction`` says, extinction that of molecules; light of aerosol alone
-    leaves both as they are. Without a site, all is as stated.
+    ``doppler.lidar`` does not state its own. Backscatter is that of molecules plus the
+    ``aerosol_fraction``, extinction that of molecules; neither changes if all light is of aerosol.
+    Without a site nothing changes.
 
     Raises
     ------
@@ -88,11 +88,13 @@ def in_air_of_its_site(experiment: Experiment, search_path: Path) -> Experiment:
     doppler, site = experiment.fringes, experiment.site
     if doppler is None or site == Site():
         return experiment
-    lidar, stated = doppler.lidar, doppler.lidar.model_fields_set
-    here = lidar.altitude if "altitude" in stated else site_altitude(site, experiment.encounter)
-    of_site: dict[str, float] = {"altitude": here}
+    lidar, set_keys = doppler.lidar, doppler.lidar.model_fields_set
+    altitude = (
+        lidar.altitude if "altitude" in set_keys else site_altitude(site, experiment.encounter)
+    )
+    of_site: dict[str, float] = {"altitude": altitude}
     if site.sounding is not None:
-        of_site["pressure"], of_site["temperature"] = _air_at(here, site, search_path)
+        of_site["pressure"], of_site["temperature"] = _air_at(altitude, site, search_path)
     lidar = _where_unstated(lidar, of_site)
     if lidar.aerosol_fraction < 1:
         molecules = molecular_scattering(
@@ -115,8 +117,8 @@ def air_of(lidar: DopplerLidar) -> tuple[float, float]:
 
 
 def _where_unstated(lidar: DopplerLidar, values: Mapping[str, float]) -> DopplerLidar:
-    stated = lidar.model_fields_set
-    return lidar.model_copy(update={key: v for key, v in values.items() if key not in stated})
+    set_keys = lidar.model_fields_set
+    return lidar.model_copy(update={key: v for key, v in values.items() if key not in set_keys})
 
 
 def site_altitude(site: Site, encounter: Encounter | None) -> float:
@@ -149,7 +151,7 @@ def _air_at(altitude: float, site: Site, search_path: Path) -> tuple[float, floa
     logarithm = np.interp(altitude, sounding.altitude, np.log(sounding.pressure))
     pressure = float(np.exp(logarithm))
     temperature = float(np.interp(altitude, sounding.altitude, sounding.temperature))
-    # half to twice: no weather, but a wrong unit or another planet
+    # a factor of two is no weather, but a wrong unit
     usual = standard_atmosphere(altitude).pressure
     for name, value, least, most in (
         ("pressure", pressure / 100, usual / 200, usual / 50),

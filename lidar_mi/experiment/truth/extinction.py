@@ -13,19 +13,18 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.graph import call
+from lidar_mi.experiment.graph import bundle, call
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.truth.clear_air import ClearAir, clear_air
 from lidar_mi.experiment.truth.flows import Advection, Flows, advection_by, flows_of, mean_flow
 from lidar_mi.experiment.truth.slab import slab_mean
-from lidar_mi.instrument.scan import Scan
+from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.schema.experiment import Experiment
-from lidar_mi.schema.platform import Platform
-from lidar_mi.schema.volume import Volume
-from lidar_mi.schema.wake import ExtinctionMapping, Wake
+from lidar_mi.schema.wake import ExtinctionMapping
 
 
 class Later(Sequence[xr.DataArray]):
-    """A field at t1 and t2; that at t2 is advected when it is first asked for.
+    """A field at t1 and t2; that at t2 is advected on first use.
 
     Advection of a volume takes seconds, and nothing that is checked before a run needs it.
     """
@@ -58,6 +57,16 @@ class Truth:
         """Extinction averaged over depth as an image (z, y): that of an ideal lidar."""
         field = (self.smooth if smooth else self.extinction)[which]
         return slab_mean(field, self.wind.attrs["gates"])
+
+
+@bundle
+class ObservedAir:
+    """What images are made from: the true air, and the scans of it."""
+
+    observation: Observation
+    flows: Flows
+    truth: Truth
+    plans: Sequence[ScanPlan]
 
 
 @checked_arguments
@@ -103,18 +112,15 @@ def make_truth(
             f"wake: missing in {experiment.name}; expected the section of a wake that a "
             "backscatter lidar observes"
         )
+    search_path = experiment.folder if beside is None else Path(beside)
     if flows is None:
-        flows = flows_of(experiment, None if beside is None else Path(beside))
-    path = experiment.folder if beside is None else Path(beside)
-    clear = call(clear_air, experiment, search_path=path)
+        flows = flows_of(experiment, search_path)
+    clear = call(clear_air, experiment, search_path=search_path)
     return call(true_air, experiment, flows=flows, clear_air=clear, advected=advected)
 
 
 def true_air(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
+    observation: Observation,
     seed: int,
     flows: Flows,
     clear_air: ClearAir,
@@ -126,9 +132,10 @@ def true_air(
     Flows come from `read_flows`, the clear air is that at the site.
     """
     first, second = flows
+    wake, scan = observation.wake, observation.scan
     mapping, molecules = wake.extinction, clear_air.extinction
     flow = mean_flow((first, second))
-    advected = advected or advection_by(wake, platform, scan, volume, flows)
+    advected = advected or advection_by(observation, flows)
     smooth1 = extinction_of(first, mapping, first, second)
     texture = wake.texture
     factor = xr.DataArray(1.0)

@@ -21,15 +21,15 @@ Pairs = tuple[tuple[Vortex, ...], tuple[Vortex, ...]]
 """Port and starboard vortices, one for each plane."""
 
 
-def refuse_ages(section: str, given: Mapping[str, float | None]) -> None:
-    """A wake of a file is as old as it is.
+def refuse_ages(section: str, ages: Mapping[str, float | None]) -> None:
+    """Refuse ages and decay times for the wake of a file.
 
     Raises
     ------
     InputError
         A key of the section has a value.
     """
-    for key, value in given.items():
+    for key, value in ages.items():
         if value:
             raise InputError(
                 f"{section}.{key}: {value:g} is not allowed with wake.file; expected "
@@ -45,8 +45,8 @@ def read_planes(path: Path, wake: Wake, *, volume: bool = False) -> xr.Dataset:
     InputError
         Several planes of which none is named.
     """
-    needed, names = tracers_of(wake)
-    flow = read_wake(path, wake.time, names, None if volume else wake.x, require=needed)
+    tracers, names = tracers_of(wake)
+    flow = read_wake(path, wake.time, names, None if volume else wake.x, require=tracers)
     if not volume and flow.sizes["x"] > 1:
         planes = flow["x"].values
         raise InputError(
@@ -84,7 +84,7 @@ def pairs_in(flow: xr.Dataset, name: str) -> tuple[Pairs, tuple[float, float]]:
         for side, core, partner in zip(sides, cores, cores[::-1], strict=True):
             # the widest rings within the plane and around no other core
             tried = (ring_averages(section, core, [partner], outer=outer) for outer in _OUTER)
-            rings = next((one for one in tried if one is not None), None)
+            rings = next((averages for averages in tried if averages is not None), None)
             if rings is None:
                 raise InputError(
                     f"wake.file: {name} has vortices {where} that are too close to each other or "

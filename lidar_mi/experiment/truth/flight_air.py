@@ -1,4 +1,4 @@
-"""The air of an encounter: what flies, what is seen and what is advected is in all of it."""
+"""The air of an encounter, for the aircraft, the images and the advection alike."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -32,7 +32,7 @@ from lidar_mi.schema.section import Section
 from lidar_mi.units import AS_GIVEN
 
 # Planes across the path, in separations from the middle, over which a wake's drift is averaged.
-_AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_DRIFT_PLANES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 def air_along_path(experiment: Experiment) -> WakeAlongPath:
@@ -55,10 +55,11 @@ def air_along_path(experiment: Experiment) -> WakeAlongPath:
         parts = (volume, *parts)
     if not air.wake:
         return AirAlongPath(None, parts, frame)
-    met = path.start / path.speed
-    # a gust is shorter than the wake: it does not move all of it
-    wide = [part for part in parts if not isinstance(part, Gust)]
-    return AirAlongPath(wake, parts, frame, _drift(wake, wide, frame, path.start, met), met)
+    arrival = path.start / path.speed
+    # no gusts: they are shorter than the wake and do not move it as a whole
+    lasting = [part for part in parts if not isinstance(part, Gust)]
+    drift = _drift(wake, lasting, frame, path.start, arrival)
+    return AirAlongPath(wake, parts, frame, drift, arrival)
 
 
 def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir, ...]:
@@ -96,7 +97,7 @@ def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir
 
 
 def described(air: schema.Air, path: flight.Path) -> list[tuple[str, str]]:
-    """What the air is, for people: names of its parts, and a line for each."""
+    """The air in words: names of its parts, and a line for each."""
     rows = []
     if air.turbulence is not None:
         sigma, length = turbulence_scales(air.turbulence, path.altitude)
@@ -121,7 +122,7 @@ def _keys(part: Section) -> str:
 
 
 def _largest_speed(gust: schema.Gust, altitude: float) -> float:
-    """Of a gust, m/s: its own, or the design speed."""
+    """Speed of a gust, m/s: as given, or the design speed."""
     if gust.speed is not None:
         return gust.speed
     factor = gust.alleviation or 1.0
@@ -132,53 +133,53 @@ def _largest_speed(gust: schema.Gust, altitude: float) -> float:
     return design_gust_speed(altitude, gust.gradient, factor)
 
 
-def _volume(given: schema.AirVolume, experiment: Experiment) -> AirVolume:
-    path = find_file(given.file, experiment.folder, "encounter.air.volume.file")
-    # its time of change: a file that is written anew is read anew
+def _volume(settings: schema.AirVolume, experiment: Experiment) -> AirVolume:
+    path = find_file(settings.file, experiment.folder, "encounter.air.volume.file")
+    # the modification time: a changed file is read again
     height = encounter_of(experiment).path.altitude
-    return _read_volume(path, path.stat().st_mtime_ns, given.model_dump_json(), height)
+    return _read_volume(path, path.stat().st_mtime_ns, settings.model_dump_json(), height)
 
 
 # check, flight and lidar need it again: it takes seconds to read
 @lru_cache(maxsize=1)
 def _read_volume(path: Path, stamp: int, keys: str, height: float) -> AirVolume:
-    given = schema.AirVolume.model_validate_json(keys)
-    flow = _flow(path, given)
-    start = float(flow["x"][0]) if given.start is None else given.start
-    centre = float(flow["y"].mean()) if given.centre is None else given.centre
-    return AirVolume(flow[["u", "v", "w"]], start, centre, height, given.largest_divergence)
+    settings = schema.AirVolume.model_validate_json(keys)
+    flow = _flow(path, settings)
+    start = float(flow["x"][0]) if settings.start is None else settings.start
+    centre = float(flow["y"].mean()) if settings.centre is None else settings.centre
+    return AirVolume(flow[["u", "v", "w"]], start, centre, height, settings.largest_divergence)
 
 
-def _flow(path: Path, given: schema.AirVolume) -> xr.Dataset:
+def _flow(path: Path, volume: schema.AirVolume) -> xr.Dataset:
     """The wind of a file on (x, y, z), or on (time, x, y, z) with 0 s as the path starts."""
     box = {".bts": "a field of TurbSim", ".bin": "a Mann box"}.get(path.suffix.lower())
-    if box and (given.time is not None or given.series or given.names):
+    if box and (volume.time is not None or volume.series or volume.names):
         raise InputError(
             f"encounter.air.volume: time, series and names are not allowed with {box}, which has "
             "one state"
         )
-    if (box == "a Mann box") != (given.mann is not None):
+    if (box == "a Mann box") != (volume.mann is not None):
         raise InputError(
             f"encounter.air.volume.mann: expected with a Mann box (.bin) and with no other file, "
             f"found {path.name}"
         )
-    if given.mann is not None:
-        return read_mann(path, given.mann.nodes, given.mann.spacing, given.mann.base)
+    if volume.mann is not None:
+        return read_mann(path, volume.mann.nodes, volume.mann.spacing, volume.mann.base)
     if box:
         return read_bts(path)
-    if not given.series:
-        return read_wake(path, given.time, given.names, require=["u"])
-    times = np.unique(wake_times(path, given.names))
-    if given.time is None or not (times[:1] <= given.time).all() or times.size < 2:
+    if not volume.series:
+        return read_wake(path, volume.time, volume.names, require=["u"])
+    times = np.unique(wake_times(path, volume.names))
+    if volume.time is None or not (times[:1] <= volume.time).all() or times.size < 2:
         listed = f"{times[0]:g} to {times[-1]:g} s" if times.size else "none"
         raise InputError(
             f"encounter.air.volume.series: needs a file of several times and `time`, one of them; "
             f"{path.name} has {listed}"
         )
-    # the state at `time` is chosen as of a single one, whatever its rounding
-    first = read_wake(path, given.time, given.names, require=["u"])
+    # the state at `time` is chosen as for a single state, whatever its rounding
+    first = read_wake(path, volume.time, volume.names, require=["u"])
     chosen = [float(first["time"]), *times[times > float(first["time"])]]
-    states = [first, *(read_wake(path, t, given.names, require=["u"]) for t in chosen[1:])]
+    states = [first, *(read_wake(path, t, volume.names, require=["u"]) for t in chosen[1:])]
     return xr.concat(states, "time").assign_coords(time=np.array(chosen) - chosen[0])
 
 
@@ -201,11 +202,11 @@ def _check_covered(
     x, z = frame.places(along[:, None], [-above, above])
     missing = volume.missing(x, [-across, across], z, last)
     for name, (first, last, low, high) in missing.items():
-        what = {"x": "start", "y": "centre", "z": "path.altitude"}[name]
+        key = {"x": "start", "y": "centre", "z": "path.altitude"}[name]
         raise InputError(
             f"encounter.air.volume.file: {file} covers {name} = {first:g} to {last:g} m; the "
             f"flight needs {low:.4g} to {high:.4g} m (a larger volume, a shorter path, or another "
-            f"{what})"
+            f"{key})"
         )
 
 
@@ -213,9 +214,9 @@ def _image_size(experiment: Experiment, wake: WakeAlongPath) -> tuple[float, flo
     """Width and height of the lidar's images, m."""
     if isinstance(wake, VolumeAlongPath):
         return float(np.ptp(wake.flow["y"])), float(np.ptp(wake.flow["z"]))
-    given = experiment.wake
-    assert given is not None and given.vortex_pair is not None  # an analytic wake
-    return given.vortex_pair.width, given.vortex_pair.height
+    wake_section = experiment.wake
+    assert wake_section is not None and wake_section.vortex_pair is not None  # an analytic wake
+    return wake_section.vortex_pair.width, wake_section.vortex_pair.height
 
 
 def _drift(
@@ -229,11 +230,11 @@ def _drift(
     places = [(x, 0.0, 0.0)]
     if middle:
         separation = abs(middle[0].y - middle[1].y)
-        planes = [x + part * separation for part in _AROUND]
+        planes = [x + part * separation for part in _DRIFT_PLANES]
         places = [
-            (plane, one.y, one.z)
+            (plane, vortex.y, vortex.z)
             for plane in planes
-            for one in vortices_in_plane(wake, plane, time) or ()
+            for vortex in vortices_in_plane(wake, plane, time) or ()
         ]
     at = np.array(places).T
     u, v, w = (float(a.mean()) for a in frame.wind(parts, *at, time))

@@ -17,13 +17,13 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import Guard, call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.memory import Footprint
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.truth.slab import slab_mean
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.io.wake_file import read_wake
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.input_files import find_file
 from lidar_mi.schema.platform import Platform
-from lidar_mi.schema.volume import Volume
 from lidar_mi.schema.wake import Turbine, Wake
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
@@ -49,24 +49,16 @@ def mean_flow(flows: Flows) -> xr.Dataset:
     return first if second is None else (first + second) / 2
 
 
-def moves_along(wake: Wake, volume: Volume | None) -> bool:
-    """Whether air moves along x between the images; a plane of air is uniform along it."""
-    in_volume = wake.second == "advect_3d" and wake.depth == "volume"
-    return wake.turbine is not None or volume is not None or in_volume
-
-
-def advection_by(
-    wake: Wake, platform: Platform, scan: Scan, volume: Volume | None, flows: Flows
-) -> Advection:
+def advection_by(observation: Observation, flows: Flows) -> Advection:
     """From a field to the field after dt in the frame of the gates; trajectories are followed once.
 
-    They are followed when they are first needed: a field of one value stays.
+    They are computed on first use: a uniform field needs none.
     """
-    flow, dt = mean_flow(flows), platform.dt
+    flow, dt = mean_flow(flows), observation.platform.dt
 
     @functools.cache
     def carry() -> Advection:
-        along = flow["u"] - scan.follow if moves_along(wake, volume) else None
+        along = flow["u"] - observation.scan.follow if observation.moves_along else None
         return carrier(flow["v"], flow["w"], dt, u=along)
 
     def advected(field: xr.DataArray) -> xr.DataArray:
@@ -86,10 +78,7 @@ def flows_of(experiment: Experiment, search_path: Path | None = None) -> Flows:
 
 
 def read_flows(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
+    observation: Observation,
     seed: int,
     footprint: Annotated[Footprint, Guard],
     search_path: Path,
@@ -104,23 +93,17 @@ def read_flows(
         it.
     """
     log.bar("reading the wake", None)
+    scan = observation.scan
     if scan.aim == "angles":
         footprint.check_size(scan.columns, scan.rows)
-    flows = _flows(wake, platform, scan, volume, seed, footprint.most_nodes(), search_path)
+    flows = _flows(observation, seed, footprint.most_nodes(), search_path)
     if scan.aim == "grid":  # a beam for every node
         footprint.check_size(flows[0].sizes["y"], flows[0].sizes["z"])
     return flows
 
 
-def _flows(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    seed: int,
-    most: int,
-    search_path: Path,
-) -> Flows:
+def _flows(observation: Observation, seed: int, most: int, search_path: Path) -> Flows:
+    wake, platform, scan = observation.wake, observation.platform, observation.scan
     gate_middle = scan.range + scan.thickness / 2
     if wake.vortex_pair:
         pair = wake.vortex_pair
@@ -130,9 +113,9 @@ def _flows(
         )
         return pair_wake(vortices, y, z, x=gate_middle), None
     if wake.turbine:
-        return _turbine(wake, wake.turbine, platform, scan, seed, most, gate_middle), None
+        return _turbine(observation, wake.turbine, seed, most), None
     assert wake.file is not None  # of the three kinds of wake, the schema asks for one
-    needed, names = tracers_of(wake)
+    tracers, names = tracers_of(wake)
     path = find_file(wake.file, search_path, "wake.file")
     if wake.stored is not None and wake.time is not None:
         passed = wake.stored - wake.time
@@ -143,11 +126,11 @@ def _flows(
             )
 
     along = wake.second == "advect_3d"
-    axes = "xyz" if along or moves_along(wake, volume) else "yz"
+    axes = "xyz" if along or observation.moves_along else "yz"
 
     def state(when: float | None) -> xr.Dataset:
         plane = wake.x if wake.depth == "plane" and not along else None
-        flow = read_wake(path, when, names, plane, require=needed)
+        flow = read_wake(path, when, names, plane, require=tracers)
         places = flow["x"].values
         if wake.depth == "plane" and wake.x is None and len(places) > 1:
             raise InputError(
@@ -174,21 +157,10 @@ def _flows(
 def _air_of_gates(
     wake: Wake, platform: Platform, scan: Scan, flow: xr.Dataset, middle: float, name: str
 ) -> tuple[float, float]:
-    """Ends along x of the air that is in the gates at t1 or at t2, with `_EDGE`, in a file, m.
+    """Ends along x (m, of the file) of the air that is in the gates at t1 or at t2, with `_EDGE`.
 
-    Parameters
-    ----------
-    flow : xr.Dataset
-        As it is in the file.
-    middle : float
-        Place in it that is put in the middle of the gates, m.
-    name : str
-        Of the file.
-
-    Raises
-    ------
-    InputError
-        A file without u, or whose planes do not hold that air.
+    ``middle`` (m) is put into the middle of the gates. A file without u, or whose planes do not
+    hold that air, is refused.
     """
     if "u" not in flow:
         raise InputError(
@@ -229,24 +201,18 @@ def _advected_along(flow: xr.Dataset, platform: Platform, scan: Scan) -> Flows:
 def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
     """Variables that the extinction needs of a wake's file; names of all in the file.
 
-    Tracers of the extinction have our names once they are read.
+    Tracers of the extinction have our names after reading.
     """
     mapping = wake.extinction
-    named = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
-    needed = {n: t for n, t in named.items() if t and mapping.source == "tracer"}
-    return needed, wake.names | {n: t for n, t in needed.items() if t != n}
+    in_file = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
+    tracers = {n: t for n, t in in_file.items() if t and mapping.source == "tracer"}
+    return tracers, wake.names | {n: t for n, t in tracers.items() if t != n}
 
 
-def _turbine(
-    wake: Wake,
-    turbine: Turbine,
-    platform: Platform,
-    scan: Scan,
-    seed: int,
-    most: int,
-    gate_middle: float,
-) -> xr.Dataset:
+def _turbine(observation: Observation, turbine: Turbine, seed: int, most: int) -> xr.Dataset:
     """Wind behind a turbine on planes that contain the gates and the air that passes them."""
+    wake, scan = observation.wake, observation.scan
+    gate_middle = scan.range + scan.thickness / 2
     mean = TurbineWake(
         **turbine.model_dump(
             include={"diameter", "thrust", "tip_speed_ratio", "wind_speed", "growth", "hub_core"}
@@ -255,7 +221,7 @@ def _turbine(
     )
     # air from beyond the ends must not reach the gates: the wake's air moves at 0 to the full wind
     fastest = max(abs(scan.follow), abs(turbine.wind_speed - scan.follow))
-    margin = fastest * platform.dt + _EDGE * wake.spacing
+    margin = fastest * observation.platform.dt + _EDGE * wake.spacing
     half = math.ceil((scan.thickness / 2 + margin) / wake.spacing)
     y, z = analytic_axes(wake, "turbine", most)
     x = gate_middle + wake.spacing * np.arange(-half, half + 1)

@@ -1,4 +1,4 @@
-"""The truth while a scan lasts: the extinction that beams meet at times of their own."""
+"""The truth during a scan: the extinction at the times of its beams."""
 
 import math
 from collections.abc import Sequence
@@ -8,12 +8,10 @@ import xarray as xr
 
 from lidar_mi.atmosphere.advection import advect_to
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.experiment.truth.flows import Flows, mean_flow, moves_along
-from lidar_mi.instrument.scan import Scan, ScanPlan
-from lidar_mi.schema.platform import Platform
-from lidar_mi.schema.volume import Volume
-from lidar_mi.schema.wake import Wake
+from lidar_mi.experiment.truth.flows import Flows, mean_flow
+from lidar_mi.instrument.scan import ScanPlan
 
 LARGEST_STEP = 0.25
 """Node spacings by which air moves from one state to the next, at most.
@@ -22,12 +20,10 @@ Between states the renderer is linear in time. A wave of 4 nodes, the shortest t
 is then displaced by 0.63 * 0.25^3 / 4^2 = 0.0006 nodes at most, and its amplitude is 2 % smaller
 half way between two states.
 """
-MOST_VALUES = 2.5e8  # of all states of a scan: 1 GB in the renderer
+MOST_VALUES = 2.5e8  # values of all states of a scan: 1 GB in the renderer
 
 
-def state_times(
-    wake: Wake, scan: Scan, volume: Volume | None, flows: Flows, times: np.ndarray
-) -> np.ndarray:
+def state_times(observation: Observation, flows: Flows, times: np.ndarray) -> np.ndarray:
     """Equally spaced times, s, at which the air is computed for beams at ``times``.
 
     The middle one is that of the middle of the scan.
@@ -41,7 +37,7 @@ def state_times(
     first, last = float(np.min(times)), float(np.max(times))
     if first == last:
         return np.array([first])
-    moved = (last - first) * _speed_in_nodes(flow, _along(wake, scan, volume, flow))
+    moved = (last - first) * _speed_in_nodes(flow, _along(observation, flow))
     # an odd number
     count = 2 * max(2, math.ceil(moved / LARGEST_STEP / 2)) + 1
     values = count * flow["v"].size
@@ -54,9 +50,7 @@ def state_times(
     return np.linspace(first, last, count)
 
 
-def values_of_states(
-    wake: Wake, scan: Scan, volume: Volume | None, flows: Flows, plans: Sequence[ScanPlan]
-) -> int:
+def values_of_states(observation: Observation, flows: Flows, plans: Sequence[ScanPlan]) -> int:
     """Values of all states of the scan that has most; 0 where air is frozen or beams have one time.
 
     Raises
@@ -64,28 +58,20 @@ def values_of_states(
     InputError
         As of `state_times`.
     """
-    if scan.air != "moving":
+    if observation.scan.air != "moving":
         return 0
     timed = [plan.beams.time for plan in plans if plan.beams is not None]
-    counts = [state_times(wake, scan, volume, flows, times).size for times in timed]
+    counts = [state_times(observation, flows, times).size for times in timed]
     return max(counts, default=0) * flows[0]["v"].size
 
 
 def air_in_time(
-    wake: Wake,
-    platform: Platform,
-    scan: Scan,
-    volume: Volume | None,
-    truth: Truth,
-    flows: Flows,
-    which: int,
-    times: np.ndarray,
+    observation: Observation, truth: Truth, flows: Flows, which: int, times: np.ndarray
 ) -> xr.DataArray:
     """The extinction of scan ``which`` at the times of its beams, m^-1, dims (time, x, y, z).
 
-    The truth of the scan's reference time, advected by the same flow as the air from t1 to t2. Of a
-    wake with a state at t2, between both times, the mean of both states advected to the time, each
-    weighted with its nearness.
+    The truth of the scan's reference time, advected by the same flow as the air from t1 to t2. With
+    a stored state at t2, the mean of both states advected to the time, weighted linearly in time.
 
     Parameters
     ----------
@@ -104,10 +90,10 @@ def air_in_time(
     """
     if all(float(field.min()) == float(field.max()) for field in truth.extinction):
         return truth.extinction[which]
-    flow, dt = mean_flow(flows), platform.dt
-    u = _along(wake, scan, volume, flow)
+    flow, dt = mean_flow(flows), observation.platform.dt
+    u = _along(observation, flow)
     molecules = truth.molecules
-    taus = state_times(wake, scan, volume, flows, times)
+    taus = state_times(observation, flows, times)
 
     def advected(state: int) -> xr.DataArray:
         # molecules are everywhere, and no undershoot of a spline may remove them
@@ -118,13 +104,13 @@ def air_in_time(
 
     if flows[1] is None:
         return advected(which)
-    nearness = xr.DataArray(np.clip((taus + which * dt) / dt, 0, 1), {"time": taus}, "time")
-    return ((1 - nearness) * advected(0) + nearness * advected(1)).astype(np.float32)
+    weight = xr.DataArray(np.clip((taus + which * dt) / dt, 0, 1), {"time": taus}, "time")
+    return ((1 - weight) * advected(0) + weight * advected(1)).astype(np.float32)
 
 
-def _along(wake: Wake, scan: Scan, volume: Volume | None, flow: xr.Dataset) -> xr.DataArray | None:
+def _along(observation: Observation, flow: xr.Dataset) -> xr.DataArray | None:
     """Speed of the air along x in the frame of the gates, m/s; None: it is uniform along x."""
-    return flow["u"] - scan.follow if moves_along(wake, volume) else None
+    return flow["u"] - observation.scan.follow if observation.moves_along else None
 
 
 def _speed_in_nodes(flow: xr.Dataset, u: xr.DataArray | None) -> float:

@@ -42,7 +42,7 @@ class MeanWind:
         return self.along + math.cos(towards) * speed, self.left + math.sin(towards) * speed
 
     def to_the_left(self, height: np.ndarray) -> np.ndarray:
-        """The second alone."""
+        """The component to the left alone."""
         return self.at(height)[1]
 
 
@@ -93,8 +93,8 @@ class PassingWake:
         u, v = self.mean.at(z)
         w = np.zeros_like(z)
         if isinstance(self.wake, PairAboveGround):
-            found = self.wake.wind(y, z, time)
-            v, w = v + found[0], w + found[1]
+            swirl = self.wake.wind(y, z, time)
+            v, w = v + swirl[0], w + swirl[1]
         elif self.wake is not None:
             of_wake = self.wake.wind(x, y, z, time)
             u, v, w = u + of_wake[0], v + of_wake[1], w + of_wake[2]
@@ -126,17 +126,17 @@ def passing_wake(
     """
     passage, air = doppler.passage, doppler.air
     mean = _mean(air)
-    found: PairAboveGround | VolumeAlongPath | None = None
+    passing: PairAboveGround | VolumeAlongPath | None = None
     if wake is not None and wake.vortex_pair is not None:
-        found = _pair(wake.vortex_pair, passage, mean, last)
+        passing = _pair(wake.vortex_pair, passage, mean, last)
     elif wake is not None:
-        found = _plane(wake, passage, mean, search_path)
+        passing = _plane(wake, passage, mean, search_path)
     gusts = (
         None
         if air.turbulence is None
         else turbulent_air(air.turbulence, passage.height, seed, "doppler.air")
     )
-    return PassingWake(found, mean, gusts, passage.height, passage.heading, doppler.position)
+    return PassingWake(passing, mean, gusts, passage.height, passage.heading, doppler.position)
 
 
 def echo(doppler: CoherentDoppler, wake: Wake | None, air: PassingWake) -> Signal | None:
@@ -168,10 +168,10 @@ def echo(doppler: CoherentDoppler, wake: Wake | None, air: PassingWake) -> Signa
 
 
 def _mean(air: AirAtTheGround) -> MeanWind:
-    layer, given = None, air.logarithmic_shear
-    if given is not None:
+    layer, shear = None, air.logarithmic_shear
+    if shear is not None:
         layer = LogarithmicShear(
-            given.speed, given.reference, given.roughness, given.towards, given.reference
+            shear.speed, shear.reference, shear.roughness, shear.towards, shear.reference
         )
     return MeanWind(*air.wind, layer)
 
@@ -212,9 +212,9 @@ def _plane(wake: Wake, passage: Passage, mean: MeanWind, search_path: Path) -> V
     path = find_file(wake.file, search_path, "wake.file")
     flow = with_extinction(read_planes(path, wake), wake)
     (port, starboard), (v, w) = pairs_in(flow, path.name)
-    own_y, own_z = wake.centre or (
-        float(np.mean([one.y for one in (*port, *starboard)])),
-        float(np.mean([one.z for one in (*port, *starboard)])),
+    centre_y, centre_z = wake.centre or (
+        float(np.mean([vortex.y for vortex in (*port, *starboard)])),
+        float(np.mean([vortex.z for vortex in (*port, *starboard)])),
     )
     return VolumeAlongPath(
         flow,
@@ -222,6 +222,6 @@ def _plane(wake: Wake, passage: Passage, mean: MeanWind, search_path: Path) -> V
         starboard,
         background=wake.extinction.background,
         drift=(v + float(mean.to_the_left(np.array(passage.height))), w),
-        origin=(float(flow["x"][0]), own_y, own_z),
+        origin=(float(flow["x"][0]), centre_y, centre_z),
         miss=(0.0, passage.height),
     )

@@ -53,9 +53,9 @@ def wake_along_path(experiment: Experiment) -> WakeAlongPath:
     if wake is not None and wake.file:
         return _from_file(wake, wake.file, encounter, experiment.folder)
     if wake is None or wake.vortex_pair is None:
-        found = "nothing" if wake is None else "turbine"
+        source = "nothing" if wake is None else "turbine"
         raise InputError(
-            f"wake: {found} is not allowed in an encounter, as it is not known along the wake's "
+            f"wake: {source} is not allowed in an encounter, as it is not known along the wake's "
             "axis; expected wake.vortex_pair or wake.file"
         )
     return analytic_wake(wake.vortex_pair, encounter)
@@ -88,8 +88,8 @@ def _from_file(wake: Wake, file: str, encounter: Encounter, folder: Path) -> Vol
         },
     )
     flow, (port, starboard), drift, _ = _period_of(wake, file, encounter, folder)
-    both = [*port, *starboard]
-    middle = np.mean([one.y for one in both]), np.mean([one.z for one in both])
+    vortices = [*port, *starboard]
+    middle = np.mean([vortex.y for vortex in vortices]), np.mean([vortex.z for vortex in vortices])
     y, z = wake.centre or middle
     x = wake.x if wake.x is not None and wake.depth == "volume" else float(flow["x"].mean())
     nominal = encounter.path
@@ -112,7 +112,7 @@ def _period_of(
     wake: Wake, file: str, encounter: Encounter, folder: Path
 ) -> tuple[xr.Dataset, Pairs, tuple[float, float], Closing]:
     path = find_file(file, folder, "wake.file")
-    # its time of change: a file that is written anew is read anew
+    # the modification time: a changed file is read again
     stamp, ends = path.stat().st_mtime_ns, encounter.wake
     return _volume(path, stamp, wake.model_dump_json(), ends.ends, ends.ends_length)
 
@@ -141,16 +141,16 @@ def described_wake(experiment: Experiment) -> list[tuple[str, str]]:
     text = f"{closing.how}: a period of {closing.period:.4g} m, repeated"
     rows.append(("wake along its axis", text))
     if closing.changed:
-        # a mirror leaves the flow in the planes across the axis
-        kept = "as in the file"
+        # a mirror does not change the flow in planes across the axis
+        change = "as in the file"
         if closing.how == "blend":
             changed = np.isin(np.arange(len(strength[0])), closing.changed)
-            ratios = [float(one[changed].mean() / one[~changed].mean()) for one in strength]
-            kept = f"{max(abs(ratio - 1) for ratio in ratios):.1%} off that elsewhere"
+            ratios = [float(gamma[changed].mean() / gamma[~changed].mean()) for gamma in strength]
+            change = f"{max(abs(ratio - 1) for ratio in ratios):.1%} off that elsewhere"
         text = (
             f"changed over {encounter.wake.ends_length:g} m: divergence {closing.divergence:.2g} "
             f"of the gradients there ({closing.divergence_before:.2g} in the file), circulation "
-            f"{kept}"
+            f"{change}"
         )
         rows.append(("ends of the volume", text))
     return rows

@@ -62,21 +62,21 @@ def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
     except Exception as error:  # any exception of the parser
         raise InputError(f"{path}: not a table ({error}); expected a head and rows") from None
     heads = [_HEAD.fullmatch(str(name)) for name in table.columns]
-    there = {head[1]: (k, head[2]) for k, head in enumerate(heads) if head}
+    units_of = {head[1]: (k, head[2]) for k, head in enumerate(heads) if head}
     columns: dict[str, np.ndarray] = {}
     remarks: list[str] = []
     for ours, unit in _UNITS.items():
         theirs = names.get(ours, ours).lstrip("+-").strip()
-        if theirs not in there:
+        if theirs not in units_of:
             if ours in _REQUIRED or ours in names:
                 raise InputError(
-                    f"{path}: column {theirs!r} ({ours}) is missing; it has {listed(list(there))}; "
-                    f"expected names: {{{ours}: its name there}}"
+                    f"{path}: column {theirs!r} ({ours}) is missing; it has "
+                    f"{listed(list(units_of))}; expected names: {{{ours}: its name there}}"
                 )
             continue
-        index, given = there[theirs]
-        columns[ours], more = _values(table.iloc[:, index], ours, given, unit, path)
-        remarks += more
+        index, theirs_unit = units_of[theirs]
+        columns[ours], more_remarks = _values(table.iloc[:, index], ours, theirs_unit, unit, path)
+        remarks += more_remarks
     if not len(table):
         raise InputError(f"{path}: no row below the head; expected one or more")
     sign = names.get("radial_velocity", "")

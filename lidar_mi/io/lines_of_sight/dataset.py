@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.lines_of_sight.flags import LineFlag
+from lidar_mi.flags import LineFlag, flag_attributes
 from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, PLACE, Scan
 
 _SAME_PLACE = 0.01  # degrees: of one lidar, rounded differently from file to file
@@ -54,17 +54,10 @@ def assembled(
             data[name] = ("time", "range"), full[order], _attributes(name, unit, long_name)
     flag = np.full((sum(lines), ranges.size), LineFlag.MISSING.value, np.uint16)
     _fill(flag, [flags for _, _, flags in scans], gates, lines)
-    masks = np.array([one.value for one in LineFlag], np.uint16)
     data["flag"] = (
         ("time", "range"),
         flag[order],
-        {
-            "long_name": "reasons not to use the velocity, 0 = valid",
-            "standard_name": "quality_flag",
-            "flag_masks": masks,
-            "flag_values": masks,
-            "flag_meanings": " ".join(str(one.name).lower() for one in LineFlag),
-        },
+        flag_attributes(LineFlag, "reasons not to use the velocity"),
     )
     coords: dict[str, Any] = {
         "time": ("time", time[order], {"long_name": "time of the line (UTC)", "axis": "T"}),
@@ -75,10 +68,10 @@ def assembled(
         ),
     }
     for name, long_name in ANGLES.items():
-        there = [scan.angles.get(name) for _, scan, _ in scans]
-        if any(one is not None for one in there):
+        angles = [scan.angles.get(name) for _, scan, _ in scans]
+        if any(values is not None for values in angles):
             values = [
-                np.full(n, np.nan) if v is None else v for v, n in zip(there, lines, strict=True)
+                np.full(n, np.nan) if v is None else v for v, n in zip(angles, lines, strict=True)
             ]
             coords[name] = (
                 "time",
@@ -89,11 +82,11 @@ def assembled(
     coords["sweep"] = "time", sweep[order], {"units": "1", "long_name": "number of the scan"}
     for name, value in _place([scan for _, scan, _ in scans]).items():
         coords[name] = (), value, _attributes(name, *PLACE[name])
-    found = xr.Dataset(data, coords, _about(scans) | thresholds)
-    found.attrs["scan"] = scan_kind(coords["azimuth"][1], coords["elevation"][1])
-    found.attrs["remarks"] = "\n".join(remarks + _about_values(found))
-    found["time"].encoding |= {"units": "seconds since 1970-01-01T00:00:00", "dtype": "float64"}
-    return found
+    dataset = xr.Dataset(data, coords, _about(scans) | thresholds)
+    dataset.attrs["scan"] = scan_kind(coords["azimuth"][1], coords["elevation"][1])
+    dataset.attrs["remarks"] = "\n".join(remarks + _about_values(dataset))
+    dataset["time"].encoding |= {"units": "seconds since 1970-01-01T00:00:00", "dtype": "float64"}
+    return dataset
 
 
 def scan_kind(azimuth: np.ndarray, elevation: np.ndarray) -> str:
@@ -137,9 +130,9 @@ def _common_ranges(scans: Sequence[Scan]) -> np.ndarray:
 
 def _gates(ranges: np.ndarray, common: np.ndarray) -> np.ndarray:
     """Index of every gate on the common ranges; -1: no such gate."""
-    known = np.isfinite(ranges)
-    nearest = np.searchsorted(common, np.where(known, ranges, common[0]) - _CENTIMETRE)
-    return np.where(known, np.minimum(nearest, common.size - 1), -1)
+    finite = np.isfinite(ranges)
+    nearest = np.searchsorted(common, np.where(finite, ranges, common[0]) - _CENTIMETRE)
+    return np.where(finite, np.minimum(nearest, common.size - 1), -1)
 
 
 def _fill(
@@ -165,27 +158,27 @@ def _attributes(name: str, unit: str, long_name: str) -> dict[str, str]:
 
 def _place(scans: Sequence[Scan]) -> dict[str, float]:
     """Where the lidar is, which must be one place."""
-    found: dict[str, float] = {}
+    place: dict[str, float] = {}
     for scan in scans:
         for name, value in scan.place.items():
-            first = found.setdefault(name, value)
+            first = place.setdefault(name, value)
             if name != "altitude" and abs(value - first) > _SAME_PLACE:
                 raise InputError(
                     f"{name}: {first:g} and {value:g} degrees; expected files of one lidar "
                     "at one place"
                 )
-    return found
+    return place
 
 
 def _about(scans: Sequence[tuple[str, Scan, np.ndarray]]) -> dict[str, str | float]:
     """Attributes that all scans share; of those that differ, all values as text."""
-    found: dict[str, str | float] = {"Conventions": "CF-1.11", "title": "Lines of sight"}
+    attributes: dict[str, str | float] = {"Conventions": "CF-1.11", "title": "Lines of sight"}
     for key in dict.fromkeys(key for _, scan, _ in scans for key in scan.about):
         values = list(dict.fromkeys(s.about[key] for _, s, _ in scans if key in s.about))
-        found[key] = values[0] if len(values) == 1 else ", ".join(map(str, values))
-    found["source"] = ", ".join(dict.fromkeys(name for name, _, _ in scans))
-    found["history"] = f"read by lidar-mi from {found['source']}"
-    return found
+        attributes[key] = values[0] if len(values) == 1 else ", ".join(map(str, values))
+    attributes["source"] = ", ".join(dict.fromkeys(name for name, _, _ in scans))
+    attributes["history"] = f"read by lidar-mi from {attributes['source']}"
+    return attributes
 
 
 def _about_times(scans: Sequence[tuple[str, Scan, np.ndarray]], back: int) -> list[str]:
@@ -197,7 +190,11 @@ def _about_times(scans: Sequence[tuple[str, Scan, np.ndarray]], back: int) -> li
     elif back:
         remarks.append("the scans are not in the order of time; lines are sorted by time")
     spans = sorted((s.time.min(), s.time.max(), name) for name, s, _ in scans)
-    overlaps = [f"{one[2]} and {other[2]}" for one, other in pairwise(spans) if other[0] < one[1]]
+    overlaps = [
+        f"{earlier[2]} and {later[2]}"
+        for earlier, later in pairwise(spans)
+        if later[0] < earlier[1]
+    ]
     if overlaps:
         remarks.append(f"scans overlap in time: {', '.join(overlaps[:3])}; all lines are kept")
     keys = [
@@ -210,10 +207,10 @@ def _about_times(scans: Sequence[tuple[str, Scan, np.ndarray]], back: int) -> li
     return remarks
 
 
-def _about_values(found: xr.Dataset) -> list[str]:
+def _about_values(lines: xr.Dataset) -> list[str]:
     """Remarks on gates without any value."""
-    empty = ~np.isfinite(found["radial_velocity"].values).any(0)
+    empty = ~np.isfinite(lines["radial_velocity"].values).any(0)
     if not empty.any():
         return []
-    where = found["range"].values[empty]
+    where = lines["range"].values[empty]
     return [f"{int(empty.sum())} gates, {where[0]:g} to {where[-1]:g} m, have no value in any line"]

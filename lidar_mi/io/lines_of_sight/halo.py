@@ -25,7 +25,7 @@ _LARGEST_GATES = 100_000
 
 
 def read_halo(path: Path) -> Scan:
-    """The rays of a file, as many as there are, whatever the header promises.
+    """All rays of a file, whatever number the header states.
 
     Gates are adjacent, (gate + 1/2) gate lengths away, but for scans that are called overlapping:
     these begin at every sample, gate length over points apart.
@@ -53,7 +53,7 @@ def read_halo(path: Path) -> Scan:
         remarks.insert(0, f"the header promises {promised} rays, the file has {len(rays)}")
     columns = dict(zip(_COLUMNS, np.moveaxis(values, -1, 0), strict=True))
     columns["snr"] = columns["snr"] - 1.0
-    columns = {name: found for name, found in columns.items() if np.isfinite(found).any()}
+    columns = {name: column for name, column in columns.items() if np.isfinite(column).any()}
     columns.setdefault("radial_velocity", np.full(values.shape[:2], np.nan))
     angles = {"azimuth": rays[:, 1], "elevation": rays[:, 2]}
     if np.isfinite(rays[:, 3:]).all():
@@ -85,15 +85,15 @@ def read_halo(path: Path) -> Scan:
 
 def _parts(text: str, path: Path) -> tuple[dict[str, str], list[str]]:
     """Names and values of the header, and the lines below it."""
-    found = re.search(r"^\*{4}(.*)$", text, re.MULTILINE)
-    if not found or found.start() > 20_000:
+    stars = re.search(r"^\*{4}(.*)$", text, re.MULTILINE)
+    if not stars or stars.start() > 20_000:
         raise InputError(f"{path}: has no line that begins with ****; expected {_KIND}, whole")
     head = {}
-    for line in [*text[: found.start()].splitlines(), found[1]]:
+    for line in [*text[: stars.start()].splitlines(), stars[1]]:
         name, sign, value = line.partition("=" if "spectral width =" in line else ":")
         if sign:
             head[name.strip()] = value.strip()
-    return head, text[found.end() :].splitlines()
+    return head, text[stars.end() :].splitlines()
 
 
 def _number(head: dict[str, str], name: str, path: Path) -> float:
@@ -123,7 +123,7 @@ def _start(head: dict[str, str], path: Path) -> datetime:
 
 
 def _times(hours: np.ndarray, start: datetime) -> np.ndarray:
-    """Times of decimal hours, which begin again at midnight: a step back by half a day is one."""
+    """Times of decimal hours, which restart at midnight: a step back by more than half a day."""
     midnight = datetime(start.year, start.month, start.day)
     first = (start - midnight).total_seconds() / 3600
     days = np.cumsum(np.diff(hours, prepend=first) < -12)
@@ -137,21 +137,21 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
     starts = [k for k, line in enumerate(lines) if not line.split(None, 1)[0].isdigit()]
     if not starts:
         raise InputError(f"{path}: has no ray below its header; expected one or more")
-    lost = starts[0]
-    rays, values, odd = [], [], 0
+    stray = starts[0]
+    rays, values, invalid = [], [], 0
     partial: list[int] = []
     for begin, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         ray = _floats([lines[begin].split()], 5)
         if not np.isfinite(ray[0, :3]).all():
-            lost += end - begin
+            stray += end - begin
             continue
         number, table = _gates(lines[begin + 1 : end])
         inside = number < gates
-        odd += int((~inside).sum()) + int((~np.isfinite(table[:, :2])).any(1).sum())
-        one = np.full((gates, 4), np.nan)
-        one[number[inside]] = table[inside]
+        invalid += int((~inside).sum()) + int((~np.isfinite(table[:, :2])).any(1).sum())
+        ray_values = np.full((gates, 4), np.nan)
+        ray_values[number[inside]] = table[inside]
         rays.append(ray[0])
-        values.append(one)
+        values.append(ray_values)
         if len(set(number[inside].tolist())) < gates:
             partial.append(len(rays))
     if not rays:
@@ -162,10 +162,10 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
             f"{len(partial)} of {len(rays)} rays have fewer than {gates} gates, ray {partial[0]} "
             "the first: what is missing is flagged"
         )
-    if odd:
-        remarks.append(f"{odd} gates are no numbers or beyond the {gates} of the header")
-    if lost:
-        remarks.append(f"{lost} lines belong to no ray with a time and two angles")
+    if invalid:
+        remarks.append(f"{invalid} gates are no numbers or beyond the {gates} of the header")
+    if stray:
+        remarks.append(f"{stray} lines belong to no ray with a time and two angles")
     return np.array(rays), np.array(values), remarks
 
 
@@ -173,22 +173,22 @@ def _gates(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of gates (n,) and their values (n, 4), NaN where there is none."""
     width = len(lines[0].split()) if lines else 0
     if width in (4, 5):
-        found = _numbers_of(" ".join(lines))
-        if found.size == width * len(lines):
-            found = found.reshape(-1, width)
-            if np.array_equal(found[:, 0], np.arange(len(lines))):
+        numbers = _numbers_of(" ".join(lines))
+        if numbers.size == width * len(lines):
+            numbers = numbers.reshape(-1, width)
+            if np.array_equal(numbers[:, 0], np.arange(len(lines))):
                 table = np.full((len(lines), 4), np.nan)
-                table[:, : width - 1] = found[:, 1:]
+                table[:, : width - 1] = numbers[:, 1:]
                 return np.arange(len(lines)), table
     words = [line.split() for line in lines]
-    words = [one for one in words if len(one[0]) < 9]
-    return np.array([int(one[0]) for one in words], int), _floats([one[1:] for one in words], 4)
+    words = [row for row in words if len(row[0]) < 9]
+    return np.array([int(row[0]) for row in words], int), _floats([row[1:] for row in words], 4)
 
 
 def _numbers_of(text: str) -> np.ndarray:
     """Numbers of a text, (n,); none if there is a word that is no number."""
     with warnings.catch_warnings():
-        # by the version of numpy, what is no number ends the reading or is an error
+        # by the version of numpy, a word that is no number ends the reading or is an error
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
             return np.fromstring(text, sep=" ")
@@ -198,17 +198,17 @@ def _numbers_of(text: str) -> np.ndarray:
 
 def _floats(rows: list[list[str]], width: int) -> np.ndarray:
     """Numbers of rows, (rows, width): NaN where a row is shorter or has no number."""
-    found = np.full((len(rows), width), np.nan)
+    numbers = np.full((len(rows), width), np.nan)
     size = min(width, min(map(len, rows), default=0))
     try:
-        found[:, :size] = np.array([row[:size] for row in rows], float).reshape(len(rows), size)
+        numbers[:, :size] = np.array([row[:size] for row in rows], float).reshape(len(rows), size)
         tails = [(k, row) for k, row in enumerate(rows) if len(row) > size]
     except ValueError:
         size, tails = 0, list(enumerate(rows))
     for k, row in tails if size < width else ():
         for column, word in enumerate(row[size:width], size):
             try:
-                found[k, column] = float(word)
+                numbers[k, column] = float(word)
             except ValueError:
                 continue
-    return found
+    return numbers

@@ -57,10 +57,10 @@ NAMES = {
 """Ours, and those of the makers in lower case, the most telling first."""
 
 _UNITS = {name: unit for name, (unit, _) in FIELDS.items()} | {"range": "m", "altitude": "m"}
-_EARTH = 6.371e6  # m, mean radius
-_MOVED = 100.0  # m, within a scan: more than receivers of satellites are off
+_EARTH_RADIUS = 6.371e6  # m, mean radius
+_MOVED = 100.0  # m, within a scan: more than the error of satellite navigation
 _WORDS = ("long_name", "comment", "description", "note", "sign_convention", "positive")
-_NEVER = -9999.0  # ARM's missing value, which not every file declares
+_ARM_MISSING = -9999.0  # ARM's missing value, which not every file declares
 _KINDS = (
     ("datastream", "sgp", "ARM"),
     ("dod_version", "dl", "ARM"),
@@ -74,9 +74,9 @@ def is_lines(path: Path) -> bool:
     with open_netcdf(path) as data:
         if "sweep_group_name" in data.variables:
             return True
-        found = _found(data, {})
-        return {"azimuth", "elevation", "range", "radial_velocity"} <= set(found) and (
-            data[found["radial_velocity"]].ndim > 1
+        theirs = _file_names(data, {})
+        return {"azimuth", "elevation", "range", "radial_velocity"} <= set(theirs) and (
+            data[theirs["radial_velocity"]].ndim > 1
         )
 
 
@@ -111,8 +111,8 @@ def read_netcdf_lines(path: Path, names: Mapping[str, str]) -> list[Scan]:
             more = {"scan_type": mode} if mode else {}
             with open_netcdf(path) as root:
                 reference = _word(data, "time_reference") or _word(root, "time_reference")
-            own = place | _place(data, names, path)
-            scans += _flat(data, names, about | more, own, path, reference)
+            sweep_place = place | _place(data, names, path)
+            scans += _flat(data, names, about | more, sweep_place, path, reference)
     if not scans:
         raise InputError(f"{path}: no sweep has a line of sight; it has {listed(sweeps)}")
     if empty:
@@ -121,12 +121,14 @@ def read_netcdf_lines(path: Path, names: Mapping[str, str]) -> list[Scan]:
 
 
 def _sweep_names(root: xr.Dataset, path: Path) -> list[str]:
-    """Groups of the sweeps; none: the variables are in the file itself."""
-    there = groups(path)
+    """Groups of the sweeps; empty: the variables are in the root group."""
+    present = groups(path)
     if "sweep_group_name" in root.variables:
-        given = [as_text(one) for one in np.ravel(load_variable(root["sweep_group_name"], path))]
-        return [name for name in given if name in there]
-    return sorted(name for name in there if name.lower().startswith("sweep"))
+        listed_names = [
+            as_text(word) for word in np.ravel(load_variable(root["sweep_group_name"], path))
+        ]
+        return [name for name in listed_names if name in present]
+    return sorted(name for name in present if name.lower().startswith("sweep"))
 
 
 def _about(root: xr.Dataset, path: Path) -> dict[str, str | float]:
@@ -137,7 +139,7 @@ def _about(root: xr.Dataset, path: Path) -> dict[str, str | float]:
         kind = "CfRadial 2" if groups(path) else "CfRadial 1"
     about: dict[str, str | float] = {"kind": kind or "NetCDF"}
     if texts.get("tilt"):
-        about["tilt"] = texts["tilt"]  # of a data set that was written
+        about["tilt"] = texts["tilt"]  # of a data set written by lidar-mi
     for ours, theirs in (
         ("instrument", "instrument_name"),
         ("instrument", "serial_number"),
@@ -171,51 +173,55 @@ def _word(data: xr.Dataset, name: str) -> str:
     return as_text(values if values.dtype.kind == "S" and values.itemsize == 1 else values.flat[0])
 
 
-def _found(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
-    """Ours to the file's name of every variable that is there."""
+def _file_names(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
+    """Our name -> the file's, of every variable in the file."""
     lower = {str(name).lower(): str(name) for name in reversed(list(data.variables))}
     standard = {str(v.attrs.get("standard_name", "")): str(n) for n, v in data.variables.items()}
-    found = {}
-    for ours, known in NAMES.items():
+    file_names = {}
+    for ours, candidates in NAMES.items():
         if ours in names:
-            found[ours] = names[ours].lstrip("+-").strip()
+            file_names[ours] = names[ours].lstrip("+-").strip()
             continue
-        theirs = next((lower[name] for name in known if name in lower), None)
+        theirs = next((lower[name] for name in candidates if name in lower), None)
         if ours == "radial_velocity":
             theirs = standard.get(AWAY) or standard.get(TOWARD) or theirs
         if theirs is not None:
-            found[ours] = theirs
-    return found
+            file_names[ours] = theirs
+    return file_names
 
 
 def _place(data: xr.Dataset, names: Mapping[str, str], path: Path) -> dict[str, float]:
     """Latitude, longitude and altitude: of a moving platform the first."""
-    found = _found(data, names)
+    file_names = _file_names(data, names)
     place = {}
     for name in ("latitude", "longitude", "altitude"):
-        if found.get(name) in data.variables and data[found[name]].size:
-            place[name] = float(_numbers(data[found[name]], name, path).flat[0])
+        if file_names.get(name) in data.variables and data[file_names[name]].size:
+            place[name] = float(_numbers(data[file_names[name]], name, path).flat[0])
     return {name: value for name, value in place.items() if np.isfinite(value)}
 
 
 def _moving(data: xr.Dataset, names: Mapping[str, str], time: np.ndarray, path: Path) -> list[str]:
     """A remark on a platform that moves, whose speed is in the velocities."""
-    found = _found(data, names)
-    there = [found.get(name) for name in ("latitude", "longitude")]
-    if any(one not in data.variables or data[one].size != time.size for one in there):
+    file_names = _file_names(data, names)
+    coordinates = [file_names.get(name) for name in ("latitude", "longitude")]
+    if any(
+        theirs not in data.variables or data[theirs].size != time.size for theirs in coordinates
+    ):
         return []
-    latitude, longitude = (np.deg2rad(np.ravel(_numbers(data[one], "", path))) for one in there)
-    known = np.flatnonzero(np.isfinite(latitude) & np.isfinite(longitude))
-    if known.size < 2:
+    latitude, longitude = (
+        np.deg2rad(np.ravel(_numbers(data[theirs], "", path))) for theirs in coordinates
+    )
+    finite = np.flatnonzero(np.isfinite(latitude) & np.isfinite(longitude))
+    if finite.size < 2:
         return []
-    north = _EARTH * (latitude[known] - latitude[known[0]])
-    east = _EARTH * np.cos(latitude[known]) * (longitude[known] - longitude[known[0]])
-    way = float(np.hypot(np.ptp(north), np.ptp(east)))
-    seconds = float((time[known[-1]] - time[known[0]]) / np.timedelta64(1, "s"))
-    if way < _MOVED or seconds <= 0:
+    north = _EARTH_RADIUS * (latitude[finite] - latitude[finite[0]])
+    east = _EARTH_RADIUS * np.cos(latitude[finite]) * (longitude[finite] - longitude[finite[0]])
+    distance = float(np.hypot(np.ptp(north), np.ptp(east)))
+    seconds = float((time[finite[-1]] - time[finite[0]]) / np.timedelta64(1, "s"))
+    if distance < _MOVED or seconds <= 0:
         return []
     return [
-        f"the lidar moves by {way:.0f} m ({np.hypot(north[-1], east[-1]) / seconds:.2g} m/s): "
+        f"the lidar moves by {distance:.0f} m ({np.hypot(north[-1], east[-1]) / seconds:.2g} m/s): "
         "winds are off by its velocity unless that was subtracted, and of the place in the middle "
         "of the scan"
     ]
@@ -226,23 +232,23 @@ def _numbers(variable: xr.DataArray, ours: str, path: Path) -> np.ndarray:
     if variable.dtype.kind not in "iuf":
         raise InputError(f"{path}: {variable.name}: {variable.dtype} is not allowed; numbers are")
     limits = {k: v for k, v in variable.attrs.items() if not k.startswith("valid_")}
-    bare = variable.copy()
-    bare.attrs = limits
-    values = load_variable(bare, path).values.astype(float)
-    values = np.where(values == _NEVER, np.nan, values)
+    unlimited = variable.copy()
+    unlimited.attrs = limits
+    values = load_variable(unlimited, path).values.astype(float)
+    values = np.where(values == _ARM_MISSING, np.nan, values)
     unit = str(variable.attrs.get("units", "")).strip()
     if ours == "snr":
         return values
-    wanted = "degree" if ours in ANGLES else _UNITS.get(ours)
-    if wanted is None or unit.lower() in ("", "unitless", "none", "1"):
+    target = "degree" if ours in ANGLES else _UNITS.get(ours)
+    if target is None or unit.lower() in ("", "unitless", "none", "1"):
         return values
     try:
-        return values * conversion(unit.replace("/(m sr)", "/m/sr"), wanted)
+        return values * conversion(unit.replace("/(m sr)", "/m/sr"), target)
     except ValueError:
         if ours == "attenuated_backscatter":
             return values  # relative ones are in units of their own
         raise InputError(
-            f"{path}: {variable.name} has the unit {unit!r}; allowed: {wanted} or a unit that "
+            f"{path}: {variable.name} has the unit {unit!r}; allowed: {target} or a unit that "
             "converts to it"
         ) from None
 
@@ -274,34 +280,34 @@ def _flat(
     path: Path,
     reference: str = "",
 ) -> list[Scan]:
-    """The lines of a file or group, apart by its sweeps."""
-    found = _found(data, names)
+    """The lines of a file or group, a scan for each of its sweeps."""
+    file_names = _file_names(data, names)
     for ours in ("time", "azimuth", "elevation", "range", "radial_velocity"):
-        if found.get(ours) not in data.variables:
-            theirs = f" ({found[ours]})" if ours in found else ""
-            there = listed(list(map(str, data.variables)))
+        if file_names.get(ours) not in data.variables:
+            theirs = f" ({file_names[ours]})" if ours in file_names else ""
+            present = listed(list(map(str, data.variables)))
             raise InputError(
-                f"{path}: {ours}{theirs} is missing; it has {there}; "
+                f"{path}: {ours}{theirs} is missing; it has {present}; "
                 f"expected names: {{{ours}: its name there}}"
             )
-    velocity = data[found["radial_velocity"]]
-    line = str(data[found["time"]].dims[0]) if data[found["time"]].ndim else ""
+    velocity = data[file_names["radial_velocity"]]
+    line = str(data[file_names["time"]].dims[0]) if data[file_names["time"]].ndim else ""
     if line not in velocity.dims and velocity.dims != ("n_points",):
         raise InputError(
             f"{path}: {velocity.name} has the dimensions {tuple(velocity.dims)}; expected those of "
-            f"{found['time']} and {found['range']}"
+            f"{file_names['time']} and {file_names['range']}"
         )
     lines = data.sizes[line]
     ragged = _Ragged.of(data, path) if velocity.dims == ("n_points",) else None
     fields = {}
     toward, remarks = _is_toward(velocity, names)
     for name in FIELDS:
-        if found.get(name) in data.variables and data[found[name]].dims == velocity.dims:
-            values = _numbers(data[found[name]], name, path)
+        if file_names.get(name) in data.variables and data[file_names[name]].dims == velocity.dims:
+            values = _numbers(data[file_names[name]], name, path)
             if name == "snr":
-                unit = str(data[found[name]].attrs.get("units", ""))
-                values, more = ratio_of_powers(values, unit, found[name])
-                remarks += more
+                unit = str(data[file_names[name]].attrs.get("units", ""))
+                values, more_remarks = ratio_of_powers(values, unit, file_names[name])
+                remarks += more_remarks
             if ragged is not None:
                 fields[name] = ragged.full(values)
             elif velocity.ndim == 2:
@@ -311,31 +317,33 @@ def _flat(
     if toward:
         fields["radial_velocity"] = -fields["radial_velocity"]
     gates = fields["radial_velocity"].shape[1]
-    ranges = _numbers(data[found["range"]], "range", path)
+    ranges = _numbers(data[file_names["range"]], "range", path)
     if ranges.shape == (lines,) and gates != lines:
         ranges = ranges[:, None]
     if ranges.ndim == 2 and (ranges == ranges[0]).all():
         ranges = ranges[0]
     if ranges.shape not in ((gates,), (lines, gates)):
         raise InputError(
-            f"{path}: {found['range']} has the shape {ranges.shape}; expected ({gates},) or "
+            f"{path}: {file_names['range']} has the shape {ranges.shape}; expected ({gates},) or "
             f"({lines}, {gates})"
         )
     angles = {}
     for name in ANGLES:
-        if found.get(name) in data.variables:
-            values = _numbers(data[found[name]], name, path)
+        if file_names.get(name) in data.variables:
+            values = _numbers(data[file_names[name]], name, path)
             angles[name] = np.broadcast_to(values, (lines,)).copy()
-    own: dict[str, Any] = dict(about)
+    attributes: dict[str, Any] = dict(about)
     for name in ("nyquist_velocity", "nyquist"):
         if name in data.variables and data[name].dtype.kind in "iuf":
             nyquist = np.unique(load_variable(data[name], path).values.astype(float))
             # lines of several pulse rates fold at several speeds
             if nyquist.size == 1 and nyquist[0] > 0:
-                own["nyquist_velocity"] = float(nyquist[0])
+                attributes["nyquist_velocity"] = float(nyquist[0])
     if "range_gate_length" in data.variables:
-        own["gate_length"] = float(np.ravel(load_variable(data["range_gate_length"], path))[0])
-    time, more = _times(data, found["time"], reference, path)
+        attributes["gate_length"] = float(
+            np.ravel(load_variable(data["range_gate_length"], path))[0]
+        )
+    time, more_remarks = _times(data, file_names["time"], reference, path)
     scan = Scan(
         time,
         angles,
@@ -343,10 +351,10 @@ def _flat(
         fields,
         dict(place),
         _rejected(data, velocity, path),
-        own,
-        remarks + more + _moving(data, names, time, path),
+        attributes,
+        remarks + more_remarks + _moving(data, names, time, path),
     )
-    return _apart(scan, data, path)
+    return _sweeps(scan, data, path)
 
 
 def _is_toward(velocity: xr.DataArray, names: Mapping[str, str]) -> tuple[bool, list[str]]:
@@ -359,16 +367,16 @@ def _is_toward(velocity: xr.DataArray, names: Mapping[str, str]) -> tuple[bool, 
     words = toward_in_words("; ".join(texts.values()))
     if words is None or words == standard or (standard is None and not words):
         return bool(standard), []
-    said = "; ".join(text for text in texts.values() if toward_in_words(text) is not None)
+    wording = "; ".join(text for text in texts.values() if toward_in_words(text) is not None)
     if standard is None:
         use = f"the sign is reversed (names: radial_velocity: '+{velocity.name}' retains it)"
     else:
-        other = "+" if standard else "-"
+        opposite = "+" if standard else "-"
         use = (
             "the standard name, which contradicts it, is used: which is right? (names: "
-            f"radial_velocity: '{other}{velocity.name}' for the words)"
+            f"radial_velocity: '{opposite}{velocity.name}' for the words)"
         )
-    return bool(words if standard is None else standard), [f"{velocity.name}: {said!r}: {use}"]
+    return bool(words if standard is None else standard), [f"{velocity.name}: {wording!r}: {use}"]
 
 
 def _rejected(data: xr.Dataset, velocity: xr.DataArray, path: Path) -> np.ndarray | None:
@@ -380,7 +388,7 @@ def _rejected(data: xr.Dataset, velocity: xr.DataArray, path: Path) -> np.ndarra
     return None
 
 
-def _apart(scan: Scan, data: xr.Dataset, path: Path) -> list[Scan]:
+def _sweeps(scan: Scan, data: xr.Dataset, path: Path) -> list[Scan]:
     """The sweeps of CfRadial 1, from their first and last rays."""
     edges = ("sweep_start_ray_index", "sweep_end_ray_index")
     if not set(edges) <= set(data.variables) or data.sizes.get("sweep", 1) < 2:
@@ -427,6 +435,6 @@ class _Ragged:
 
     def full(self, values: np.ndarray) -> np.ndarray:
         """Values (lines, gates), NaN behind the end of a ray."""
-        found = np.full(self.shape, np.nan)
-        found[self.rows[self.inside], self.columns[self.inside]] = values[self.index[self.inside]]
-        return found
+        table = np.full(self.shape, np.nan)
+        table[self.rows[self.inside], self.columns[self.inside]] = values[self.index[self.inside]]
+        return table

@@ -82,8 +82,8 @@ def read_lines_of_sight(
     >>> float(lines["radial_velocity"].sel(range=300.0)[0]), lines.attrs["scan"]
     (1.5, 'stare')
     """
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
-    if not given:
+    files = [paths] if isinstance(paths, str | Path) else list(paths)
+    if not files:
         raise InputError("paths: none is not allowed; expected files of lines of sight")
     for name in names or {}:
         if name not in NAMES:
@@ -92,15 +92,15 @@ def read_lines_of_sight(
         raise InputError(f"range_step: {range_step} m is not allowed; expected above 0 m")
     scans: list[tuple[str, Scan, np.ndarray]] = []
     thresholds: dict[str, float] = {}
-    for path in map(Path, given):
+    for path in map(Path, files):
         for scan in _scans(path, names or {}):
             if range_step is not None:
                 _step(scan, range_step)
             scan = check(scan, path)
             if range_step is None:
                 correct_steps(scan, min_cnr)
-            found, thresholds = flags(scan, min_cnr, blind_range)
-            scans.append((path.name, scan, found))
+            flag, thresholds = flags(scan, min_cnr, blind_range)
+            scans.append((path.name, scan, flag))
     return assembled(scans, thresholds)
 
 

@@ -68,7 +68,7 @@ class Scan:
 
 
 def check(scan: Scan, path: Path) -> Scan:
-    """A scan with angles in range and ranges in metres; what was changed is remarked.
+    """A scan with angles in range and ranges in metres; changes become remarks.
 
     Raises
     ------
@@ -77,19 +77,19 @@ def check(scan: Scan, path: Path) -> Scan:
         be kilometres.
     """
     lines = len(scan.time)
-    known = ~np.isnat(scan.time)
+    complete = ~np.isnat(scan.time)
     for name in ("azimuth", "elevation"):
-        known &= np.isfinite(scan.angles[name])
-    if not known.any():
+        complete &= np.isfinite(scan.angles[name])
+    if not complete.any():
         raise InputError(
             f"{path}: no line of sight, of {lines}, has a time, an azimuth and an elevation; "
             "expected one or more"
         )
-    if not known.all():
+    if not complete.all():
         # as while a scanner moves from one scan to the next
-        scan = part(scan, np.flatnonzero(known))
+        scan = part(scan, np.flatnonzero(complete))
         scan.remarks.append(
-            f"{lines - int(known.sum())} of {lines} lines have no time or direction"
+            f"{lines - int(complete.sum())} of {lines} lines have no time or direction"
         )
     _level(scan)
     _wrap(scan)
@@ -105,16 +105,16 @@ LEVEL = 0.02
 
 
 def _level(scan: Scan) -> None:
-    """Directions of the beam by the platform's pitch and roll, where their axes are known.
+    """Directions of the beam with pitch and roll of the platform, where their axes are known.
 
-    In tables azimuth and elevation are those of the platform, whose front is at azimuth 0: positive
-    pitch lifts it, positive roll lowers the right side. Of CfRadial they are those above the
-    horizon already. Makers do not document the axes of their sensors: a tilt is an error of what is
-    retrieved, which says so.
+    In tables, azimuth and elevation are relative to the platform, whose front is at azimuth 0:
+    positive pitch raises it, positive roll lowers the right side. In CfRadial files they are
+    relative to the horizon. Other makers do not document the axes of their tilt sensors: their tilt
+    is not applied, and retrievals report it.
     """
     kind = str(scan.about.get("kind", ""))
-    known = {"pitch", "roll"} <= set(scan.angles)
-    if not known or kind.startswith("CfRadial") or "tilt" in scan.about:
+    measured = {"pitch", "roll"} <= set(scan.angles)
+    if not measured or kind.startswith("CfRadial") or "tilt" in scan.about:
         return
     pitch, roll = (np.deg2rad(np.nan_to_num(scan.angles[name])) for name in ("pitch", "roll"))
     tilt = float(np.rad2deg(np.hypot(pitch, roll).max()))
@@ -132,11 +132,11 @@ def _level(scan: Scan) -> None:
         front * np.cos(pitch) - up * np.sin(pitch),
         front * np.sin(pitch) + up * np.cos(pitch),
     )
-    over = scan.angles["elevation"] > 90
+    beyond_zenith = scan.angles["elevation"] > 90
     slope = np.arctan2(up, np.hypot(right, front))
-    scan.angles["elevation"] = np.rad2deg(np.where(over, np.pi - slope, slope))
-    turn = np.arctan2(right, front) + np.where(over, np.pi, 0.0)
-    scan.angles["azimuth"] = np.rad2deg(turn)
+    scan.angles["elevation"] = np.rad2deg(np.where(beyond_zenith, np.pi - slope, slope))
+    rotated = np.arctan2(right, front) + np.where(beyond_zenith, np.pi, 0.0)
+    scan.angles["azimuth"] = np.rad2deg(rotated)
     scan.remarks.append(
         f"pitch and roll of up to {tilt:.2f} degrees are applied, with the front of the "
         "platform at azimuth 0"
@@ -158,7 +158,7 @@ def part(scan: Scan, lines: slice | np.ndarray) -> Scan:
 
 
 def _wrap(scan: Scan) -> None:
-    """Azimuths to 0 to 360, elevations to -180 to 180 degrees; 360 itself is not worth a word."""
+    """Azimuths to 0 to 360, elevations to -180 to 180 degrees; no remark on 360 itself."""
     azimuth, elevation = scan.angles["azimuth"], scan.angles["elevation"]
     for name, values, low, high in (
         ("azimuth", azimuth, -180.0, 360.0),
@@ -176,16 +176,16 @@ def _wrap(scan: Scan) -> None:
 
 
 def _check_ranges(ranges: np.ndarray, path: Path) -> None:
-    known = ranges[np.isfinite(ranges)]
-    if not known.size:
+    finite = ranges[np.isfinite(ranges)]
+    if not finite.size:
         raise InputError(f"{path}: range: no finite number; expected metres")
     steps = np.diff(ranges, axis=-1)
     if (steps[np.isfinite(steps)] <= 0).any():
         raise InputError(f"{path}: range: does not increase from gate to gate; expected metres")
-    # the light of a pulse alone is longer
-    if known.max() < 40:
+    # a pulse alone is longer
+    if finite.max() < 40:
         raise InputError(
-            f"{path}: range: up to {known.max():g} m, shorter than a pulse; expected metres, or "
+            f"{path}: range: up to {finite.max():g} m, shorter than a pulse; expected metres, or "
             "the unit of kilometres (units: km, in a table range [km])"
         )
 
@@ -221,8 +221,8 @@ _ENCODINGS = (
 def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[str]]:
     """Times of numbers without a unit, and a remark if they are no seconds since 1970.
 
-    They are taken for these, unless they then lie in the future or are closer than lines can be:
-    then for the one other common encoding that gives dates from 1980 to today.
+    They count from 1970, unless they then lie in the future or closer together than lines can: then
+    the only other common encoding with dates from 1980 to today is used.
 
     Raises
     ------
@@ -230,35 +230,35 @@ def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[s
         No encoding, or more than one, is possible.
     """
     epoch = np.datetime64("1970-01-01", "s")
-    known = values[np.isfinite(values)]
-    step = float(np.median(np.diff(np.unique(known)))) if np.unique(known).size > 1 else np.inf
+    finite = values[np.isfinite(values)]
+    step = float(np.median(np.diff(np.unique(finite)))) if np.unique(finite).size > 1 else np.inf
     first, last = (
-        float((one - epoch) / np.timedelta64(1, "s"))
-        for one in (_FIRST_SCAN, np.datetime64("now") + np.timedelta64(1, "D"))
+        float((date - epoch) / np.timedelta64(1, "s"))
+        for date in (_FIRST_SCAN, np.datetime64("now") + np.timedelta64(1, "D"))
     )
 
     def possible(unit: float, zero: float, first: float) -> bool:
-        since = unit * (known - zero)
+        since = unit * (finite - zero)
         return bool(((since >= first) & (since <= last)).all()) and unit * step >= _SHORTEST_LINE
 
-    # those that begin with the measurement are seconds, too
-    if not known.size or possible(1.0, 0.0, -86400.0):
+    # seconds may also count from the start of the measurement
+    if not finite.size or possible(1.0, 0.0, -86400.0):
         return seconds(values, epoch), []
-    others = [one for one in _ENCODINGS if possible(one[1], one[2], first)]
-    if len(others) != 1:
+    encodings = [date for date in _ENCODINGS if possible(date[1], date[2], first)]
+    if len(encodings) != 1:
         raise InputError(
-            f"{path}: {name}: {known[0]:.10g} without a unit is not allowed; expected seconds "
+            f"{path}: {name}: {finite[0]:.10g} without a unit is not allowed; expected seconds "
             "since 1970, ISO 8601, or a unit"
         )
-    text, unit, zero = others[0]
-    remark = f"{name}: {known[0]:.10g} is no time in seconds since 1970: read as {text}"
+    text, unit, zero = encodings[0]
+    remark = f"{name}: {finite[0]:.10g} is no time in seconds since 1970: read as {text}"
     return seconds(unit * (values - zero), epoch), [remark]
 
 
 _TOWARD = r"(?:toward|approach|inbound|incoming)"
 _AWAY = r"(?:away|reced|outbound|outgoing|outward)"
 _SIGN = r"(?:positive|negative|(?<!\w)[+-]ve|(?<!\w)[><]\s*0)"
-_SAID = re.compile(
+_SIGN_CONVENTION = re.compile(
     rf"(?P<sign>{_SIGN})[^.;,]*?(?P<way>{_TOWARD}|{_AWAY})"
     rf"|(?P<way2>{_TOWARD}|{_AWAY})[^.;,]*?(?P<sign2>{_SIGN})",
     re.IGNORECASE,
@@ -271,12 +271,12 @@ def toward_in_words(text: str) -> bool | None:
     >>> toward_in_words("Doppler velocity, positive towards the lidar")
     True
     """
-    said = set()
-    for one in _SAID.finditer(text):
-        sign, way = one["sign"] or one["sign2"], one["way"] or one["way2"]
+    senses = set()
+    for match in _SIGN_CONVENTION.finditer(text):
+        sign, way = match["sign"] or match["sign2"], match["way"] or match["way2"]
         positive = sign.lower().startswith(("positive", "+", ">"))
-        said.add((re.match(_TOWARD, way, re.IGNORECASE) is not None) == positive)
-    return said.pop() if len(said) == 1 else None
+        senses.add((re.match(_TOWARD, way, re.IGNORECASE) is not None) == positive)
+    return senses.pop() if len(senses) == 1 else None
 
 
 _FILL = -100.0  # dB: below it a value stands for none
@@ -291,8 +291,8 @@ def ratio_of_powers(values: np.ndarray, unit: str, name: str) -> tuple[np.ndarra
     if unit.startswith(("db", "decibel")):
         return 10.0 ** (values / 10), []
     if unit in ("", "unitless", "none", "1"):
-        given = values[np.isfinite(values) & (values > _FILL)]
-        if given.size and np.mean(given < -1.0) > 0.01:
+        finite = values[np.isfinite(values) & (values > _FILL)]
+        if finite.size and np.mean(finite < -1.0) > 0.01:
             return 10.0 ** (values / 10), [
                 f"{name} has values below -1, which no ratio of powers has: read as dB"
             ]

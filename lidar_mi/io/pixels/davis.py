@@ -33,14 +33,14 @@ def read_davis(path: Path) -> Frames:
             raise ValueError(f"{width} x {height} x {depth} x {count} pixels")
         check_size(path, 8 * width * height * depth * count)
         buffer = lvpyio.read_buffer(str(path))
-        found = [_frame(path, frame) for frame in buffer]
+        frames = [_frame(path, frame) for frame in buffer]
     except InputError:
         raise
     except Exception as error:  # any exception of the library in a damaged file
         raise damaged(path, "DaVis image", error) from None
-    if len({image.shape for image in found}) != 1:
+    if len({image.shape for image in frames}) != 1:
         raise InputError(f"{path}: no frames, or of different sizes; expected one size")
-    return frames_of(path, np.stack(found))
+    return frames_of(path, np.stack(frames))
 
 
 def _frame(path: Path, frame: Any) -> np.ndarray:

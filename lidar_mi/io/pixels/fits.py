@@ -59,23 +59,23 @@ def read_fits(path: Path, layer: str | None) -> Frames:
 
 
 def _chosen(path: Path, images: dict[int, Any], layer: str | None) -> Any:
-    """The part that is meant."""
+    """The part named by ``layer``, or the only one."""
     names = {str(number): part for number, part in images.items()}
     names |= {part.name: part for part in images.values() if part.name}
-    shown = ", ".join(part.name or str(number) for number, part in images.items())
+    listed = ", ".join(part.name or str(number) for number, part in images.items())
     if layer is not None:
         if layer not in names:
-            raise InputError(f"{path}: layer {layer!r} is not there; expected one of {shown}")
+            raise InputError(f"{path}: layer {layer!r} is not there; expected one of {listed}")
         return names[layer]
     if not images:
         raise InputError(f"{path}: has no image; expected a FITS image or cube")
     if len(images) > 1:
-        raise InputError(f"{path}: {len(images)} images; expected --layer, one of {shown}")
+        raise InputError(f"{path}: {len(images)} images; expected --layer, one of {listed}")
     return next(iter(images.values()))
 
 
 def _values(part: Any) -> np.ndarray:
-    """What the stored numbers stand for."""
+    """Physical values of the stored numbers."""
     header = part.header
     scale, zero, blank = (header.get(key) for key in ("BSCALE", "BZERO", "BLANK"))
     stored = np.asarray(part.data)

@@ -73,12 +73,12 @@ def kind_of(path: Path) -> str:
         with suppress(OSError, EOFError, zlib.error), gzip.open(path) as file:
             if file.read(6) == b"SIMPLE":
                 return "fits"
-    what = how = ""
+    kind_name = how = ""
     if start[:3] == b"CDF":
-        what, how = "NetCDF-3", "nccopy -k nc4 FILE NEW.nc"
+        kind_name, how = "NetCDF-3", "nccopy -k nc4 FILE NEW.nc"
     elif packed := compression(start):
         name, program = packed
-        what, how = f"compressed with {name}", f"{program} FILE"
-    if what:
-        raise InputError(f"{path}: {what} is not read as an image; expected an {KINDS}: {how}")
+        kind_name, how = f"compressed with {name}", f"{program} FILE"
+    if kind_name:
+        raise InputError(f"{path}: {kind_name} is not read as an image; expected an {KINDS}: {how}")
     raise InputError(f"{path}: no readable image (it begins as none); expected an {KINDS}")

@@ -102,16 +102,16 @@ def read_hdf5(path: Path, layer: str | None) -> Frames:
 
     try:
         with h5py.File(path, "r") as file:
-            found: dict[str, Any] = {}
+            arrays: dict[str, Any] = {}
 
             def add(name: str, part: Any) -> None:
                 if isinstance(part, h5py.Dataset) and part.dtype.kind in "iufb":
-                    found[name] = part
+                    arrays[name] = part
 
             file.visititems(add)
-            found = {name: part for name, part in found.items() if not name.startswith("#")}
-            chosen = _chosen(path, {name: part.shape for name, part in found.items()}, layer)
-            part = found[chosen]
+            arrays = {name: part for name, part in arrays.items() if not name.startswith("#")}
+            chosen = _chosen(path, {name: part.shape for name, part in arrays.items()}, layer)
+            part = arrays[chosen]
             _refuse_unreadable(path, part)
             matlab = "MATLAB_class" in part.attrs
             image = part[()]
@@ -163,8 +163,8 @@ def _chosen(path: Path, shapes: Mapping[str, tuple[int, ...]], layer: str | None
 
 
 def _listed(names: list[str]) -> str:
-    shown = ", ".join(name[:30] for name in names[:4])
-    return shown + (", ..." if len(names) > 4 else "")
+    text = ", ".join(name[:30] for name in names[:4])
+    return text + (", ..." if len(names) > 4 else "")
 
 
 def _numpy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:

@@ -29,22 +29,22 @@ def read_netpbm(path: Path) -> Frames:
         A bitmap (P1, P4), a damaged file, images of different sizes, channels of unknown meaning.
     """
     content, place = path.read_bytes(), 0
-    found: list[np.ndarray] = []
+    images: list[np.ndarray] = []
     if content[:2] in (b"P1", b"P4"):
         raise InputError(f"{path}: black and white (PBM) is no measured light; expected PGM or PPM")
     try:
         while content[place:].strip(b"\0 \n\r\t"):
             image, place = _image(path, content, place)
-            if found and image.shape != found[0].shape:
+            if images and image.shape != images[0].shape:
                 raise InputError(f"{path}: images of different sizes; expected one size")
-            found.append(image)
+            images.append(image)
             if content[:2] in (b"P2", b"P3"):
                 break
     except InputError:
         raise
     except (ValueError, IndexError, OverflowError) as error:
         raise damaged(path, _KIND, error) from None
-    return frames_of(path, np.stack(found))
+    return frames_of(path, np.stack(images))
 
 
 def _image(path: Path, content: bytes, place: int) -> tuple[np.ndarray, int]:
@@ -84,11 +84,11 @@ def _header(content: bytes, place: int, magic: bytes) -> tuple[int, int, int, in
     text, end, words = content[place : place + _LONGEST], 2, []
     colours = _COLOURS[magic] if magic in _COLOURS else _unknown(magic)
     for _ in range(3):
-        found = _WORD.match(text, end)
-        if found is None:
+        word = _WORD.match(text, end)
+        if word is None:
             raise ValueError("its header is cut off")
-        words.append(found[1])
-        end = found.end()
+        words.append(word[1])
+        end = word.end()
     scale = float(words[2])
     if not math.isfinite(scale) or scale == 0:
         raise ValueError(f"a scale of {scale:g}")
@@ -102,16 +102,16 @@ def _pam_header(path: Path, content: bytes, place: int) -> tuple[int, int, int, 
     text = content[place : place + _LONGEST]
     end = text.index(b"ENDHDR\n") + len(b"ENDHDR\n")
     lines = [line.split(b"#")[0].split() for line in text[:end].splitlines()[1:-1]]
-    said = {line[0]: b" ".join(line[1:]) for line in lines if line}
+    fields = {line[0]: b" ".join(line[1:]) for line in lines if line}
     tuples = {
         b"GRAYSCALE": (1, 0),
         b"GRAYSCALE_ALPHA": (1, 1),
         b"RGB": (3, 0),
         b"RGB_ALPHA": (3, 1),
     }
-    numbers = [int(said.get(name, b"0")) for name in (b"WIDTH", b"HEIGHT", b"MAXVAL", b"DEPTH")]
+    numbers = [int(fields.get(name, b"0")) for name in (b"WIDTH", b"HEIGHT", b"MAXVAL", b"DEPTH")]
     width, height, largest, depth = numbers
-    kind = said.get(b"TUPLTYPE", b"GRAYSCALE" if depth == 1 else b"")
+    kind = fields.get(b"TUPLTYPE", b"GRAYSCALE" if depth == 1 else b"")
     if kind not in tuples or sum(tuples[kind]) != depth:
         raise InputError(
             f"{path}: {depth} channels of TUPLTYPE {kind.decode(errors='replace')[:20]!r}; "

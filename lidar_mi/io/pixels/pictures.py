@@ -33,18 +33,18 @@ def read_picture(path: Path) -> Frames:
         with _opened(path, _FORMATS) as file:
             count = getattr(file, "n_frames", 1)
             check_size(path, 8 * count * file.width * file.height * 3)
-            found: list[np.ndarray] = []
+            images: list[np.ndarray] = []
             for number in range(count):
                 file.seek(number)
                 _refuse_shallow(path, file)
-                found.append(_light(path, ImageOps.exif_transpose(file)))
-                if found[-1].shape != found[0].shape:
+                images.append(_light(path, ImageOps.exif_transpose(file)))
+                if images[-1].shape != images[0].shape:
                     raise InputError(f"{path}: images of different sizes; expected one size")
     except InputError:
         raise
     except Exception as error:  # any exception of the library in a damaged file
         raise damaged(path, "JPEG, BMP, GIF or WebP", error) from None
-    return frames_of(path, np.stack(found))
+    return frames_of(path, np.stack(images))
 
 
 def read_jpeg2000(path: Path) -> Frames:

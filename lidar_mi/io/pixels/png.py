@@ -52,7 +52,7 @@ def _silent() -> Iterator[None]:
     """Without what libpng writes to the process's standard error: a remark on interlaced files."""
     try:
         former = os.dup(2)
-    except OSError:  # there is none
+    except OSError:  # no descriptor of standard error
         yield
         return
     nothing = os.open(os.devnull, os.O_WRONLY)

@@ -17,7 +17,7 @@ from lidar_mi.io.size import check_size
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
-# what the library only logs, and goes on with part of the file
+# faults that the library only logs before it reads part of the file
 _LOSSES = re.compile(
     r"invalid (page )?offset|invalid next page|corrupted (tag list|file)|circular|"
     r"missing (\d+ )?(frames|pages|files|data|ByteCounts)|series metadata|failed to read|"
@@ -52,28 +52,28 @@ def read_tiff(path: Path) -> Frames:
 
     def read(chosen: Sequence[int]) -> np.ndarray:
         with _opened(path) as file:
-            found = []
+            pages = []
             for number in chosen:
                 page: Any = file.pages[numbers[number]]
                 # pages can share their pixels
                 check_size(path, 8 * len(chosen) * page.imagewidth * page.imagelength)
-                found.append(_pixels(path, page))
-                if found[-1].shape != found[0].shape:
-                    (high, wide), (rows, columns) = found[-1].shape, found[0].shape
+                pages.append(_pixels(path, page))
+                if pages[-1].shape != pages[0].shape:
+                    (high, wide), (rows, columns) = pages[-1].shape, pages[0].shape
                     raise InputError(
                         f"{path}: page {numbers[number]} is {wide} x {high} px; expected "
                         f"{columns} x {rows} px as of the first"
                     )
-            if len({one.dtype for one in found}) > 1:
-                found = [one.astype(float) for one in found]
-            return np.stack(found)
+            if len({image.dtype for image in pages}) > 1:
+                pages = [image.astype(float) for image in pages]
+            return np.stack(pages)
 
     return Frames(count, read, channels)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The file; what the library says or raises becomes one line."""
+    """The file; messages and exceptions of the library become one line."""
     import tifffile
 
     logger, lost = logging.getLogger("tifffile"), _Lost()
@@ -114,8 +114,8 @@ def _planes(path: Path, file: "TiffFile") -> tuple[list[int] | None, int, bool]:
     No numbers (None): the images follow the first page's and have no pages of their own.
     """
     # a TiffFrame, of which a series may consist, takes what it lacks from its page
-    each: Iterable[Any] = file.pages
-    whole = [n for n, page in enumerate(each) if not (page.is_reduced or page.is_mask)]
+    all_pages: Iterable[Any] = file.pages
+    whole = [n for n, page in enumerate(all_pages) if not (page.is_reduced or page.is_mask)]
     if not whole:
         raise InputError(f"{path}: no page of full size; expected an image")
     series = file.series
@@ -123,20 +123,20 @@ def _planes(path: Path, file: "TiffFile") -> tuple[list[int] | None, int, bool]:
         raise InputError(f"{path}: OME-TIFF whose planes are in other files too; expected one file")
     if series[0].kind in _ORDINARY and not file.is_imagej:
         return whole, len(whole), False
-    one = series[0]
-    sizes = dict(zip(one.get_axes(squeeze=False), one.get_shape(squeeze=False), strict=True))
+    planes = series[0]
+    sizes = dict(zip(planes.get_axes(squeeze=False), planes.get_shape(squeeze=False), strict=True))
     sizes = {axis: n for axis, n in sizes.items() if n > 1 and axis not in "YXS"}
     count = math.prod(sizes.values())
-    shown = ", ".join(f"{axis} {n}" for axis, n in sizes.items())
+    axes = ", ".join(f"{axis} {n}" for axis, n in sizes.items())
     if len(series) > 1 or len(sizes) > 1:
         raise InputError(
-            f"{path}: images along several axes ({shown or f'{len(series)} series'}); expected "
+            f"{path}: images along several axes ({axes or f'{len(series)} series'}); expected "
             "height, width and one more: T (time), Z (depth) or C (channels)"
         )
     axis = next(iter(sizes), "T")
     if axis not in (*_IN_ORDER, "C"):
         raise InputError(f"{path}: images along the axis {axis}; expected T (time), Z or C")
-    pages = [None if page is None else page.index for page in one.pages]
+    pages = [None if page is None else page.index for page in planes.pages]
     if pages == [whole[0]] and count > 1:
         return None, count, axis == "C"
     if sorted(pages, key=lambda page: -1 if page is None else page) != whole or len(pages) != count:
@@ -159,17 +159,17 @@ def _contiguous(path: Path, file: "TiffFile", count: int) -> np.ndarray:
 
 def _pixels(path: Path, page: "TiffPage") -> np.ndarray:
     """One number a pixel of a page."""
-    more = _check(path, page)
+    extra = _check(path, page)
     axes, image = page.axes, page.asarray()
     if set(axes) - set("YXS"):
         raise InputError(f"{path}: a page with the axes {axes}; expected height and width")
     image = np.moveaxis(image, axes.index("S"), -1) if "S" in axes else image[..., None]
-    image = grey(path, image, page.samplesperpixel - more, more)
+    image = grey(path, image, page.samplesperpixel - extra, extra)
     return _without_gaps(page, _upright(image, page.tags.valueof(_ORIENTATION, 1)))
 
 
 def _check(path: Path, page: "TiffPage", count: int = 1) -> int:
-    """Refuse what is no light, or not there; the number of channels of transparency."""
+    """Refuse pixels that are no light or are missing; the number of transparency channels."""
     import tifffile
 
     samples, photometric = page.samplesperpixel, int(page.photometric)
@@ -221,7 +221,7 @@ def _is_ramp(colours: np.ndarray | None) -> bool:
         return False
     first = np.asarray(colours[0], float)
     ideal = np.linspace(0, first[-1], len(first))
-    # of 8 bits in 16: within one step of them
+    # 8 bits scaled to 16: equal within one step
     return bool((colours == colours[0]).all() and first[-1] and abs(first - ideal).max() <= 256)
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.linalg import lapack
 
 from lidar_mi.retrieval.ground_winds.turbulence_covariance import correlations
 from lidar_mi.retrieval.images.band_limit import even_fast_len
@@ -28,16 +29,14 @@ LENGTHS = (15.0, 40.0, 100.0, 250.0)
 ALONG = 7.5
 """Distance along the path, m, over which the decay of the eddies' effect on the pair is stated."""
 
-# Rms of each component, m/s, of uniform prior density.
-_SPREADS = np.geomspace(0.02, 5.0, 24)
+# Rms of each component, m/s, of uniform prior density, as close as 300 winds can tell them apart.
+_SPREADS = np.geomspace(0.02, 5.0, 64)
 # Of the weakest turbulence, the least error of a single residual that is told apart.
 _FINEST = 1e-3
 # Squares of pixels in which turbulence is uniform: at most so many.
 _BLOCKS = 150
 # Pixels beyond which the errors by turbulence are those of sums over two by two of them.
 _FEW = 4000
-# Of the strongest patterns of turbulence, for its likelihood.
-_PATTERNS = 64
 # Core radius of a further vortex, m, and radii of the cores of the pair about which none is sought.
 _CORE, _OWN = 2.5, 3.0
 # Of a block's mean with another's: the difference of two Gauss points each, over its side.
@@ -73,17 +72,53 @@ class AmbientWind(NamedTuple):
 
     def at(self, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
         """v and w (2, z, y) on a grid of places (z, y), one coordinate along each axis."""
+        return self.turbulence(y[0], z[:, 0]) + self.linear(y, z)
+
+    def turbulence(self, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        """The part of the eddies alone (2, z, y), at places along each axis."""
         weights = [
-            linear_weights(nodes.to(axis), axis)
-            for nodes, axis in ((self.z, z[:, 0]), (self.y, y[0]))
+            linear_weights(nodes.to(axis), axis) for nodes, axis in ((self.z, z), (self.y, y))
         ]
-        return separable(self.eddies.to(y), weights) + self.linear(y, z)
+        return separable(self.eddies.to(y), weights)
 
     def linear(self, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
         """The part of the gradient alone."""
         v_y, v_z, w_y, w_z = self.gradient.to(y)
         y, z = y - self.centre[0], z - self.centre[1]
         return torch.stack([v_y * y + v_z * z, w_y * y + w_z * z])
+
+
+class Elimination(NamedTuple):
+    """What the errors by an ambient wind follow from; winds (2 n,) in blocks, v before w.
+
+    Attributes
+    ----------
+    blocks : _Blocks
+    y, z : torch.Tensor
+        Of the residuals, m.
+    dt : float
+    parameters : torch.Tensor
+        At which the fit is linear.
+    variances : torch.Tensor
+        Of turbulence of each of `LENGTHS`, m^2 s^-2.
+    covariance : torch.Tensor, shape (2 n, 2 n)
+        Of turbulence relative to the wind at the pair.
+    free, push : torch.Tensor, shapes (2 n, 2 n) and (2 n,)
+        Stiffness and force of winds, as the parameters follow them.
+    prior : torch.Tensor
+        Inverse variance of parameters and gradients.
+    """
+
+    blocks: "_Blocks"
+    y: torch.Tensor
+    z: torch.Tensor
+    dt: float
+    parameters: torch.Tensor
+    variances: torch.Tensor
+    covariance: torch.Tensor
+    free: torch.Tensor
+    push: torch.Tensor
+    prior: torch.Tensor
 
 
 class Ambient(NamedTuple):
@@ -95,22 +130,33 @@ class Ambient(NamedTuple):
         With the four gradients after the parameters. Its derivatives lack what turbulence explains,
         its residuals the estimated turbulence.
     wind : AmbientWind
-    covariance : torch.Tensor, shape (10, 10)
-        Of the parameters' error by turbulence, and by the gradients' prior.
-    ahead : torch.Tensor, shape (10, 10)
-        Covariance of that error with that of a slab `ALONG` further along the path.
     rms, length : float
         Of the turbulence, posterior means: m/s and m.
-    further : float
-        Largest chi-square (one degree of freedom) of a further vortex anywhere.
+    elimination : Elimination
     """
 
     solution: Solution
     wind: AmbientWind
-    covariance: torch.Tensor
-    ahead: torch.Tensor
     rms: float
     length: float
+    elimination: Elimination
+
+
+class AmbientErrors(NamedTuple):
+    """Errors of a fit by its ambient wind.
+
+    Attributes
+    ----------
+    covariance : torch.Tensor, shape (10, 10)
+        Of the parameters' error by turbulence, and by the gradients' prior.
+    ahead : torch.Tensor, shape (10, 10)
+        Covariance of that error with that of a slab `ALONG` further along the path.
+    further : float
+        Largest chi-square (one degree of freedom) of a further vortex anywhere.
+    """
+
+    covariance: torch.Tensor
+    ahead: torch.Tensor
     further: float
 
 
@@ -165,7 +211,9 @@ def in_ambient_wind(
     normal = (weighted @ flat.T).double()
     gradient = (weighted @ residual.flatten()).double()
     if known is not None:
-        eddies = known.eddies.flatten().to(force)
+        # its blocks are those of another image where the scan follows the pair
+        before = known.turbulence(blocks.y, blocks.z)
+        eddies = before.flatten().to(force)
         # the residuals without the eddies that are known
         force = force - stiffness @ eddies
         gradient = gradient - coupling @ eddies
@@ -182,15 +230,16 @@ def in_ambient_wind(
     variances = _variances(blocks, here, free, push)
     between = _relative(blocks.covariance(variances), here)
     covariance = _relative(between.T, here)
-    further = _further_vortex(blocks, found.parameters, covariance, free, push)
-    # (A + K^-1)^-1 = K (1 + A K)^-1
+    # (A + K^-1)^-1 = (1 + K A)^-1 K
     one = torch.eye(len(force), dtype=torch.float64, device=force.device)
-    remaining = torch.linalg.solve(one + covariance @ stiffness, covariance)
-    absorbed = -coupling @ remaining
+    explained = torch.linalg.solve(
+        one + covariance @ stiffness, covariance @ torch.cat([coupling.T, force[:, None]], 1)
+    )
+    absorbed = -explained[:, :-1].T
     reduced = normal + absorbed @ coupling.T
     reduced = (reduced + reduced.T) / 2
     step = -_solve(reduced, gradient + absorbed @ force)
-    eddies = -remaining @ (force + coupling.T @ step)
+    eddies = absorbed.T @ step - explained[:, -1]
 
     shaped = absorbed.view(len(columns), 2, *blocks.shape)
     projected = columns
@@ -201,13 +250,8 @@ def in_ambient_wind(
     remains = residual + torch.tensordot(step.to(jacobian), columns, 1)
     remains = remains + (estimated[:, None] * slope).sum(0)
     if known is not None:
-        stored = blocks.spread(known.eddies.to(jacobian)) * dt
+        stored = blocks.spread(before.to(jacobian)) * dt
         remains = remains - (stored[:, None] * slope).sum(0)
-    inverse = _solve(reduced, torch.eye(len(reduced), dtype=torch.float64, device=reduced.device))
-    of_pair = torch.tensordot(dt * inverse[:10].to(projected), projected, 1)
-    response = torch.stack([(of_pair * part).sum(1) for part in steep], 1)
-    by_prior = (inverse * prior) @ inverse
-    here_by_eddies, ahead_by_eddies = _spread(response, found.parameters, y, z, variances)
     if misfit.residual.ndim == 2:
         remains, projected, weight = remains[0], projected[:, 0], weight[0]
     moved = torch.cat([found.parameters, found.parameters.new_zeros(4)]) + step.to(found.parameters)
@@ -221,12 +265,24 @@ def in_ambient_wind(
     return Ambient(
         solution,
         air,
-        here_by_eddies + by_prior[:10, :10],
-        ahead_by_eddies + by_prior[:10, :10],
         float(variances.sum().sqrt()),
         float((variances * lengths.log()).sum().div(variances.sum()).exp()),
-        further,
+        Elimination(blocks, y, z, dt, found.parameters, variances, covariance, free, push, prior),
     )
+
+
+def ambient_errors(ambient: Ambient) -> AmbientErrors:
+    """Errors of a fit by its ambient wind, and the test for a further vortex."""
+    (_, misfit, weight, normal, *_), known = ambient.solution, ambient.elimination
+    one = torch.eye(len(normal), dtype=torch.float64, device=normal.device)
+    inverse = _solve(normal, one)
+    of_pair = torch.tensordot(known.dt * inverse[:10].to(misfit.jacobian), misfit.jacobian, 1)
+    response = torch.stack([of_pair * weight * part for part in misfit.slope], 1)
+    if misfit.residual.ndim == 3:
+        response = response.sum(2)
+    by_prior = ((inverse * known.prior) @ inverse)[:10, :10]
+    here, ahead = _spread(response, known.parameters, known.y, known.z, known.variances)
+    return AmbientErrors(here + by_prior, ahead + by_prior, _further_vortex(known))
 
 
 _PAIRS = ((0, 0), (0, 1), (1, 1))
@@ -318,45 +374,56 @@ def _variances(
 
     Only one of them is there: a variance is weighted by the probability of its length.
     """
-    variance = torch.as_tensor(_SPREADS**2, device=push.device)[:, None]
+    variance = torch.as_tensor(_SPREADS**2, device=push.device)
+    local = _before_relative(_before_relative(free, here).T, here)
+    force = _before_relative(push[:, None], here)
     likelihoods = []
     for length in LENGTHS:
-        patterns = _covariances(*blocks.shape, *blocks.steps, length, push.device)[1]
-        local = _relative(patterns, here)
-        strength, turned = torch.linalg.eigh(local.T @ free @ local)
-        square = (turned.T @ (local.T @ push)).square()
-        gain = 1 + variance * strength.clamp(min=0)
-        likelihoods.append((variance * square / gain - gain.log()).sum(1) / 2)
+        root = _covariances(*blocks.shape, *blocks.steps, length, push.device)[1]
+        likelihoods.append(_log_likelihoods(root.T @ local @ root, root.T @ force))
     # uniform in the rms, whose nodes are logarithmic
-    together = torch.stack(likelihoods) + torch.as_tensor(np.log(_SPREADS), device=push.device)
+    together = torch.as_tensor(np.stack(likelihoods) + np.log(_SPREADS), device=push.device)
     probability = (together - together.max()).exp()
-    return (probability * variance[:, 0]).sum(1) / probability.sum()
+    return (probability * variance).sum(1) / probability.sum()
 
 
-def _further_vortex(
-    blocks: _Blocks,
-    parameters: torch.Tensor,
-    covariance: torch.Tensor,
-    free: torch.Tensor,
-    push: torch.Tensor,
-) -> float:
+def _log_likelihoods(stiffness: torch.Tensor, force: torch.Tensor) -> np.ndarray:
+    """Of `_SPREADS`, of amplitudes that are independent and have this rms.
+
+    (s^2 b . (1 + s^2 M)^-1 b - log det (1 + s^2 M)) / 2, with the stiffness M once in tridiagonal
+    form.
+    """
+    matrix, turned = stiffness.cpu().numpy(), force.cpu().numpy().copy()
+    # as much memory as for blocks of 64 columns
+    reflectors, diagonal, beside, scales, _ = lapack.dsytrd(matrix, 1, 64 * len(matrix))
+    turned[1:] = lapack.dormqr("L", "T", reflectors[1:, :-1], scales, turned[1:], 64)[0]
+    found = np.empty(len(_SPREADS))
+    for number, variance in enumerate(_SPREADS**2):
+        pivots, _, solution, _ = lapack.dptsv(1 + variance * diagonal, variance * beside, turned)
+        gain = variance * float((turned * solution).sum())
+        found[number] = (gain - np.log(pivots).sum()) / 2
+    return found
+
+
+def _further_vortex(known: Elimination) -> float:
     """Largest score statistic of one more vortex in the middle of a block, in the turbulence.
 
     Chi-square with one degree of freedom at each place, if there is no such vortex (Rao 1948). Not
     of places within `_OWN` core radii of the pair, whose profile may differ from the model.
     """
+    blocks, free, push = known.blocks, known.free, known.push
     z, y = (a.flatten() for a in torch.meshgrid(blocks.z, blocks.y, indexing="ij"))
     away = torch.stack([y[:, None] - y, z[:, None] - z])
     square = away.square().sum(0) + _CORE**2
     swirl = torch.cat([-away[1] / square, away[0] / square])
     clear = torch.ones_like(y, dtype=torch.bool)
     for first in (0, 4):
-        _, log_radius, at_y, at_z = (float(a) for a in parameters[first : first + 4])
+        _, log_radius, at_y, at_z = (float(a) for a in known.parameters[first : first + 4])
         clear &= torch.hypot(y - at_y, z - at_z) > _OWN * math.exp(log_radius)
     swirl = swirl[:, clear]
     one = torch.eye(len(push), dtype=torch.float64, device=push.device)
     scores = torch.linalg.solve(
-        one + free @ covariance, torch.cat([push[:, None], free @ swirl], 1)
+        one + free @ known.covariance, torch.cat([push[:, None], free @ swirl], 1)
     )
     square = (swirl.T @ scores[:, 0]).square() / (swirl * scores[:, 1:]).sum(0).clamp(min=1e-30)
     return float(square.max())
@@ -411,6 +478,12 @@ def _relative(fields: torch.Tensor, here: torch.Tensor) -> torch.Tensor:
     return (parts - torch.einsum("n,anm->am", here, parts)[:, None]).flatten(0, 1)
 
 
+def _before_relative(forces: torch.Tensor, here: torch.Tensor) -> torch.Tensor:
+    """Forces (2 n, m) on winds in blocks, of forces on these less the wind at the pair."""
+    parts = forces.unflatten(0, (2, -1))
+    return (parts - here[:, None] * parts.sum(1, keepdim=True)).flatten(0, 1)
+
+
 def _solve(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
     """Solution with a symmetric matrix whose units differ by powers of ten."""
     scale = matrix.diagonal().clamp(min=1e-300).rsqrt()
@@ -436,7 +509,7 @@ def _covariances(
     vv, vw, ww = total[:, *at]
     plane = np.block([[vv, vw], [vw, ww]])
     strength, patterns = np.linalg.eigh(plane)
-    root = patterns[:, -_PATTERNS:] * np.sqrt(strength[-_PATTERNS:].clip(min=0))
+    root = patterns * np.sqrt(strength.clip(min=0))
     return torch.as_tensor(plane, device=device), torch.as_tensor(root, device=device)
 
 

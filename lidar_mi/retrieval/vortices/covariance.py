@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from lidar_mi.retrieval.images.windows import averaged
-from lidar_mi.retrieval.vortices.ambient import ALONG, Ambient
+from lidar_mi.retrieval.vortices.ambient import ALONG, AmbientErrors
 from lidar_mi.retrieval.vortices.model_error import (
     ModelError,
     Response,
@@ -95,12 +95,12 @@ def parameter_covariance(
     return covariance.cpu().numpy()
 
 
-def shared_error(ambient: Ambient) -> tuple[np.ndarray, float]:
+def shared_error(errors: AmbientErrors) -> tuple[np.ndarray, float]:
     """Covariance (10, 10) of the parameters' error by the ambient wind, and its length along x, m.
 
     The length is that of an exponential with the mean of the parameters' correlations at `ALONG`.
     """
-    here, ahead = (part.cpu().numpy() for part in (ambient.covariance, ambient.ahead))
+    here, ahead = (part.cpu().numpy() for part in (errors.covariance, errors.ahead))
     correlation = float(np.clip((np.diagonal(ahead) / np.diagonal(here)).mean(), 1e-6, 1 - 1e-6))
     return here, -ALONG / np.log(correlation)
 

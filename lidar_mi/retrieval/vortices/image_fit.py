@@ -31,7 +31,7 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
-from lidar_mi.retrieval.vortices.ambient import Ambient, in_ambient_wind
+from lidar_mi.retrieval.vortices.ambient import Ambient, ambient_errors, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import (
     change_by_flow,
     curvature,
@@ -458,7 +458,8 @@ def _checked(
     q = curvature(best, make.spacing)
     # parameters follow a departure: they err by all of it, not by what they have left
     departure = model_error_of(best, _NOISE_LAGS, changes=True, before=error)
-    covariance = parameter_covariance(best, error, departure, 1 / q**2, ambient.covariance)
+    by_air = ambient_errors(ambient)
+    covariance = parameter_covariance(best, error, departure, 1 / q**2, by_air.covariance)
     valid = misfit.valid
     # image 1 at its places, and image 2 at its own: the residual with image 1 times its gain
     first = -misfit.jacobian[10]
@@ -480,9 +481,9 @@ def _checked(
         # a roll rate of 1 rad/s that is not known moves the images by this
         change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
         None if make.telescope is None else _change_by_slopes(make, make.telescope, best, images),
-        ambient.further,
+        by_air.further,
     )
-    shared, length = shared_error(ambient)
+    shared, length = shared_error(by_air)
     return replace(pair, ambient=ambient.wind, shared=shared, shared_length=length)
 
 

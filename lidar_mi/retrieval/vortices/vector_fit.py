@@ -17,7 +17,7 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
-from lidar_mi.retrieval.vortices.ambient import AmbientWind, in_ambient_wind
+from lidar_mi.retrieval.vortices.ambient import AmbientWind, ambient_errors, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import (
     change_by_flow,
     model_error_of,
@@ -170,7 +170,8 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         model = replace(model, ambient=around.at(lateral, vertical))
     error = model_error_of(best, 1.0)
     departure = model_error_of(best, 1.0, before=error)
-    covariance = parameter_covariance(best, error, departure, 1.0, ambient.covariance)
+    by_air = ambient_errors(ambient)
+    covariance = parameter_covariance(best, error, departure, 1.0, by_air.covariance)
     chi2 = float(best.misfit.residual[:, valid].square().mean()) if known else np.nan
     residual = model.off(best.parameters)[:, valid]
     varied = model.value[:, valid] - model.value[:, valid].mean(1, keepdim=True)
@@ -187,9 +188,9 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         z,
         y,
         change_by_flow(best, torch.stack([-model.z, model.y])),
-        further=ambient.further,
+        further=by_air.further,
     )
-    shared, length = shared_error(ambient)
+    shared, length = shared_error(by_air)
     pair = replace(pair, ambient=around, shared=shared, shared_length=length)
     v_stderr, w_stderr = common
     rotation, centre = common_rotation(vectors)

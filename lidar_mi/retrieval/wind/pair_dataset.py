@@ -24,7 +24,7 @@ class Vectors(NamedTuple):
 
     Attributes
     ----------
-    found : Displacement
+    displacement : Displacement
         With all flags.
     texture : Texture
         Of the templates of image 1.
@@ -34,7 +34,7 @@ class Vectors(NamedTuple):
         Of one image in the other, at rest, that was removed.
     """
 
-    found: Displacement
+    displacement: Displacement
     texture: Texture
     pattern: Standing
     copy: Copy
@@ -49,10 +49,10 @@ def pair_dataset(
     validation: VectorValidation,
 ) -> xr.Dataset:
     """The data set that `retrieve_wind` returns."""
-    found, texture, _, _, times = vectors
+    displacement, texture, _, _, times = vectors
     image, steps = given.images[0], spacing(given.images[0])
-    moved = found.d.cpu().numpy() * np.reshape(steps, (2, 1, 1))
-    variables = winds(found, _AXES, steps, times.difference)
+    moved = displacement.d.cpu().numpy() * np.reshape(steps, (2, 1, 1))
+    variables = winds(displacement, _AXES, steps, times.difference)
     variables["time"] = field(_AXES, times.middle, "mid-time of the vector", "s")
     for axis, along in zip("yz", moved[::-1], strict=True):
         about = f"displacement along {axis}", "m"
@@ -61,10 +61,10 @@ def pair_dataset(
     slope = "weakest rms slope relative to the mean, per pixel"
     isotropy = "weakest over strongest rms slope"
     variables |= {
-        score: field(_AXES, found.score, meaning, "1"),
+        score: field(_AXES, displacement.score, meaning, "1"),
         "texture": field(_AXES, texture.slope, slope, "1"),
         "isotropy": field(_AXES, texture.isotropy, isotropy, "1"),
-        "flag": flags(found, _AXES),
+        "flag": flags(displacement, _AXES),
     }
     coords = centres(image, given.windows, "template")
     places = np.meshgrid(*(coords[axis][1] for axis in _AXES), indexing="ij")
@@ -74,7 +74,7 @@ def pair_dataset(
         coords[f"{axis}_vector"] = field(_AXES, vector, *about)
     attributes = _options(method, given, validation) | _remarks(given, clean, vectors)
     title = "Wind in the image plane from an image pair"
-    return dataset(variables, coords, title, attributes, found)
+    return dataset(variables, coords, title, attributes, displacement)
 
 
 def _options(method: Method, given: PairInput, validation: VectorValidation) -> dict[str, Any]:
@@ -102,10 +102,10 @@ def _options(method: Method, given: PairInput, validation: VectorValidation) -> 
 
 
 def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str, Any]:
-    """What was found in the images, of which nothing is said where there is nothing."""
+    """Remarks on the images, without empty ones."""
     pattern = vectors.pattern
     patterns = [str(part) for part in (clean.defects.pattern, pattern) if str(part)]
-    said = {
+    remarks = {
         "defects": str(clean.defects),
         "fixed_pattern": ", ".join(patterns),
         "standing_fraction": pattern.fraction,
@@ -113,4 +113,4 @@ def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str
         "identical_images": given.same,
         "illumination": clean.change_of_illumination,
     }
-    return {name: value for name, value in said.items() if value}
+    return {name: value for name, value in remarks.items() if value}

@@ -82,10 +82,10 @@ def wind_of_slab(
         stack = [first, second, *more]
         windows = Windows(tuple(first.shape), template, search, stride)
         near = start and next_flow(start, stack, noise, min_correlation)
-        found, flow = near or variational_and_flow(
+        displacement, flow = near or variational_and_flow(
             stack, windows, min_correlation, noise, blur, settings=settings, keep=True
         )
-        return found
+        return displacement
 
     chosen = replace(METHODS["variational"], find=find)
     wind = retrieve_wind(image1, image2, dt, chosen, checks=start is None, **options)

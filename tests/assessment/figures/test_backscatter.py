@@ -6,7 +6,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.backscatter import _bright
-from lidar_mi.assessment.figures.plates import by_factors
+from lidar_mi.assessment.figures.panels import by_factors
 from lidar_mi.assessment.figures.sensor import _colours
 
 

@@ -104,7 +104,7 @@ def test_members_tell_luck_from_the_knobs():
     members[6, 1:] = np.nan
     found = sobol_indices(names, members)
     # equal variances; each of 127 points estimates one with 7 degrees of freedom
-    assert found.luck == pytest.approx(0.5, abs=4 * 0.5 * np.sqrt(2 / 7 / 127 + 2 / 127))
+    assert found.between_members == pytest.approx(0.5, abs=4 * 0.5 * np.sqrt(2 / 7 / 127 + 2 / 127))
     assert found.points == 127
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.figures.panels import Drawn
 from lidar_mi.assessment.report.page import Chapter, Tables, page
 from lidar_mi.assessment.report.vector_map import map_data
 from lidar_mi.atmosphere.vortices.cores import Core

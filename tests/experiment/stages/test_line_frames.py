@@ -8,6 +8,7 @@ the laser that are not shared as they should.
 import numpy as np
 import pytest
 import torch
+import xarray as xr
 
 from lidar_mi.experiment.stages.line_frames import line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import ring_instrument
@@ -32,12 +33,8 @@ def recorded(every=1, pulses=4, scan=0, lines=(0, 1, 2)):
     lidar = doppler(every)
     rings = ring_instrument(lidar)
     images = line_images(lidar, rings, 15.0, 100.0)
-    some = list(lines)
-    return (
-        line_frames(lidar, rings, images, some, SPEEDS[some], RANGES[some], pulses, 3, scan),
-        rings,
-        lidar,
-    )
+    whole = xr.Dataset({"v_los_true": ("line", SPEEDS), "range": ("line", RANGES)})
+    return (line_frames(lidar, rings, images, whole, list(lines), pulses, 3, scan), rings, lidar)
 
 
 def test_frames_are_poisson_about_the_image_of_their_speed():

@@ -34,8 +34,8 @@ def solution(random, y, z, noise):
     return Solution(torch.as_tensor(PAIR), misfit, weight, normal, 1.0, True)
 
 
-def dense(y, z, found, noise):
-    """Parameters' step and covariance by the covariance of all vectors, of known turbulence."""
+def gradient_and_eddies(y, z):
+    """Covariances of all vectors by the gradient and by turbulence of 1 m/s."""
     vertical, lateral = (a.ravel() for a in np.meshgrid(z, y, indexing="ij"))
     dy, dz = lateral[:, None] - lateral, vertical[:, None] - vertical
     square = np.where(dy**2 + dz**2 > 0, dy**2 + dz**2, 1.0)
@@ -44,17 +44,67 @@ def dense(y, z, found, noise):
     across = von_karman("w", 0, np.sqrt(square), 0, LENGTH)
     along = von_karman("v", 0, np.sqrt(square), 0, LENGTH)
     vw = (along - across) * dy * dz / square
-    eddies = RMS**2 * np.block([[vv, vw], [vw, ww]])
     middle = PAIR[[2, 3]] / 2 + PAIR[[6, 7]] / 2
     away = np.stack([lateral - middle[0], vertical - middle[1]])
     linear = np.zeros((4, 2, away.shape[1]))
     linear[:2, 0], linear[2:, 1] = away, away
     linear = linear.reshape(4, -1)
-    total = noise**2 * np.eye(len(eddies)) + eddies + ambient.GRADIENT**2 * linear.T @ linear
+    return ambient.GRADIENT**2 * linear.T @ linear, np.block([[vv, vw], [vw, ww]])
+
+
+def dense(y, z, found, noise):
+    """Parameters' step and covariance by the covariance of all vectors, of known turbulence."""
+    gradient, eddies = gradient_and_eddies(y, z)
+    total = noise**2 * np.eye(len(eddies)) + RMS**2 * eddies + gradient
     columns = -found.misfit.jacobian.flatten(1).numpy()
     inverse = np.linalg.inv(total)
     covariance = np.linalg.inv(columns @ inverse @ columns.T)
     return covariance @ columns @ inverse @ found.misfit.residual.flatten().numpy(), covariance
+
+
+def exact(monkeypatch, spreads):
+    """One vector a block, and one length."""
+    monkeypatch.setattr(ambient, "_SPREADS", np.array(spreads))
+    monkeypatch.setattr(ambient, "LENGTHS", (LENGTH,))
+    monkeypatch.setattr(ambient, "_APART", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(ambient, "_scale", lambda found: 1.0)
+    ambient._covariances.cache_clear()
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.3])
+def test_restricted_likelihood(monkeypatch, noise):
+    """Posterior mean of the strength by determinants of the covariance of all vectors.
+
+    Turbulence of the likelihood's kind and a wake's departure from a pair, of another one: with few
+    patterns in place of all, winds that these do not have make the strength too large.
+    """
+    spreads = np.geomspace(0.05, 5, 40)
+    exact(monkeypatch, spreads)
+    y, z = np.arange(-30.0, 31, 5), np.arange(-20.0, 21, 5)
+    found = solution(np.random.default_rng(5), y, z, noise)
+    gradient, eddies = gradient_and_eddies(y, z)
+    random = np.random.default_rng(6)
+    winds = np.linalg.cholesky(eddies + 1e-9 * np.eye(len(eddies))) @ random.normal(
+        size=len(eddies)
+    )
+    off = found.misfit.residual.flatten().numpy() + 0.1 * winds
+    off += 0.2 * random.standard_normal(len(off))
+    shaped = torch.as_tensor(off).view(found.misfit.residual.shape)
+    found = found._replace(misfit=found.misfit._replace(residual=shaped))
+    lateral, vertical = (torch.as_tensor(a) for a in np.meshgrid(y, z))
+    got = ambient.in_ambient_wind(found, lateral, vertical, 1.0)
+    columns, likelihoods = found.misfit.jacobian.flatten(1).numpy(), []
+    for spread in spreads:
+        total = noise**2 * np.eye(len(off)) + gradient + spread**2 * eddies
+        inverse = np.linalg.inv(total)
+        normal = columns @ inverse @ columns.T
+        remains = off - columns.T @ np.linalg.solve(normal, columns @ inverse @ off)
+        logs = sum(np.linalg.slogdet(part)[1] for part in (total, normal))
+        likelihoods.append(-(remains @ inverse @ remains + logs) / 2)
+    probability = spreads * np.exp(np.array(likelihoods) - max(likelihoods))
+    expected = (probability * spreads**2).sum() / probability.sum()
+    assert got.rms == pytest.approx(expected**0.5, rel=5e-3)
+    ambient._covariances.cache_clear()
 
 
 def test_generalised_least_squares(monkeypatch):
@@ -62,11 +112,7 @@ def test_generalised_least_squares(monkeypatch):
 
     The mean wind differs: it is that of the air at the pair.
     """
-    monkeypatch.setattr(ambient, "_SPREADS", np.array([RMS]))
-    monkeypatch.setattr(ambient, "LENGTHS", (LENGTH,))
-    monkeypatch.setattr(ambient, "_APART", (0.0, 0.0, 0.0))
-    monkeypatch.setattr(ambient, "_scale", lambda found: 1.0)
-    ambient._covariances.cache_clear()
+    exact(monkeypatch, [RMS])
     y, z, noise = np.arange(-30.0, 31, 5), np.arange(-20.0, 21, 5), 0.3
     found = solution(np.random.default_rng(3), y, z, noise)
     lateral, vertical = (torch.as_tensor(a) for a in np.meshgrid(y, z))
@@ -80,7 +126,7 @@ def test_generalised_least_squares(monkeypatch):
     # noise and turbulence together are all of it
     flat = got.solution.misfit.jacobian.flatten(1)
     noise_alone = inverse @ ((flat * got.solution.weight.flatten()) @ flat.T) @ inverse
-    both = noise_alone[:10, :10] + got.covariance
+    both = noise_alone[:10, :10] + ambient.ambient_errors(got).covariance
     np.testing.assert_allclose(both, inverse[:10, :10], rtol=1e-3, atol=1e-5)
     ambient._covariances.cache_clear()
 

@@ -1,7 +1,4 @@
-"""What a figure shows, in words and numbers, read off the figure: the text for who does not see it.
-
-Being read off what was drawn, it cannot speak of another figure.
-"""
+"""Alternative text of a figure, read off what was drawn: panels, ranges, largest values."""
 
 import re
 from collections.abc import Iterator
@@ -22,7 +19,7 @@ TRUE_CORE = "true core"
 _MOST_LINES = 8
 
 
-def seen(figure: Figure) -> str:
+def alt_text(figure: Figure) -> str:
     """Panels of a figure with their ranges, largest values and places, in sentences."""
     panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
     texts = [_panel(axes) for axes in panels if axes.axison]
@@ -52,16 +49,16 @@ def _parts(axes: Axes) -> Iterator[str]:
         yield from _colours(axes, image)
     cores = [line for line in axes.lines if TRUE_CORE in str(line.get_label())]
     drawn = [np.asarray(core.get_xydata()) for core in cores]
-    places = np.array([one[0] for one in drawn if len(one)])
+    places = np.array([points[0] for points in drawn if len(points)])
     if places.size:
         yield f"true cores at {_places(places)}"
     lines = list(_lines(axes, cores))
-    shown = [f"{name} from {_number(low)} to {_number(high)}" for name, low, high in lines]
-    if shown:
-        more = len(shown) - _MOST_LINES
-        rest = f" and {more} more" if more > 0 else ""
+    ranges = [f"{name} from {_number(low)} to {_number(high)}" for name, low, high in lines]
+    if ranges:
+        more = len(ranges) - _MOST_LINES
+        others = f" and {more} more" if more > 0 else ""
         label = axes.get_ylabel()
-        yield f"{f'{_axis(label)}: ' if label else ''}{', '.join(shown[:_MOST_LINES])}{rest}"
+        yield f"{f'{_axis(label)}: ' if label else ''}{', '.join(ranges[:_MOST_LINES])}{others}"
     for bars in axes.containers:
         if isinstance(bars, BarContainer) and len(bars):
             values = np.asarray(bars.datavalues, dtype=float)
@@ -72,11 +69,11 @@ def _parts(axes: Axes) -> Iterator[str]:
 
 def _arrows(arrows: Quiver) -> Iterator[str]:
     length = np.ma.filled(np.ma.hypot(arrows.U, arrows.V), np.nan).astype(float).ravel()
-    known = np.isfinite(length)
-    if known.any():
+    finite = np.isfinite(length)
+    if finite.any():
         k = int(np.nanargmax(length))
         place = _places(np.asarray(arrows.XY)[k][None])
-        yield f"{known.sum()} arrows, the longest {_number(length[k])} m/s at {place}"
+        yield f"{finite.sum()} arrows, the longest {_number(length[k])} m/s at {place}"
 
 
 def _colours(axes: Axes, drawn: Collection | AxesImage) -> Iterator[str]:
@@ -96,13 +93,13 @@ def _colours(axes: Axes, drawn: Collection | AxesImage) -> Iterator[str]:
     yield text
 
 
-def _lines(axes: Axes, others: list[Line2D]) -> Iterator[tuple[str, float, float]]:
+def _lines(axes: Axes, cores: list[Line2D]) -> Iterator[tuple[str, float, float]]:
     """Name and range of every named line and of every row of values with error bars."""
-    named = [(str(line.get_label()), line) for line in axes.lines if line not in others]
+    labelled = [(str(line.get_label()), line) for line in axes.lines if line not in cores]
     for group in axes.containers:
         if isinstance(group, ErrorbarContainer) and group.lines[0] is not None:
-            named.append((str(group.get_label()), group.lines[0]))
-    for name, line in named:
+            labelled.append((str(group.get_label()), group.lines[0]))
+    for name, line in labelled:
         values = np.asarray(line.get_ydata(), dtype=float)
         if not name.startswith("_") and np.isfinite(values).any():
             yield name, float(np.nanmin(values)), float(np.nanmax(values))

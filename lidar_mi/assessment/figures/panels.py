@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from lidar_mi.assessment.figures.seen import TRUE_CORE, seen
+from lidar_mi.assessment.figures.alt_text import TRUE_CORE, alt_text
 from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.png import write_png
@@ -30,29 +30,31 @@ UNIFORM = 5e-3
 """Relative range of colours below which a field is called uniform."""
 
 
-Plate = tuple[Figure, str]
+Captioned = tuple[Figure, str]
 """A figure and its caption."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure file and what it shows; `seen` says it in numbers, for who does not see it."""
+    """A figure file with its title, caption and alternative text."""
 
     path: Path
     title: str
     caption: str
-    seen: str = ""
+    alt_text: str = ""
 
 
-def save_all(folder: Path, plates: Sequence[tuple[str, str, Plate]], log: Progress) -> list[Drawn]:
-    """Save plates, each (file name, title, (figure, caption)), as PNG."""
+def save_all(
+    folder: Path, figures: Sequence[tuple[str, str, Captioned]], log: Progress
+) -> list[Drawn]:
+    """Save figures, each (file name, title, (figure, caption)), as PNG."""
     make_folder(folder)
     drawn = []
-    for index, (name, title, (figure, caption)) in enumerate(plates):
-        log.bar(f"drawing {title.lower()}", index / len(plates))
+    for index, (name, title, (figure, caption)) in enumerate(figures):
+        log.bar(f"drawing {title.lower()}", index / len(figures))
         path = folder / f"{name}.png"
         write_png(figure, path, cropped=True)
-        drawn.append(Drawn(path, title, caption, seen(figure)))
+        drawn.append(Drawn(path, title, caption, alt_text(figure)))
     return drawn
 
 
@@ -68,7 +70,7 @@ def sheet(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
 
 
 def panels_of(number: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels for slabs, in rows of two or three, and none that is empty."""
+    """A figure with this number of panels for slabs, in rows of two or three."""
     columns = 3 if number % 2 and number > 1 else min(number, 2)
     rows = -(-number // columns)
     figure, grid = sheet(rows, columns)
@@ -130,8 +132,8 @@ def image_panel(
 def one_to_one(axes: Axes, label: str, *, logarithmic: bool = False) -> None:
     """The line on which both axes of a panel are the same, with the same scales on both."""
     values = [np.ravel(np.asarray(d, float)) for line in axes.lines for d in line.get_data()]
-    known = np.concatenate([v[np.isfinite(v) & ((v > 0) | (not logarithmic))] for v in values])
-    low, high = float(known.min()), float(known.max())
+    drawn = np.concatenate([v[np.isfinite(v) & ((v > 0) | (not logarithmic))] for v in values])
+    low, high = float(drawn.min()), float(drawn.max())
     if logarithmic:
         ends = low / 1.15, high * 1.15
         axes.set(xscale="log", yscale="log")

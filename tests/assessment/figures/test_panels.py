@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.figures.plates import image_panel, sheet
+from lidar_mi.assessment.figures.panels import image_panel, sheet
 
 
 @pytest.mark.parametrize(("spread", "uniform"), [(1e-4, True), (0.0, True), (0.5, False)])
