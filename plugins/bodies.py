@@ -307,8 +307,8 @@ def _affine(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 def _pieces(corners: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, bool]]:
     """Parts of a mesh, each with whether it is closed: Mitsuba merges shapes of one medium.
 
-    A part ends at the first face after which every edge has been passed as often one way as the
-    other; edges of a rim, for which that never holds, aside.
+    A part ends at the first face after which every edge, except those of a rim, has been passed as
+    often in either direction.
     """
     # corners of one place are one, whatever their normals and texture coordinates
     _, same = np.unique(corners, axis=0, return_inverse=True)

@@ -41,7 +41,7 @@ class Bounds:
         self._read: dict[Medium, _Blocks] = {}
 
     def update(self, media: Iterable[Medium], channel: int) -> None:
-        """Read the media, as far as they have changed since the last time."""
+        """Read the media that have changed since the last call."""
         read = {medium: _blocks(medium, channel, self._read.get(medium)) for medium in media}
         if not self._read or read != self._read:
             self._tabulate(read)

@@ -107,11 +107,11 @@ class OpenPath:
     def _limits(self, used: Float) -> tuple[Float, Float, Float]:
         """Least 1 + cos(theta) of flights that end in view, 2 less that, and a logarithm.
 
-        It is that of the largest over the least `one_plus_cosine` + ``used`` / distance. On an
-        ellipsoid of eccentricity e the angles psi and theta at its foci obey
-        tan(psi / 2) = (1 - e) / (1 + e) tan(theta / 2); here (1 - e) / (1 + e) is
-        used / (used + 2 distance). Flights towards the telescope end where the air does; twice
-        that far, as its boundary may be oblique.
+        The logarithm is of the largest over the least `one_plus_cosine` + ``used`` / distance. On
+        an ellipsoid of eccentricity e the angles psi and theta at its foci obey tan(psi / 2) = (1 -
+        e) / (1 + e) tan(theta / 2); here (1 - e) / (1 + e) is used / (used + 2 distance). Flights
+        towards the telescope end where the air does; twice that far, as its boundary may be
+        oblique.
         """
         narrow = dr.square(used / (self.field * (2 * self.distance + used)))
         towards = used / (used + 2 * self.reach)

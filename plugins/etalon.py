@@ -219,7 +219,7 @@ def define() -> type:
                 return amplitudes_of(layers, self.index, self.plate_index, np)
 
         def _mirrors(self, sine2: Float) -> list[Mirrors]:
-            """Of the transverse field for s and p, at an outer angle's sine squared.
+            """Amplitudes of the transverse field for s and p, at an outer angle's sine squared.
 
             One entry where both are the same.
             """

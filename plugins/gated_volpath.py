@@ -473,7 +473,7 @@ def define() -> type:
         ) -> tuple[Lidar, Sample, UInt, Float, Float]:
             """Samples of the gates: lidar, samples, cells, twice the nearest and farthest range.
 
-            Of light emitted later there is less before the gate: the sample's delay is taken off.
+            The sample's delay is subtracted from the ranges: light emitted later travels less far.
             """
             lane = dr.arange(mi.UInt32, count * sensor.gate_count * rounds)
             # opaque, so that numbers of gates, samples and passes are not compiled into the kernel

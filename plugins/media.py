@@ -40,8 +40,8 @@ def coefficients(
 def narrowest_peak(media: Iterable[Medium], wavelengths: Float) -> Float:
     """The forward peak of the media's most forward-peaked phase function: a width of 1 - cos.
 
-    That of a cone which would have all light, were it everywhere as bright as ahead; 2 of isotropic
-    scattering. For guiding alone: where a phase function varies, that at the origin.
+    It is the width of a cone of the peak's density that would contain all light; 2 for isotropic
+    scattering. It only guides sampling: a phase function that varies is taken at the origin.
     """
     context, width = mi.PhaseFunctionContext(), 2.0
     onward, aside = mi.Vector3f(0, 0, 1), dr.normalize(mi.Vector3f(1e-3, 0, 1))

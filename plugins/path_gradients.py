@@ -109,7 +109,7 @@ def _traced(
     """One walk along the paths: the sums of their light, or its remainder after a replay.
 
     ``coming`` is light, ``hidden`` light that a single vertex without scattering would give, were
-    its coefficient the largest one of its medium. Of a replay also the derivatives; with ``chosen``
+    its coefficient the largest one of its medium. A replay also gives the derivatives, ``chosen``
     the vertex at which a path goes on to this order.
     """
     rng, channel, tracks = mi.PCG32(sample.rng), lidar.channel, chosen is not None

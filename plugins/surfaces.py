@@ -141,8 +141,8 @@ class Air:
     ) -> tuple[Float, MediumPtr]:
         """The same end, or that at an open surface, and the medium behind.
 
-        Of surfaces that coincide within rounding, light crosses first the one in front of which is
-        the medium that it is in: the last one is that whose far side is in front of no other.
+        Among surfaces that coincide within rounding, light first crosses the one whose front medium
+        it is in: the last is the one whose back medium is in front of no other.
         """
         crossings = [sheet.next_crossing(origin, direction, start, active) for sheet in self.sheets]
         for place, _, _ in crossings:

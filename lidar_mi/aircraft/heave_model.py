@@ -94,7 +94,7 @@ class HeaveModel:
         return np.array([self.deflection[0], self.deflection[1], self.symmetric])
 
     def _equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Per state, and per force, pitching and rolling moment, aileron, elevator, symmetric."""
+        """Rates per state; per force, pitching and rolling moment, aileron, elevator, symmetric."""
         motion, inputs = np.zeros((_STATES, _STATES)), np.zeros((_STATES, 6))
         motion[_Z, 1] = 1.0
         motion[_HEAVE, _HEAVE] = self.heave.motion

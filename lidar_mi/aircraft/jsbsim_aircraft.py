@@ -162,8 +162,8 @@ class JSBSimAircraft:
     def _bent(self, by_wind: np.ndarray) -> tuple[float, float]:
         """Bending moments of port and starboard wing, changes from the trim, N m.
 
-        JSBSim knows no lift along the span: strips of its wing at its angle of attack, which is
-        that by its motion alone, and at its roll rate.
+        JSBSim has no lift distribution along the span: it is that of strips of its wing at its roll
+        rate and its angle of attack, which is by its motion alone.
         """
         fdm, (incidence, load_factor) = self._fdm, self._trim
         motion = np.array([0.0, fdm["aero/alpha-rad"] - incidence, fdm["velocities/q-rad_sec"]])

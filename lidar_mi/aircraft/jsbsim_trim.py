@@ -41,7 +41,7 @@ def such_as(name: str) -> str:
 
 
 def check_aeroplane(name: str, path: Path) -> None:
-    """Refuse what does not fly on wings, with ailerons, driven by an engine.
+    """Refuse aircraft without wings, ailerons or an engine.
 
     JSBSim computes its aerodynamic forces at the speed and altitude of the path, at angles of
     attack of 0 and 4 degrees, and at the latter with the ailerons deflected.
@@ -92,7 +92,7 @@ def trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec
     Raises
     ------
     InputError
-        There is no equilibrium. Or there is no JSBSim, or it has no such aircraft.
+        No equilibrium, no JSBSim, or no such aircraft.
     RuntimeError
         From JSBSim, of an aircraft that it cannot load or start.
     """

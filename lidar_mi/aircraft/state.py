@@ -212,7 +212,7 @@ def ailerons_deflected(
 ) -> tuple[float, float]:
     """Both ailerons, each within its limits and at most at its rate; roll has the first claim.
 
-    Of the travel that a commanded roll leaves, the symmetric deflection gets what it asks for.
+    The symmetric deflection is limited to the travel that a commanded roll leaves.
     Antisymmetric and symmetric deflection (rad) come and go in this order, as by `deflected`.
     """
     largest, way = limits.deflection[0], limits.rate[0] * dt

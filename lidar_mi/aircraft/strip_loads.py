@@ -56,7 +56,7 @@ class Memory:
         self._before = np.zeros(0)
 
     def __call__(self, dt: float, value: np.ndarray) -> np.ndarray:
-        """Effective input dt (s) after the last one; the first has been there for ever; (n,)."""
+        """Effective input (n,) dt (s) after the last one; the first input is a steady state."""
         if self._state is None:
             self._state = self._weights * value
         elif dt > 0:

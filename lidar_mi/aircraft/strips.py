@@ -144,9 +144,9 @@ def in_downwash(tail: Strips, section_slope: float, aspect_ratio: float) -> Stri
     """A horizontal tail in the downwash of a wing that meets the same wind.
 
     Far behind an elliptic wing the induced angle is twice that at the wing: the tail keeps the
-    fraction 1 - 2 n a_n / (pi A) of the n-th mode, with the wing's slope a_n. The downwash is
-    there at once, and that of the wind's linear parts is taken for all of it. Slope and aspect
-    ratio are the wing's, as in `finite_span_slope`.
+    fraction 1 - 2 n a_n / (pi A) of the n-th mode, with the wing's slope a_n. The downwash has no
+    delay, and that of the wind's linear parts is used for all of it. Slope and aspect ratio are the
+    wing's, as in `finite_span_slope`.
     """
     fractions = [
         1 - 2 * n * finite_span_slope(section_slope, aspect_ratio, n) / (np.pi * aspect_ratio)

@@ -134,7 +134,7 @@ class CCD(Description):
 
     @property
     def output_noise(self) -> float:
-        """Rms of what does not depend on the light, electrons behind the gain.
+        """Rms noise that does not depend on the light, electrons behind the gain.
 
         Read noise and 1 / sqrt(12) of a step of the digitiser.
         """

@@ -183,7 +183,7 @@ def attenuation_factor(rendered: _Rendered, depth: np.ndarray) -> float:
     """Factor of the attenuation that remains with multiple scattering.
 
     Platt (1981): the ratio of the signal to single scattering's is exp(2 (1 - q) t) in the optical
-    depth t. Of the least squares of its logarithm, weighted by the Monte Carlo variance.
+    depth t. Least squares of its logarithm, weighted by the Monte Carlo variance, give q.
     """
     ratio = np.log(np.maximum(rendered.signal, rendered.single) / rendered.single)
     # a floor: variances from few samples are uncertain

@@ -14,7 +14,7 @@ _SMALLER = 4
 
 
 def within_memory(integrator: Any, render: Callable[[], T]) -> T:
-    """What a function renders; where memory is full, again in passes of a quarter of the samples.
+    """Result of a renderer, repeated in passes of a quarter of the samples if memory is full.
 
     The integrator keeps the smaller passes, for the images that follow. Images do not depend on
     them but for rounding.

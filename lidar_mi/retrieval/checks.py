@@ -23,8 +23,8 @@ def checked_stack(
 ) -> tuple[list[xr.DataArray], float | xr.DataArray | None]:
     """All images, and the noise if it is an image, with these dims on one uniform grid.
 
-    Noise need not be known where image 1 is not finite either, as outside of the beams of a
-    resampled scan: it is the median there, and counts for nothing.
+    Where image 1 is not finite either, as outside of the beams of a resampled scan, unknown noise
+    is replaced by the median, which has no effect.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def identical(
 ) -> str:
     """Which images, counted from a start, are the same as the one before, in words; empty: none.
 
-    Two exposures never are: there is one image where two were meant.
+    Two exposures never are: one image was given twice.
     """
     same = [
         f"{first} and {first + 1}"

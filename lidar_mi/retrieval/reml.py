@@ -60,7 +60,7 @@ def most_likely(
     reached = misfit(factors)
     for _ in range(_ROUNDS):
         weight = np.sqrt(number) / variances(factors)
-        wanted = np.maximum(observed - known, 0.0) * weight
+        wanted = (observed - known) * weight
         step = lsq_linear((scaled * weight).T, wanted, (0.0, most), method="bvls").x - factors
         # a full step may overshoot, to variances near 0
         tried = [factors + 0.5**n * step for n in range(_HALVINGS)]

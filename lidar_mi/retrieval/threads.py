@@ -57,7 +57,7 @@ def mapped(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> list
 def in_turn(
     function: Callable[[_Part], _Result], parts: Iterable[_Part]
 ) -> Generator[_Result, None, None]:
-    """What `mapped` returns, in the parts' order, each as soon as it is there."""
+    """Results of the parts in their order, each as soon as it is computed."""
     parts = list(parts)
     before = torch.get_num_threads()
     number = min(len(parts), _AVAILABLE.get() or before)

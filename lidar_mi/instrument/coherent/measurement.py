@@ -30,11 +30,10 @@ def measured_lines(
 ) -> xr.Dataset:
     """Radial velocities with noise, in the layout of `read_lines_of_sight`.
 
-    Noise is normal with the standard deviation of the Cramér-Rao bound: of weak signals, below
-    some -20 dB, real estimates have false ones in addition, which are not modelled. Where the bound
-    exceeds the spread of velocities that are uniform over the bandwidth, they are that, and
-    flagged. Gates that overlap share their samples: noise at the distance x correlates by
-    1 - x / gate length.
+    Noise is normal with the standard deviation of the Cramér-Rao bound. False estimates of weak
+    signals, below some -20 dB, are not modelled. Where the bound exceeds the standard deviation of
+    velocities uniform over the bandwidth, velocities are uniform, and flagged. Gates that overlap
+    share their samples: noise at the distance x correlates by 1 - x / gate length.
 
     Parameters
     ----------

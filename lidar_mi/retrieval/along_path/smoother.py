@@ -255,7 +255,7 @@ class PathField:
     def _weights(
         self, to_left: np.ndarray, to_right: np.ndarray, two: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of the states of two slabs, (n, states): simple kriging with an exponential."""
+        """Weights of two slabs' states, (n, states): simple kriging, exponential correlation."""
         reach = self.basis.reach
         a, b = to_left[:, None] / reach, to_right[:, None] / reach
         inside = (two & (to_left > 0) & (to_right > 0))[:, None]

@@ -132,8 +132,8 @@ class StatisticsEstimator:
     Cosines of a slab are nearly independent (Whittle 1954), and each depends on the same cosine of
     the slab before (Vecchia 1988, J. R. Stat. Soc. B 50): the likelihood is that of the Gaussian
     conditional distributions, for every combination of `LENGTHS`, `MEANS` and `RATIOS`, each with
-    the variance that is most likely. The prior probability of all is the same but for the scale of
-    the errors; the most probable combination is taken.
+    the variance that is most likely. All have the same prior, except for the scale of the errors;
+    the most probable one is taken.
     """
 
     stride: float
@@ -214,7 +214,7 @@ def _likelihood(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Logarithms of the variances, and squares over them, of turbulence of variance 1.
 
-    Dims as of `_SHAPE`. Errors that are known are over the `sigma` estimated last (m/s).
+    Dims of `_SHAPE`. Known errors are divided by the last estimate of `sigma` (m/s).
     """
     now, product, before, count, error, common = sums
     number = np.maximum(count, 1e-9)

@@ -36,10 +36,10 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
 
         c = sum omega^2 (v, w) / sum omega^2 ,   omega = dw/dy - dv/dz .
 
-    The swirl of a vortex itself cancels. The mean wind and the induction by the others remain.
-    Exact for round vortices of equal strength far from each other and from the edge; of a pair 20
-    to 47 m apart with cores of 3 m on nodes of 1 to 2 m the descent is right to 1 %. Where vortices
-    drift by different velocities it is their mean.
+    The swirl of a vortex itself cancels. The mean wind and the induction by the others remain. It
+    is exact for round vortices of equal strength far from each other and from the edge; for a pair
+    20 to 47 m apart with cores of 3 m on nodes of 1 to 2 m the descent is right to 1 %. Of vortices
+    that drift at different velocities it is the mean.
 
     The standard errors are the larger of two: the propagated errors of the vectors, correlated as
     their windows overlap; and the scatter of the drift within the pattern,

@@ -46,7 +46,7 @@ def apparent_slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.
 def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
     """v and w of a data set with the covariance of their errors, or with errors of ``std`` (m/s).
 
-    Vectors that are flagged for nothing but an unknown error are valid with ``std``.
+    With ``std``, vectors whose only flag is an unknown error are valid.
 
     Raises
     ------

@@ -152,9 +152,9 @@ def evidence_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Evidence of standard deviations of u for several shapes of its covariance.
 
-    Where ``fixed`` is white, one rotation makes S = fixed + std^2 shape tridiagonal for all
+    After whitening by ``fixed``, one rotation makes S = fixed + std^2 shape tridiagonal for all
     standard deviations. ``fixed`` (lines, lines) is the covariance of the lines' velocities without
-    u's, positive definite; the ``residual`` (lines,) is theirs from what is expected.
+    u's, positive definite; ``residual`` (lines,) are observed less expected velocities.
 
     Returns
     -------
@@ -183,8 +183,8 @@ def _tridiagonal(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Diagonals T of symmetric matrices A = Q T Q^T, by Householder's reflections, and Q^T vectors.
 
-    It takes a third of the time of eigenvectors, which the evidence does not need. Of matrices
-    (number, n, n) and vectors (number, n): the diagonal, the one beside it, and Q^T vectors.
+    For matrices (number, n, n) and vectors (number, n): the diagonal, the off-diagonal, and Q^T
+    vectors. It takes a third of the time of eigenvectors, which the evidence does not need.
     """
     if matrices.shape[1] == 1:
         return matrices[:, 0], matrices[:, 0, :0], vectors

@@ -88,9 +88,9 @@ def bootstrap_covariance(
       texture.
 
     The vectors retrieved from this pair are d - h (1 - G) d + e, with the mean G over a window, the
-    fraction h of least squares, and the random errors e. A vector lacks h (1 - G) of the wind and
-    all that is finer: that is the `unresolved_motion.unresolved` U. As the residual is less than
-    the images' differences by what the vectors follow, e is as well, by the leverage L. So
+    fraction h of least squares, and the random errors e. Vectors lack h (1 - G) d and all finer
+    motion, whose covariance is U (`unresolved_motion.unresolved`). The vectors follow part of the
+    images' differences, so that the residual, and with it e, is too small by the leverage L. So
 
         C = L s^2 <e e / s^2> f / (f - 2) + U,
 
@@ -98,9 +98,9 @@ def bootstrap_covariance(
     variance s^2 of the noise where that is known of each pixel. With f errors in a mean, normalised
     errors have Student's distribution, of the variance f / (f - 2).
 
-    Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
-    that are passed the tests of texture by chance, and their errors are no evidence.
-    Where the known motion is recovered in less than half of them, nor are the errors of these.
+    Errors are unknown where most textured windows around (Gaussian of 4.5 templates) are not
+    `clear`, as windows then pass the tests of texture by chance, and where the known motion is
+    recovered in less than half of them.
 
     Parameters
     ----------
@@ -114,8 +114,8 @@ def bootstrap_covariance(
         Windows are deformed, and vectors belong to their centres, not half their displacement
         further on.
     textured : torch.Tensor of bool, shape windows.count, optional
-        Windows whose errors count; default: all. Errors of windows that hold nothing say nothing
-        of their neighbours.
+        Windows whose errors count, as those of windows without texture say nothing of their
+        neighbours; default: all.
     clear : torch.Tensor of bool, shape windows.count, optional
         Windows that pass thresholds of texture half as high again; default: all.
     noise : float or torch.Tensor, optional

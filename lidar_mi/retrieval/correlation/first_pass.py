@@ -79,11 +79,11 @@ def first_pass(
     """Displacement (components, *grid.shape) by large windows, and where it was replaced.
 
     Windows without a vector (`whole_pixels`), or that their neighbours contradict, take the
-    neighbours' median.
-    Images are also correlated by windows of half and of a quarter of the size. These count where
-    the images, warped by what they find, correlate better by 0.1: in a rotation of 0.3 px per px
-    the texture at the rim of a window of 32 px moves 5 px away from that in the middle. Of the
-    first two images, whose spline is band-limited; the windows are those of the last pass.
+    neighbours' median. Images are also correlated by windows of half and of a quarter of the size.
+    They are used where the images, warped by their displacement, correlate better by 0.1: in a
+    rotation of 0.3 px per px the texture at the rim of a window of 32 px moves 5 px away from that
+    in the middle. It uses the first two images; ``spline`` is band-limited, ``windows`` are those
+    of the last pass.
     """
     if windows.dims > 2:
         d, centres = _of_volumes(images, spline, windows)
@@ -197,7 +197,7 @@ def volume_scores(
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Correlation (shifts, ...) of windows of averaged volumes, and their centres in voxels.
 
-    NaN where volume 1 has no contrast, -1 where too little is left to compare.
+    NaN where volume 1 has no contrast, -1 where too little overlaps.
     """
     shape = tuple(values.shape[1:])
     reach = max(1, round(windows.reach / 2))

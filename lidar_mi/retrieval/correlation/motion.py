@@ -16,7 +16,7 @@ _AROUND = 5
 def motion_around(
     image1: torch.Tensor, image2: torch.Tensor, windows: Windows, continued: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Displacement (2, z, y) around every pixel, px, and how far (z, y) vectors there are from it.
+    """Displacement (2, z, y) around every pixel, px, and the scatter (z, y) of vectors about it.
 
     The median of 5 x 5 vectors of such windows, and that of their distances from it; where there
     is none 0, or the nearest ones (`continued`).

@@ -174,8 +174,8 @@ def travelled(d: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
 def _curved(fit: "_Fit", sigma: float, stride: int, reach: int) -> torch.Tensor:
     """Variance (components, ...) by the displacement's curvature over Gaussian windows.
 
-    Without what the noise of the gradients adds: of white noise a gradient has 1 / (2 sigma^2) of
-    the displacement's variance.
+    The part by noise is subtracted: for white noise a gradient has 1 / (2 sigma^2) of the
+    displacement's variance.
     """
     laplacian, by_noise = curvature(fit.gradient, reach)
     variance = fit.covariance.diagonal().movedim(-1, 0)

@@ -1,8 +1,8 @@
 """Motion that windows do not resolve, from the residuals that it leaves in the images.
 
-A window gives the mean of the displacement over itself. What that mean lacks displaces the texture
-within the window, so that images matched by the vectors differ: by u, where the slopes are g, by
-g u. Noise differs as well, but not more where slopes are steep.
+A window gives its mean displacement. The displacement u about that mean moves the texture within
+the window, so that images matched by the vectors differ by g u, with the slopes g. Noise differs as
+well, but not more where slopes are steep.
 """
 
 from typing import NamedTuple
@@ -86,17 +86,17 @@ def unresolved(
 ) -> Unresolved:
     """Covariance of the displacement that vectors lack.
 
-    It has two parts. Near the scale of a window it varies as the vectors do: they are low-pass
-    filtered by their windows, and M is the covariance of the part h (1 - G) d of the displacements
-    d that another window takes away, less that of random errors, over a Gaussian of `width`. What
-    is finer has the same variance everywhere. With the residual r of the given pair, r' that of the
-    known motion less the known part, and L the leverage, the mean of
+    It has two parts. Near the scale of a window it varies as the vectors do: windows are low-pass
+    filters, and M is the covariance of the part h (1 - G) d of the displacements d that a second
+    window would remove, less that of random errors, over a Gaussian of `width`. Finer motion has
+    the same variance everywhere. With the residual r of the given pair, r' that of the known motion
+    less the known part, and L the leverage, the mean of
 
         r^2 - L r'^2 = a s^2 + k (b g M g + c g g),    b >= 1, c >= 0
 
-    gives b M + c 1 by least squares, weighted by the level s^-4. The term a takes up what does not
-    vary as the slopes do. b = 1 is the least: what a second window takes away the first has taken
-    away too. k is the visible fraction, see `_visible`.
+    gives b M + c 1 by least squares, weighted by the level s^-4. The term a is the part that does
+    not vary with the slopes. b >= 1, as the first window has removed what a second would remove. k
+    is the visible fraction, see `_visible`.
 
     Parameters
     ----------
@@ -135,11 +135,11 @@ def unresolved(
 
 
 def _significant(terms: torch.Tensor, square: torch.Tensor, visible: float) -> np.ndarray:
-    """Factors (2,) of the last two terms by least squares, as far as they are not by chance.
+    """Factors (2,) of the last two terms by least squares, as far as they are significant.
 
-    With the least values, k and 0, the sum of squares is larger by F variances. By chance F is 2 in
-    the mean, as two factors are fitted: of the difference from the least values the fraction
-    1 - 2 / F is taken (Efron & Morris 1973, J. Am. Stat. Assoc. 68, 117-130).
+    The least values, k and 0, increase the sum of squares by F variances, of which 2 are expected
+    by chance, as two factors are fitted: the difference from the least values is multiplied by 1 -
+    2 / F (Efron & Morris 1973, J. Am. Stat. Assoc. 68, 117-130).
     """
     least = np.array([visible, 0.0])
     fit = _least_squares(terms, square, [-np.inf, *least])
@@ -163,10 +163,10 @@ def _visible(
 ) -> tuple[float, float]:
     """Fractions of motion finer than windows that show in the residual: of it, of its variance.
 
-    Windows see g u and follow it by J^-1 <g g u>, J = <g g>, < > being means over the window: by
-    chance not by the mean <u>. So the residual is less than g u, most where slopes are steep. u is
-    the motion within windows, of one local variance everywhere; the fraction of its variance is
-    that of the coefficients of g g in the squares of the residual and of g u.
+    Windows measure g u and follow it by J^-1 <g g u>, J = <g g>, < > being means over the window:
+    this differs by chance from the mean <u>. So the residual is less than g u, most where slopes
+    are steep. u is the motion within windows, of one local variance everywhere; the fraction of its
+    variance is that of the coefficients of g g in the squares of the residual and of g u.
     """
     slopes, use = residuals.slopes, residuals.use
     square = _products(windows.of_centres(within), valid, width / windows.stride)

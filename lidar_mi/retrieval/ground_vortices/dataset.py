@@ -39,7 +39,7 @@ class ScanVortices:
 def ordered(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (vortices, 4), cores in m, the smaller y first, and their covariance.
 
-    That has the fraction of the other profile as its last row and column.
+    The last row and column of the covariance are of the fraction of the other profile.
     """
     vortices = fit.state.vortices
     order = np.argsort(vortices[:, 0], kind="stable")

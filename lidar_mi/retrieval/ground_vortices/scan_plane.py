@@ -149,7 +149,7 @@ def _passes(angle: np.ndarray, time: np.ndarray) -> list[slice]:
 def _clock(steps: np.ndarray) -> float:
     """Resolution of times in which several lines are equal, s; 0: none are.
 
-    Lines that are there twice are not: a clock repeats a fifth of all times or more.
+    Lines stored twice do not count: a clock repeats a fifth of all times or more.
     """
     positive = steps[steps > 0]
     if not positive.size or np.mean(steps == 0) < 0.2:
@@ -243,8 +243,8 @@ def _azimuth(azimuth: np.ndarray, elevation: np.ndarray) -> float:
 def _noise_variance(velocity: np.ndarray) -> np.ndarray:
     """Variance of independent noise from second differences of three lines, each gate its own.
 
-    Robust, by the median of their absolute values; the air adds to it what differs from line to
-    line.
+    It is robust, from the median of their absolute values; differences of the air from line to line
+    add to it.
     """
     second = velocity[:-2] - 2 * velocity[1:-1] + velocity[2:]
     known = np.isfinite(second).any(0)

@@ -106,9 +106,9 @@ def motion(
 ) -> np.ndarray:
     """Velocity (..., vortices, 2) of vortices along y and z, m/s.
 
-    Of the wind at their height and of each other's induction, and of the images below the ground:
-    vortices of opposite circulation as far below it. The wind is a polynomial of the height above
-    the reference (m): m/s, m/s per m, ...
+    It is the wind at their height, the induction of each other, and that of the image vortices of
+    opposite circulation below the ground. The wind is a polynomial of the height above the
+    reference (m): m/s, m/s per m, ...
     """
     y, z, circulation, core = np.moveaxis(vortices, -1, 0)
     above = z - reference

@@ -52,8 +52,8 @@ class Window:
 
         If ``limited``, no less than the present one.
 
-        From their second differences over seven lines and three gates: where the vortices widen the
-        spectra, velocities are less certain than elsewhere.
+        It is estimated from their second differences over seven lines and three gates, as
+        velocities are less certain where the vortices widen the spectra.
         """
         lines = self.lines
         full = np.full((len(lines.time), len(lines.ranges)), np.nan)
@@ -94,8 +94,8 @@ def window_of(
 ) -> Window | None:
     """Cells between two ranges (m) and two angles (rad); None: hardly any.
 
-    Gates are left out until they are half a gate length apart or more; lines are averaged over
-    ``cell`` at the middle of the ranges, and over more where there were too many cells.
+    Gates are thinned to half a gate length or more; lines are averaged over ``cell`` at the middle
+    of the ranges, or over more to limit the number of cells.
     """
     gates = np.flatnonzero((scan.ranges >= ranges[0]) & (scan.ranges <= ranges[1]))
     lines = np.flatnonzero((scan.angle >= angles[0]) & (scan.angle <= angles[1]))

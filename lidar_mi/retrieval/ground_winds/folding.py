@@ -128,8 +128,7 @@ def _without_wind(
 def ambiguous(design: np.ndarray, wind: np.ndarray, nyquist: float | None) -> bool:
     """Whether few lines measure the same velocities, folded, in another wind that is as likely.
 
-    Of winds that are normal with 15 m/s a component, the other has a tenth of the probability or
-    more.
+    For normal winds of 15 m/s a component, the other wind has at least a tenth of the probability.
     """
     if nyquist is None or _directions(design) >= _LINES:
         return False

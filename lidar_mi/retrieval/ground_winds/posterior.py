@@ -1,9 +1,8 @@
 """Mean wind over the lines of a scan: noise and turbulence as one Gaussian process.
 
-Lines of one scan see different air. Neighbouring lines see nearly the same eddies, so that the
-scatter of the velocities about a uniform wind tells less about its error than that of independent
-numbers would. Here the wind is a mean and von Karman's turbulence; what is asked for is its average
-along the path from line to line.
+Neighbouring lines measure nearly the same eddies, so that the scatter of the velocities about a
+uniform wind says less about its error than that of independent numbers. Here the wind is a mean and
+von Karman's turbulence; estimated is its average along the path from line to line.
 """
 
 import math
@@ -18,9 +17,8 @@ from lidar_mi.retrieval.ground_winds.turbulence_covariance import of_average, of
 LENGTHS = (50.0, 200.0, 800.0)
 """Length scales of turbulence that are considered, m: those of the boundary layer.
 
-A few lines do not tell the length, and half of what is unknown of the error is in it: all are
-equally likely before the data. Turbulence that is smaller than the distance of the lines acts as
-noise.
+Few lines do not determine the length, which causes half of the error's uncertainty: the prior of
+all is equal. Turbulence smaller than the distance of the lines acts as noise.
 """
 
 NOISE_FRACTIONS = (0.003, 0.03, 0.2, 0.6, 0.97)
@@ -146,8 +144,8 @@ def mean_wind(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Average wind over the path of a level (3,), m/s, and its covariance (3, 3).
 
-    Under each model by universal kriging (Cressie, Statistics for Spatial Data, 1993, section 3.4);
-    the spread of the models is part of the error.
+    Both are by universal kriging under each model (Cressie, Statistics for Spatial Data, 1993,
+    section 3.4); the spread of the models is part of the error.
     """
     path = level.path[:: math.ceil(len(level.path) / _MOST_PLACES)]
     means = level.averaged(level.design)

@@ -193,7 +193,7 @@ def _scans(lines: xr.Dataset, interval: float | None) -> Iterator[np.ndarray]:
 class _Cells:
     """Usable gates of a scan: line, gate and level of each, heights of the levels, their stride.
 
-    Levels that are one stride apart share no air; `all` is how many gates a level has, usable or
+    Levels that are one stride apart share no air; `all` is the number of a level's gates, usable or
     not.
     """
 

@@ -296,7 +296,7 @@ def shell_means(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Power spectrum by shells of wavenumber, mean over the images; white noise gives its variance.
 
-    So it does where only some pixels are `known`, (images, ...), and the others are the mean.
+    This holds also where only some pixels are `known`, (images, ...), and the others are the mean.
 
     Each shell's value is a mean over `smoothing` neighbours. Returns these means and their
     relative standard errors.

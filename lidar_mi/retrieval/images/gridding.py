@@ -44,13 +44,11 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
     a linear trend: Matheron 1963, Econ. Geol. 58, 1246-1266; Cressie 1993, Statistics for Spatial
     Data, sect. 3.4) for a structure of Gaussian covariance of 1.5 spacings. It passes through the
     beams' values and is exact for fields linear in place. Standard errors follow from the same
-    weights and independent errors of the beams; those of neighbouring nodes are correlated
-    afterwards. What the weights leave of the structure of `Y` and `Y_noisy` becomes
-    `Y_resampling_std` and `Y_noisy_resampling_std`, see `resampling_error`: the white noise that
-    counts as much as these errors, which are correlated between nodes. So does what nodes share of
-    the beams' noise. The `beam_time` is averaged
-    with the same weights, and is within those of the scan: where beams next to each other have
-    very different times, a node's value mixes times (see `one_instant`).
+    weights and independent errors of the beams. The kriging error of `Y` and `Y_noisy`, and the
+    noise that neighbouring nodes share, become `Y_resampling_std` and `Y_noisy_resampling_std`:
+    the white noise of the same weight as these correlated errors, see `resampling_error`. The
+    `beam_time` is averaged with the same weights, within the times of the scan; where beams next
+    to each other have very different times, a node's value mixes times (see `synchronised`).
 
     Parameters
     ----------
@@ -130,8 +128,8 @@ def _resampling_error(
 ) -> xr.DataArray:
     """Standard deviation of what resampling adds to an image's white noise, of its nodes.
 
-    What the weights leave of the structure, and the sums of the noise's covariances with all other
-    nodes: sums of pixels vary by these, whatever the correlation.
+    It is the kriging error of the structure, plus the noise's covariances with all other nodes, by
+    which sums of pixels vary.
     """
     image = scan[name].transpose("z", "y")
     values = image.values.ravel().astype(float)

@@ -20,10 +20,10 @@ _TENSION = 0.1
 def inpainted(values: np.ndarray) -> np.ndarray:
     """Values with smooth ones in place of non-finite ones.
 
-    These minimise the sum of the squared second differences along the axes and, so that slopes do
-    not go on for long, of a tenth of the squared first ones: a thin plate under tension (Smith &
-    Wessel 1990, Geophysics 55, 293-305). Steps to any constant would be structure at rest. Beyond
-    8 px from the known ones they are constant. Some value must be finite.
+    They minimise the squared second differences along the axes plus a tenth of the squared first
+    ones, which makes slopes fade: a thin plate under tension (Smith & Wessel 1990, Geophysics 55,
+    293-305). Steps to any constant would be structure at rest. Beyond 8 px from the known ones they
+    are constant. Some value must be finite.
     """
     missing = ~np.isfinite(values)
     distance, nearest = distance_transform_edt(missing, return_indices=True)
@@ -60,7 +60,7 @@ def inpainted(values: np.ndarray) -> np.ndarray:
 def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.Tensor:
     """An image `inpainted`, all of it or only where some pixels are.
 
-    As it is if it is finite all over, or nowhere.
+    Unchanged if it is finite everywhere; zero if nowhere.
     """
     smooth = _replaced(image, inpainted)
     return smooth if pixels is None else torch.where(pixels, smooth, image)

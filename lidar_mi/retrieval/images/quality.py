@@ -164,9 +164,9 @@ def of_bootstrap(covariance: torch.Tensor) -> torch.Tensor:
 def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """Where a displacement's variance is above a quarter of the variance of all about their mean.
 
-    Means over the components of d (components, ...) and covariance (components, components, ...).
-    Everywhere where that holds of the median variance of all. An error below 0.05 px is small for
-    any wind: in uniform wind no error is small compared with its spread.
+    Variances are means over the components of d (components, ...) and covariance (components,
+    components, ...). All have no skill where the median variance has none. Errors below 0.05 px
+    always have skill, as in uniform wind every error exceeds the spread.
     """
     known = covariance.isfinite().all(0).all(0) & d.isfinite().all(0)
     if not bool(known.any()):
@@ -187,8 +187,8 @@ def worst_variance(covariance: torch.Tensor) -> torch.Tensor:
 def misfit_variance(misfit: torch.Tensor, valid: torch.Tensor, number: int) -> torch.Tensor:
     """Variance of white noise from its sums of squares about the mean of `number` values each.
 
-    The median of valid ones over that of chi-square with number - 1 degrees of freedom: a few
-    places where more than noise differs change it little. 0 without any sum; of shape ().
+    The median of valid ones over that of chi-square with number - 1 degrees of freedom, robust
+    against a few places where more than noise differs. Shape (); 0 without any sum.
     """
     median = torch.where(valid, misfit, torch.nan).nanmedian()
     return median.nan_to_num(0.0) / chdtri(number - 1, 0.5)
@@ -212,8 +212,8 @@ def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
 def informative(images: Sequence[torch.Tensor]) -> torch.Tensor:
     """Pixels (images, ...) that filters hardly mix with non-finite ones.
 
-    They are three away from these, and one away from lines and single pixels of an image: across a
-    pixel smooth values (`inpainting.inpainted`) are good guesses.
+    They are three pixels away from these, but only one from lines and single pixels of an image,
+    across which smooth values (`inpainting.inpainted`) are good guesses.
     """
     bad = torch.stack([~torch.isfinite(image) for image in images])
     if bad.ndim > 3 or not bool(bad.any()):

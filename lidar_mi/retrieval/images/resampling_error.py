@@ -68,7 +68,7 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
     """The variogram that fits the differences of neighbouring beams best (Cressie 1985).
 
     Bins of distance and time count by their number of pairs over the square of the model (Cressie
-    1985, Math. Geol. 17, 563-586). What no distance explains is the noise.
+    1985, Math. Geol. 17, 563-586). The rest is the noise.
     """
     half = ((values[near.near] - values[:, None]) ** 2 / 2).ravel()
     distance, delay = np.linalg.norm(near.separation, axis=-1).ravel(), np.abs(near.delay).ravel()
@@ -105,13 +105,12 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
 def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray) -> xr.Dataset:
     """The wind with vectors flagged where resampling lost more than stated errors can hold.
 
-    What is lost depends on the air and on the places of the beams, which are at rest: it is not
-    only noise, but also a bias. Flagged are vectors with a place at most half a template away, over
-    whose template its mean square exceeds 4 times that of the noise: a smooth field carries the
-    bias to its neighbours. With no place but those over the template, errors in the interior of
-    Lissajous figures are 1.5 to 1.7 times as large as stated. All vectors are flagged where two
-    thirds of those that have a displacement are: the others' errors are then up to 2.6 times as
-    large as stated.
+    The loss depends on the air and on the fixed places of the beams: it is a bias as well as noise.
+    Flagged are vectors with a place at most half a template away, over whose template its mean
+    square exceeds 4 times that of the noise: a smooth field carries the bias to its neighbours. If
+    only places over the template counted, errors in the interior of Lissajous figures would be 1.5
+    to 1.7 times as large as stated. All vectors are flagged where two thirds of those that have a
+    displacement are: the others' errors are then up to 2.6 times as large as stated.
 
     Parameters
     ----------
@@ -137,8 +136,8 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
 class LeaveOneOut(NamedTuple):
     """Beams estimated from their neighbours.
 
-    Places (n, 2), squared errors without noise (n,), and what these are for `structure` of
-    strength 1 (n,); the noise of a beam and the strength in the mean.
+    Places (n, 2), squared errors without noise (n,), their expectation for `structure` of strength
+    1 (n,); mean noise of a beam and mean strength.
     """
 
     places: np.ndarray
@@ -158,9 +157,9 @@ def leave_one_out(
 ) -> LeaveOneOut:
     """Beams with the noise that explains their squared errors, together with the structure.
 
-    A beam that its neighbours estimate errs by the structure between them and by the noise of all,
-    ``noisy`` times that of one. Both are fitted, not below 0, to means over bins of the structure's
-    part: where beams are close only the noise is left.
+    The error of a beam estimated from its neighbours is due to the structure between them and to
+    the noise of all, ``noisy`` times that of one. Both are fitted, not below 0, to means over bins
+    of the structure's part: of close beams only the noise remains.
     """
     edges = np.quantile(expected, np.linspace(0, 1, _NOISE_BINS + 1)[1:-1])
     index = np.searchsorted(edges, expected)

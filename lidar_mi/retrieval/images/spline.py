@@ -264,7 +264,7 @@ def band_limited(
 
 
 def likeliest(image: torch.Tensor, settings: FilterSettings) -> Spline:
-    """Spline through what an image most likely is without its white noise: its Wiener filter.
+    """Spline through an image after its Wiener filter, which removes white noise.
 
     Of texture of spectral density S with noise N, S / (S + N) of the image is the mean of the
     texture given the image. The filter of `band_limited` is g = sqrt(S / (S + N / 2)), so that this

@@ -296,7 +296,7 @@ def _explains(pattern: Pattern, noise: float) -> bool:
 def _rings_alone(sectors: Sectors, spacing: float | None) -> Pattern | None:
     """Lines of the strongest period where they explain the profile, of a longer one where not.
 
-    None where neither does: nothing is hidden of rings that are not there.
+    None where neither does: without rings nothing is hidden.
     """
     profile, noise = _profile(sectors)
     if spacing is None:
@@ -338,8 +338,8 @@ class _Law:
 def _law(fit: CurveFit) -> _Law:
     """Least squares of square = (order + fraction) spacing, weighted as for white noise.
 
-    The standard errors are those of the rings; where the rings deviate more than these allow, at
-    the level of 1 %, they are scaled up to the deviation.
+    Standard errors follow from those of the rings; where the rings deviate more, at the
+    significance of 1 %, they are scaled to the deviation.
     """
     lines = len(fit.pattern.fraction)
     rows = np.column_stack([fit.order, fit.line[:, None] == np.arange(lines)]).astype(float)

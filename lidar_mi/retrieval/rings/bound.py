@@ -32,7 +32,7 @@ _WORST_CONDITION = 1e13
 def standard_deviations(fisher: torch.Tensor) -> torch.Tensor:
     """Roots of the diagonal of the inverse, NaN where there is none, shape (images, free).
 
-    There is none, either, where rounding alone makes the matrix invertible.
+    Matrices that only rounding makes invertible have none.
     """
     scale = fisher.diagonal(dim1=1, dim2=2).rsqrt()
     scaled = fisher * scale[:, :, None] * scale[:, None, :]

@@ -162,8 +162,8 @@ class _State:
 class _Fit(_State):
     """The instrument after a fit.
 
-    ``covariance`` is that of what all frames have in common, by ``names``; ``speed_by_shared`` and
-    ``speed_variance`` are the frames' own speeds' dependence on it and their own variances.
+    ``covariance`` is that of the parameters ``names``, which all frames share; ``speed_by_shared``
+    is the dependence of each frame's speed on them, ``speed_variance`` its variance without them.
     """
 
     names: tuple[str, ...]

@@ -44,7 +44,7 @@ def combined(
     lines : sequence of Calibration
         Two or more, all for the same nominal gap.
     gap, gap_tolerance : float
-        The nominal gap times its refractive index, and what it may differ by, m.
+        The nominal gap times its refractive index, and its largest error, m.
     mirror_orders : sequence of float
         Of every line, by which the mirrors' phase shifts its orders.
     wavelength_accuracy : float
@@ -118,8 +118,8 @@ def combined(
 class _Geometry:
     """Estimate from one line of the shared part of the instrument.
 
-    ``information`` is the inverse of its covariance, ``determined`` that of its
-    frames without the prior, which all lines have in common.
+    ``information`` is the inverse of its covariance, ``determined`` that of its frames without the
+    prior, as all lines share the prior.
     """
 
     places: list[int]  # in `Calibration.systematic`

@@ -67,9 +67,9 @@ def ring_centre(image: np.ndarray) -> tuple[float, float]:
 
     As `gradient_centre`, but robust: the lines along gradients count by how close to the centre
     they pass (Geman and McClure 1985, Proc. Stat. Comp. Sect. ASA, 12), from several starts and
-    distances that become smaller. Those of a sloping background, of edges and of hot pixels pass it
-    by. Of the points found, on the image and on the image without its coarse structure, the one
-    about which averages over circles have the largest contrast is the centre.
+    distances that become smaller. Those of a sloping background, of edges and of hot pixels miss
+    it. Candidates are from the image and from the image without its coarse structure; the one about
+    which averages over circles have the largest contrast is the centre.
 
     Raises
     ------

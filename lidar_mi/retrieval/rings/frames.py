@@ -102,8 +102,8 @@ def few_levels(image: np.ndarray) -> str:
     Rounding to steps q is like uniform noise of variance q^2 / 12 where the noise before it has a
     standard deviation of q / 2 or more: then all moments of the sum are those of independent
     numbers to 1 % (Widrow & Kollar 2008, Quantization Noise, chapter 4). Below, crests are flat and
-    slopes are steps, which is structure. Counts of single photons have coarser steps, but the
-    variance of these: their mean times q.
+    slopes are steps, which is structure. Counts of single photons have coarser steps, with their
+    own variance: their mean times q.
     """
     values = np.unique(image)
     if values.size > MOST_LEVELS:
@@ -141,8 +141,8 @@ def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tenso
 def patches(image: torch.Tensor) -> torch.Tensor:
     """Pixels of bright patches, as of a reflection, and those within 2 px of one.
 
-    Brighter than the crests, taken as the brightest percent, by half of what these are above the
-    median. Where that is more than `MOST_SPOTS` of the pixels it is no patch, and none is.
+    They exceed the crests, taken as the brightest percent, by half of the crests' height above the
+    median. Where these are more than `MOST_SPOTS` of the pixels, none is a patch.
     """
     low, high = np.quantile(image.cpu().numpy(), [0.5, 0.99])
     bright = (image > high + 0.5 * (high - low)).float()[None, None]

@@ -263,7 +263,8 @@ class _Task(NamedTuple):
 def _fit(images: torch.Tensor, task: _Task, number: int, method: str) -> RingFit:
     """`fit_rings` for some of the images, from the ``number``-th on.
 
-    If one is refused, each is fitted alone; what is refused then, without its bright patches.
+    If one is refused, each is fitted alone; those refused again are fitted without their bright
+    patches.
     """
     try:
         return _fit_together(images, task, number, method)

@@ -165,9 +165,9 @@ def matched_score(
 def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
     """Speeds and all other parameters of images near a reference.
 
-    Frames are summed up over the cells once, which takes most of the time. They are not searched
-    for hot pixels or saturated crests, as by `fit_rings`: an image that has some is not ``read``
-    once they show in chi-square. Images (images, height, width) are in electrons.
+    Frames are summed up over the cells once, which takes most of the time. Unlike in `fit_rings`
+    they are not searched for hot pixels or saturated crests: an image with some is not ``read``
+    where chi-square is too large. Images (images, height, width) are in electrons.
 
     Raises
     ------
@@ -200,8 +200,8 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
 def _read(means: torch.Tensor, score: MatchedScore) -> tuple[torch.Tensor, ...]:
     """Parameters of some images from the cells' centre, errors, chi-square, and convergence.
 
-    From means (images, cells) to (images, `PARAMETERS`), (images, names), (images,) and whether
-    the last step was small, (images,). An image whose last step was small is not looked at again.
+    From means (images, cells) to (images, `PARAMETERS`), (images, names), (images,) and whether the
+    last step was small, (images,). Images whose last step was small are finished.
     """
     model, names, columns = score.model, score.names, _columns(score)
     at, mean = _started(score, means)

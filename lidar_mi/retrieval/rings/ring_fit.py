@@ -131,8 +131,8 @@ def fit_all(
 def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
     """Where the rings of a pattern are lower than `HIDDEN` of the usual ring, for certain.
 
-    The height of a ring in a sector is by least squares over an order about it, together with a
-    level and a slope.
+    The height of a ring in a sector is a least-squares fit over one order about it, with a level
+    and a slope.
     """
     if pattern is None:
         return None

@@ -79,8 +79,8 @@ class Hidden:
 class Sectors:
     """Averages over sectors of annuli of equal steps in squared mean radius.
 
-    Out to where the last sector leaves the image. A sector cut by the edge has no pixels: it would
-    average another part of the image.
+    They extend to where the last sector leaves the image. Sectors cut by the edge have no pixels,
+    as they would average another part of the image.
 
     Attributes
     ----------

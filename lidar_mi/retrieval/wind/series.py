@@ -53,7 +53,7 @@ def retrieve_winds(
     beam_times : sequence of xr.DataArray, optional
         When each pixel of each image was seen, as ``times`` of `retrieve_wind`.
     notice : callable, optional
-        Called with a text and the fraction done (0 to 1) for each pair, before its wind is there.
+        Called with a text and the fraction done (0 to 1) for each pair, before its retrieval.
     **options
         Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``windows``,
         ``validation`` and so on.

@@ -147,7 +147,7 @@ def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
 
 
 def _without_gaps(image: xr.DataArray) -> xr.DataArray:
-    """The nearest value beyond the beams: vectors there fail, and not all around them."""
+    """The nearest value beyond the beams, so that only vectors there fail."""
     image = image.transpose("z", "y")
     return image.copy(data=nearest_filled(image.values))
 
