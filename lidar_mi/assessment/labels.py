@@ -13,7 +13,7 @@ METHOD_NAMES: Mapping[str, str] = {
     ImageMethod.VORTEX_FIT: "vortex fit",
     VolumeMethod.CORRELATION: "correlation",
 }
-"""Methods that winds are retrieved by, as figures and tables call them."""
+"""Names of the wind retrieval methods in figures and tables."""
 
 SOURCE_NAMES: Mapping[str, str] = {
     Source.BACKSCATTER: "backscatter",
@@ -22,7 +22,7 @@ SOURCE_NAMES: Mapping[str, str] = {
     Source.BLURRED: "extinction blurred by the beam",
     Source.WITHOUT_TEXTURE: "extinction without texture",
 }
-"""What winds are retrieved from, as figures and tables call it."""
+"""Names of the data that winds are retrieved from in figures and tables."""
 
 BACKSCATTER = "attenuated backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"
 

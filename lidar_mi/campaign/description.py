@@ -18,7 +18,7 @@ KEYS = ("base", "sweep", "sample", "members")
 """Keys that only a campaign has."""
 
 LARGEST = 10**7
-"""Values of a dimension, points of a sample, members: more are a slip of the pen."""
+"""Most values of a dimension, points of a sample, members: more are a typing error."""
 
 
 class Span(Description):

@@ -33,18 +33,18 @@ from lidar_mi.progress import Notice
 from lidar_mi.schema.shipped import campaign_file
 
 MOST_UNASKED = 100_000
-"""Points of a campaign that runs without a confirmation."""
+"""Most points of a campaign that runs without confirmation."""
 
 PATIENCE = 15.0
-"""Seconds for a scheduler to answer."""
+"""Longest time for a scheduler to answer, s."""
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 _TRIES = 10
-"""Workers that may be lost while they are made ready."""
+"""Most workers that may be lost while they are made ready."""
 
 _AT_ONCE = 4
-"""Tasks per thread that the scheduler holds: enough that no worker waits."""
+"""Tasks per thread that the scheduler holds, so that no worker waits."""
 
 
 @dataclass(repr=False)

@@ -18,7 +18,7 @@ from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import registry, split_quantity
 
 MEMBER, SAMPLE = "member", "sample"
-"""Names of dimensions that are no key."""
+"""Names of dimensions that are no keys."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from multiprocessing import process, spawn
 from lidar_mi.errors import InputError, causes, one_line
 
 PATIENCE = 300.0
-"""Seconds for a process to start, on a machine that is busy."""
+"""Longest time for a process to start on a busy machine, s."""
 
 _FILES, _FILES_EACH = 16, 11
 """Files that dask opens in this process, and for each worker: 25, 35 and 56 for 1, 2 and 4."""

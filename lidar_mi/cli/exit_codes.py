@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 NOTHING_FOUND = 1
 BAD_INPUT = 2
 BY_SIGNAL = 128
-"""Plus the number of the signal."""
+"""Exit code of a signal, less its number."""
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

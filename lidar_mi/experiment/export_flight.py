@@ -9,7 +9,7 @@ import xarray as xr
 from lidar_mi.io.netcdf import read_netcdf
 
 FLIGHT_FILES = {"series": "flight.nc", "track": "track.nc", "slabs": "slabs.nc"}
-"""Of the time series of flights, of the lidar's track, of images and wind vectors of its slabs."""
+"""Files of the time series, of the lidar's track, of images and wind vectors of its slabs."""
 
 _SIDES = ("port", "starboard")
 _FOR_A_REPLAY = ["parameter", "parameter_2", "vector_row", "vector_column", "arrival"]

@@ -50,7 +50,7 @@ USUAL = (
     Usual("wake.vortex_pair.core_radius", "m", 0.05, 15.0, "1 to 5 % of the wing span, later 15 %"),
     Usual("wake.turbine.wind_speed", "m/s", 2.0, 35.0, "from cut-in to beyond cut-out"),
 )
-"""Nothing outside is known of instruments, aircraft and wakes; 0 and infinity are idealisations."""
+"""Ranges of all known instruments, aircraft and wakes; 0 and infinity are idealisations."""
 
 # factors of likely wrong units: a prefix, a degree in place of a milliradian
 _SLIPS = (1e-3, 1e3, 1e-6, 1e6, 1e-9)

@@ -246,8 +246,8 @@ def retrieve_v_los(
 
     >>> import lidar_mi as lm
     >>> import numpy as np
-    >>> found = lm.retrieve_v_los(np.full((1, 780, 960), 30.0))
-    >>> float(found.v_los[0]), str(found.status[0].values)
+    >>> speeds = lm.retrieve_v_los(np.full((1, 780, 960), 30.0))
+    >>> float(speeds.v_los[0]), str(speeds.status[0].values)
     (nan, 'image: its gradients have no common centre; expected rings')
     """
     doppler = doppler_of(instrument)

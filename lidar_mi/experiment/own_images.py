@@ -23,7 +23,7 @@ from lidar_mi.retrieval.wind.synchronised import synchronised
 Level = float | xr.DataArray | None
 
 _TOLERANCE = 1e-3
-"""Relative difference between a time step given and one from headers that is rounding."""
+"""Relative difference of a given time step from that of the headers by rounding."""
 
 
 @checked_arguments

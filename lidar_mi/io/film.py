@@ -11,10 +11,10 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 
 QUALITY = 55
-"""Of lossy frames, 0 to 100."""
+"""Quality of lossy frames, 0 to 100."""
 
 VIDEO_EXTRA = "a video needs PyAV; expected pip install 'lidar-mi[film]'"
-"""What is said where there is none."""
+"""Message where PyAV is missing."""
 
 _COLOURS = 128
 # Constant rate factor of x264: 23 is its default, higher is smaller.

@@ -41,7 +41,7 @@ _KINDS = (
 )
 _ZARR = (".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json")
 _LIBRARY = "netCDF4"
-"""Reads files that h5py and SciPy do not, where it is installed."""
+"""Optional library for files that h5py and SciPy cannot read."""
 
 
 def open_netcdf(path: str | Path, group: str | None = None) -> xr.Dataset:

@@ -14,7 +14,7 @@ from lidar_mi.errors import InputError
 
 _BTS_HEAD = struct.Struct("<h4i6f6fi")
 _BTS_KINDS = (7, 8)
-"""Of one run, and periodic."""
+"""Files of one run, and periodic ones."""
 
 _ATTRS = {"units": "m s-1"}
 

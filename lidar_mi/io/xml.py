@@ -6,7 +6,8 @@ from xml.parsers import expat
 from lidar_mi.errors import InputError
 
 DEEPEST = 64
-"""Levels of tags; a scene needs six. Mitsuba's parser calls itself for each: its stack ends."""
+"""Most levels of tags; a scene needs six. Mitsuba's parser recurses into each, and its stack is
+limited."""
 
 
 def check_scene_file(path: str | Path) -> None:

@@ -10,11 +10,11 @@ from lidar_mi.errors import InputError, one_line
 from lidar_mi.io.text import read_text
 
 LONGEST = 128 << 10
-"""Bytes of a YAML file."""
+"""Most bytes of a YAML file."""
 LARGEST = 10_000
-"""Values in a file, those that aliases repeat included."""
+"""Most values in a file, including those that aliases repeat."""
 DEEPEST = 40
-"""Sections in sections."""
+"""Most levels of sections."""
 
 _LARGEST_NUMBER = 10**300
 # ten times as fast where PyYAML was built with libyaml

@@ -12,7 +12,7 @@ from lidar_mi.schema.section import section_in, tagged_section
 from lidar_mi.units import Unit, Within, to_si
 
 A_NAME = "at most 100 letters, digits, _, . and -, a letter or digit first"
-"""What the only pattern allows, that of names."""
+"""The names that the pattern allows."""
 
 
 def first_fault(error: ValidationError, model: type[BaseModel]) -> str:

@@ -32,7 +32,7 @@ OF_A_FILE = {
     "keys are merged over those of the base, and null removes a section",
     "variants": "several experiments in one file: names, each with the keys that it changes",
 }
-"""Keys of a file that are none of an experiment."""
+"""Keys of a file that are not keys of an experiment."""
 
 _MOST_SUGGESTED = 4
 
@@ -50,7 +50,7 @@ class Key:
     words: tuple[str, ...]
     """Values that are words, if it takes any."""
     more: tuple[str, ...]
-    """Paragraphs of its section about it; of a section, all of its own."""
+    """Paragraphs of its section about it; for a section, all of them."""
     keys: tuple[str, ...]
     """Names of the keys of a section."""
     listed_in: str

@@ -110,7 +110,7 @@ class Check:
 
 @dataclass(frozen=True, repr=False)
 class Checkup(Tabular):
-    """What was found on this machine."""
+    """The checks of this machine."""
 
     checks: tuple[Check, ...]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 GIB = 1 << 30
 UNKNOWN_GPU = 2 * GIB
-"""Bytes that a GPU is taken to have free where nothing says how many."""
+"""Free bytes assumed for a GPU where they are unknown."""
 
 
 def machine_memory() -> int:

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.quiver import Quiver
 
 TRUE_CORE = "true core"
-"""What labels of markers of true vortices begin with."""
+"""Prefix of the labels of true vortices."""
 
 _MOST_LINES = 8
 

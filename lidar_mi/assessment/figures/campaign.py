@@ -25,7 +25,7 @@ from lidar_mi.assessment.metrics.sensitivity import SobolIndices
 
 FAILED, ABSENT, DOT = "#a4161a", "#e4e4e4", "#3b6ea5"
 _FEW = 6
-"""Up to so many values along an axis each has its tick, and every cell its number."""
+"""Most values of an axis with a tick each, and numbers in the cells."""
 COLOURS = ("#1f5fa8", "#c2571a", "#2c7a3f", "#8a3a8f", "#7a6200", "#4a4a4a", "#b0306a", "#0d7f86")
 
 
@@ -70,7 +70,7 @@ def colour_scale(values: xr.DataArray) -> Normalize:
 
 
 Limits = Mapping[str, xr.DataArray]
-"""What is not negative where a limit is met, over the knobs, by what the limit is called."""
+"""Margins over the knobs, by the name of the limit; negative where it is not met."""
 
 
 def draw_map(

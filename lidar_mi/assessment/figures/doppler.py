@@ -65,7 +65,7 @@ def draw_all(
         Images of the laser and of the air at the first speed, without and with noise.
     samples : xr.Dataset or None
         Image of the laser's light, traced path by path.
-    found, metrics
+    velocities, metrics
         From `lidar_mi.experiment.stages.ring_velocities.velocities`,
         `lidar_mi.assessment.metrics.velocities`.
     """

@@ -115,8 +115,8 @@ def chosen(metrics: Mapping[str, xr.DataArray], names: Sequence[str] | None) -> 
         "encounter.lead_time",
         "encounter.normalised_innovation",
     ]
-    found = [key for key in defaults if key in finite]
-    return found or sorted(finite)[:8]
+    present = [key for key in defaults if key in finite]
+    return present or sorted(finite)[:8]
 
 
 def _best_method(metrics: Mapping[str, xr.DataArray], finite: set[str]) -> str:

@@ -9,11 +9,11 @@ import xarray as xr
 from lidar_mi.assessment.metrics.errors import error_statistics
 
 PREFIX = "coherent."
-"""Of all metrics here."""
+"""Prefix of all metrics here."""
 
 PUBLISHED = {"circulation_error": 0.04, "place_error": 0.06}
-"""Errors of circulation and place that are published for simulated scans with known truth, of the
-circulation and of the separation (DLR's LES Lidar Simulator; J. Atmos. Oceanic Technol. 42(3),
+"""Published errors of circulation and place for simulated scans with known truth, relative to the
+circulation and the separation (DLR's LES Lidar Simulator; J. Atmos. Oceanic Technol. 42(3),
 2025)."""
 
 _QUANTITIES = ("y", "z", "circulation")

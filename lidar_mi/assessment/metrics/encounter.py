@@ -19,7 +19,7 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 from lidar_mi.assessment.metrics.wind_ahead import wind_ahead_metrics
 
 CONTROLLER = "controller"
-"""Attribute of the time series: the name of a controller of one's own."""
+"""Attribute of the time series: the name of a user's controller."""
 
 MET = "met"
 """Attribute of the time series: what a flight meets, "wake" (by default) or "air"."""
@@ -46,7 +46,7 @@ AFTER = 5
 _ROUNDING = 1e-9
 
 _FELT = 0.1
-"""Fraction of the largest rolling moment of the wake from which on it counts as felt."""
+"""Fraction of the wake's largest rolling moment at which it counts as felt."""
 
 _CIRCULATIONS = ("port_circulation", "starboard_circulation")
 _PLACES = ("port_y", "port_z", "starboard_y", "starboard_z")

@@ -19,7 +19,7 @@ ACCEPTED_RATIO = 0.2
 """Roll control ratio of the wake up to which it is uncritical (Schwarz and Hahn 2006)."""
 
 ACCEPTED_BANK = math.radians(7)
-"""Bank angle (rad) beyond which it is called out on an approach (Flight Safety Foundation 2000)."""
+"""Largest bank angle (rad) on an approach without a call-out (Flight Safety Foundation 2000)."""
 
 
 def roll_control_ratio(moment: ArrayLike, largest: float) -> float:

@@ -12,9 +12,10 @@ import xarray as xr
 from lidar_mi.atmosphere.vortices.cores import Core, ring_averages
 
 MOST_DIVERGENCE = 0.5
-"""Of a cross-section, by `relative_divergence`. Sections of a simulated wake have 0.1, those of
-isotropic turbulence 1 / sqrt(5) (Taylor 1935: <(du/dx)^2> is a fifth of the mean square of a
-component of the vorticity). With a component or an axis of the wrong sign they have 1."""
+"""Largest plausible `relative_divergence` of a cross-section. Sections of a simulated wake have
+0.1, those of isotropic turbulence 1 / sqrt(5) (Taylor 1935: <(du/dx)^2> is a fifth of the mean
+square of a component of the vorticity). With a component or an axis of the wrong sign they have
+1."""
 
 
 def relative_divergence(wind: xr.Dataset) -> float:

@@ -21,7 +21,7 @@ RENDERED = (Source.BACKSCATTER, Source.NOISY)
 """Sources that are images of the lidar; the second one behind a detector."""
 
 OUTSIDE_CORES = "outside_cores."
-"""Of errors beyond two core radii, before the quantity."""
+"""Prefix to the quantity for errors beyond two core radii."""
 
 
 def far_from_cores(metrics: Mapping[str, float], prefix: str, quantity: str) -> str:

@@ -38,7 +38,7 @@ _LEAST_DEPARTURE = 3.0
 
 
 def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
-    """What a run found, the same on the terminal, in the report and in `summary.txt`.
+    """The results of a run in sentences, on the terminal, in the report and in `summary.txt`.
 
     Parameters
     ----------

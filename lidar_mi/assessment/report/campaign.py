@@ -27,7 +27,7 @@ from lidar_mi.units import conversion, usual_unit
 _PANELS = 16
 _FEW = 4
 _ROWS = 36
-"""Of the table of points, at most."""
+"""Most rows of the table of points."""
 _DONE, _FAILED = 0, 1
 
 
@@ -86,7 +86,7 @@ def answer(dataset: xr.Dataset) -> str:
 
 
 Margins = Mapping[tuple[str, str], Mapping[str, numbers.Interval]]
-"""Of each quantity, by application and phase of flight."""
+"""Margins of each quantity, by application and phase of flight."""
 
 
 def _axes(dataset: xr.Dataset) -> dict[str, Axis]:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 GOAL = 0.8
-"""Fraction of what perfect preview removes beyond the autopilot that the lidar should remove: the
-project's own goal, from no standard and not from the paper."""
+"""Goal for the lidar, as a fraction of what perfect preview removes beyond the autopilot: the
+project's own, from no standard and not from the paper."""
 
 _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),

@@ -27,7 +27,7 @@ UNSTEADINESS = 0.5
 """Rate of a mode over sqrt(k^3 E(k)) (Fung et al., J. Fluid Mech. 236, 281-318, 1992)."""
 
 MODES = 600
-"""Waves of a field."""
+"""Number of modes of a field."""
 
 # Longest waves over the length scale, 2 pi / (k L): 5e-5 of von Karman's energy is in longer ones.
 _LOWEST = 0.05

@@ -14,7 +14,7 @@ from lidar_mi.io import exr
 from lidar_mi.io.arrays import read_arrays, write_arrays
 
 MADE_BY = "run_sha256"
-"""Attribute of an image: the hash of what it was rendered from."""
+"""Attribute of an image: the hash of its inputs."""
 BATCHES = "_batches.npz"
 """Suffix to the name of an unfinished image: its samples so far."""
 

@@ -47,7 +47,7 @@ from lidar_mi.schema.wake import Wake
 from lidar_mi.units import shown
 
 LEAST_SHOWN = 0.5
-"""Seconds of a part of a run that is shown."""
+"""Least time of a part of a run that is shown, s."""
 
 
 def sections(

@@ -21,7 +21,7 @@ from lidar_mi.schema.site import Site
 from lidar_mi.schema.wake import ExtinctionMapping
 
 SHORTEST_WAVELENGTH, LONGEST_WAVELENGTH = 0.2e-6, 2e-6
-"""m, of the refractive index of air; beyond, molecules scatter less than 7e-8 m^-1."""
+"""Wavelengths (m) of the refractive index of air; beyond, molecules scatter less than 7e-8 m^-1."""
 
 
 class ClearAir(NamedTuple):

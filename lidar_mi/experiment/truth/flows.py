@@ -30,9 +30,9 @@ Flows = tuple[xr.Dataset, xr.Dataset | None]
 Advection = Callable[[xr.DataArray], xr.DataArray]
 
 _LEAST_PLANES = 4
-"""Of a file, along x: a cubic spline needs four."""
+"""Least planes of a file along x: a cubic spline needs four."""
 _EDGE = 2
-"""Nodes at either end along x that air in the gates must not come from.
+"""Nodes at either end along x from which no air of the gates may come.
 
 Beyond the ends a spline has the value at the end.
 """

@@ -14,7 +14,7 @@ from lidar_mi.experiment.truth.flows import Flows, mean_flow
 from lidar_mi.instrument.scan import ScanPlan
 
 LARGEST_STEP = 0.25
-"""Node spacings by which air moves from one state to the next, at most.
+"""Largest motion of the air from one state to the next, node spacings.
 
 Between states the renderer is linear in time. A wave of 4 nodes, the shortest that a grid carries,
 is then displaced by 0.63 * 0.25^3 / 4^2 = 0.0006 nodes at most, and its amplitude is 2 % smaller

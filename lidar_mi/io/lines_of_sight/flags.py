@@ -19,7 +19,7 @@ rejects as well.
 BLIND_RANGE = {"Halo Photonics (hpl)": 90.0, "ARM": 90.0, "": 0.0}
 """Range up to which the outgoing pulse is seen, m: three gates of 30 m of Halo Photonics' lidars.
 
-WindCube's gates begin behind it. Of others it is not known.
+WindCube's gates begin behind it. That of others is unknown.
 """
 
 HARD_TARGET_DB = 10.0
@@ -39,9 +39,9 @@ _LONGEST_PULSES = 4  # gate lengths that a reflection may cover
 
 
 EXCESS = 4.0
-"""Times that a repeated number is more frequent than its neighbours."""
+"""Least frequency of a repeated number over that of its neighbours."""
 LEAST_REPEATED = 40
-"""Cells that a repeated number has at least."""
+"""Least number of cells with a repeated number."""
 
 _LEAST_NOISE = 500  # gates: a tenth of uniform velocities is above 90 % of the largest, to 1.5 %
 _LEAST_GATES = 8  # whose velocities are not equal by coincidence

@@ -17,7 +17,7 @@ from lidar_mi.io.lines_of_sight.scan import Scan, seconds
 from lidar_mi.io.text import read_text
 
 LARGEST = 1 << 30
-"""Bytes: an hour of a stare has some ten millions."""
+"""Most bytes of a file: an hour of a stare has some ten million."""
 
 _KIND = "a Halo Photonics file (.hpl)"
 _COLUMNS = ("radial_velocity", "snr", "attenuated_backscatter", "spectral_width")

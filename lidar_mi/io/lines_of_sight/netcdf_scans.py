@@ -54,7 +54,7 @@ NAMES = {
     "longitude": ("longitude", "lon"),
     "altitude": ("altitude", "alt"),
 }
-"""Ours, and those of the makers in lower case, the most telling first."""
+"""Our names, and those of the makers in lower case, the most specific first."""
 
 _UNITS = {name: unit for name, (unit, _) in FIELDS.items()} | {"range": "m", "altitude": "m"}
 _EARTH_RADIUS = 6.371e6  # m, mean radius

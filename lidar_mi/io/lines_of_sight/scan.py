@@ -15,7 +15,7 @@ FIELDS = {
     "spectral_width": ("m s-1", "width of the Doppler spectrum"),
     "attenuated_backscatter": ("m-1 sr-1", "attenuated backscatter coefficient"),
 }
-"""Of a line and a gate: unit and meaning."""
+"""Quantities of a line and a gate: unit and meaning."""
 
 ANGLES = {
     "azimuth": "azimuth of the line of sight, clockwise from north",
@@ -23,14 +23,14 @@ ANGLES = {
     "pitch": "pitch of the platform, as reported: positive with the front up",
     "roll": "roll of the platform, as reported: positive with the right side down",
 }
-"""Of a line, degrees."""
+"""Angles of a line, degrees."""
 
 PLACE = {
     "latitude": ("degrees_north", "latitude of the lidar"),
     "longitude": ("degrees_east", "longitude of the lidar"),
     "altitude": ("m", "altitude of the lidar above mean sea level"),
 }
-"""Of the lidar: unit and meaning."""
+"""Place of the lidar: unit and meaning."""
 
 
 @dataclass(eq=False)
@@ -215,7 +215,7 @@ _ENCODINGS = (
     ("Julian days", 86400.0, 2440587.5),
     ("seconds since 1904 (LabVIEW)", 1.0, 2082844800.0),
 )
-"""Of numbers that are no seconds since 1970: name, seconds of a unit, number of 1970-01-01."""
+"""Encodings other than seconds since 1970: name, seconds of a unit, number of 1970-01-01."""
 
 
 def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[str]]:

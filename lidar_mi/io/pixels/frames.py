@@ -9,7 +9,7 @@ import numpy as np
 from lidar_mi.errors import InputError
 
 _EXACT = 2**53
-"""Whole numbers up to this one are exact as float64."""
+"""Largest whole number up to which all are exact in float64."""
 _ALPHA = 1
 
 

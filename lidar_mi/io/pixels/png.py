@@ -13,7 +13,7 @@ from lidar_mi.io.pixels.frames import Frames, damaged, frames_of, grey
 from lidar_mi.io.size import check_size
 
 _CHANNELS = {0: 1, 2: 3, 3: 4, 4: 2, 6: 4}
-"""By the format's type of colour, with transparency where there may be some."""
+"""Channels by the format's colour type, including transparency."""
 
 
 def read_png(path: Path) -> Frames:

@@ -24,9 +24,9 @@ _LOSSES = re.compile(
     r"out of range|discontiguous|OME series|TiffTag (2[5-9]|3[0-4])\d .*invalid"
 )
 _IN_ORDER = "TZIQ"
-"""Axes along which images follow each other: time, depth, a sequence, one of no name."""
+"""Axes of a sequence of images: time, depth, a sequence, an unnamed one."""
 _ORDINARY = ("shaped", "uniform", "generic", "page")
-"""Series without metadata of their own about axes."""
+"""Series without metadata about axes."""
 _MINISWHITE, _MINISBLACK, _RGB, _PALETTE, _YCBCR, _RAW = 0, 1, 2, 3, 6, 34892
 _JPEG = (6, 7, 33007)
 _PHOTOMETRIC, _EXTRA, _ORIENTATION, _NODATA = 262, 338, 274, 42113

@@ -91,7 +91,7 @@ class _Windows:
 def detect(
     scan: PlaneScan,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     *,
     separations: tuple[float, ...] = SEPARATIONS,
     single: bool = False,
@@ -106,7 +106,7 @@ def detect(
     if windows is None:
         return Detection(-np.inf, 1.0, 0.0, [], Air(0.3, LENGTHS[0]))
     air = _air(windows, lidar)
-    z, information = _scores(windows, air, lidar, given, separations, single)
+    z, information = _scores(windows, air, lidar, assumed, separations, single)
     signs = np.abs(z) if single else z
     # turbulence that is stronger than in most windows, or of another length, spreads all scores
     spread = np.maximum(1.0, 1.4826 * np.median(np.abs(z), axis=1, keepdims=True))
@@ -123,7 +123,7 @@ def detect(
         score,
         _chance(windows, level, score, 2 if single else 1),
         float(scipy.special.expit(total)),
-        _candidates(windows, signs, z, information, separations, single, given),
+        _candidates(windows, signs, z, information, separations, single, assumed),
         air,
     )
 
@@ -230,7 +230,7 @@ def _scores(
     windows: _Windows,
     air: Air,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     separations: tuple[float, ...],
     single: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +240,7 @@ def _scores(
     information = np.zeros_like(z)
     kinds = np.round(windows.angle / _ANGLES).astype(int)
     templates = {
-        kind: _templates(windows, kind * _ANGLES, lidar, given, separations, single)
+        kind: _templates(windows, kind * _ANGLES, lidar, assumed, separations, single)
         for kind in np.unique(kinds)
     }
     packed = np.packbits(windows.usable, axis=1)
@@ -279,7 +279,7 @@ def _templates(
     windows: _Windows,
     elevation: float,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     separations: tuple[float, ...],
     single: bool,
 ) -> np.ndarray:
@@ -290,7 +290,7 @@ def _templates(
     same = np.full(_ROWS, _CELL / far)
     lines = lines_of(np.zeros(_ROWS), angle, same, np.zeros(_ROWS), far + windows.offsets, lidar)
     templates = []
-    core = math.log(max(given.core_radius, 2.0))
+    core = math.log(max(assumed.core_radius, 2.0))
     for separation in (0.0,) if single else separations:
         total = np.zeros((_ROWS, windows.offsets.size))
         for side in (1,) if single else (1, -1):
@@ -298,7 +298,7 @@ def _templates(
             place = np.array([y, far * math.sin(elevation)])
             places = np.broadcast_to(place, (_ROWS, 2, 2))
             strength = np.array([float(side), core])
-            total += radial_velocity(lines, places, strength, None, given.model)[0]
+            total += radial_velocity(lines, places, strength, None, assumed.model)[0]
         templates.append(total.ravel())
     return np.stack(templates)
 
@@ -355,7 +355,7 @@ def _candidates(
     information: np.ndarray,
     separations: tuple[float, ...],
     single: bool,
-    given: Assumptions,
+    assumed: Assumptions,
 ) -> list[Candidate]:
     """The best places near the best of all, each some metres from the better ones."""
     places = windows.centre * np.stack([np.cos(windows.angle), np.sin(windows.angle)])
@@ -363,7 +363,7 @@ def _candidates(
     near = np.hypot(*(places - places[:, best[1], None])) < _NEAR
     candidates: list[Candidate] = []
     taken: list[np.ndarray] = []
-    core = math.log(given.core_radius)
+    core = math.log(assumed.core_radius)
     order = np.argsort(np.where(near, signs, -np.inf), axis=None)[::-1]
     for k in order[: int(near.sum()) * len(signs)]:
         template, place = np.unravel_index(int(k), signs.shape)

@@ -147,13 +147,15 @@ def start_state(window: Window, vortices: np.ndarray) -> State:
 
 
 def fitted(
-    window: Window, starts: Sequence[np.ndarray], air: Air, given: Assumptions
+    window: Window, starts: Sequence[np.ndarray], air: Air, assumed: Assumptions
 ) -> tuple[Fit, list[np.ndarray]]:
     """The likeliest fit from several starts (vortices, 4); the vortices of those as likely.
 
     Turbulence is estimated from the residuals; ``air`` is the first guess.
     """
-    first = Problem(window, given, crossing_time(window, starts[0]), float(starts[0][:, 1].mean()))
+    first = Problem(
+        window, assumed, crossing_time(window, starts[0]), float(starts[0][:, 1].mean())
+    )
     factor = first.factor(air)
     ends = []
     for start in starts:
@@ -176,9 +178,9 @@ def fitted(
     return problem.averaged(state, air, models, converged), others
 
 
-def residuals(window: Window, fit: Fit, given: Assumptions) -> np.ndarray:
+def residuals(window: Window, fit: Fit, assumed: Assumptions) -> np.ndarray:
     """Velocities of the cells less those of a fit (n,), m/s."""
-    problem = Problem(window, given, fit.time, fit.reference)
+    problem = Problem(window, assumed, fit.time, fit.reference)
     return window.velocity - problem.predicted(fit.state)[0]
 
 
@@ -195,7 +197,7 @@ class Problem:
     """
 
     window: Window
-    given: Assumptions
+    assumed: Assumptions
     time: float
     reference: float
     uneven: np.ndarray | float = 0.0
@@ -215,7 +217,7 @@ class Problem:
         for vortex in state.vortices:
             places = np.broadcast_to(vortex[:2], (*time.shape, 2))
             value, _ = radial_velocity(
-                lines, places, vortex[2:], self.given.ground, self.given.model
+                lines, places, vortex[2:], self.assumed.ground, self.assumed.model
             )
             size = UNEVEN_SWIRL * value[self.window.line, self.window.gate]
             near = np.exp(-((across * np.exp(-vortex[3])) ** 2 + along**2) / 2)
@@ -241,7 +243,7 @@ class Problem:
     def predicted(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Velocities (n,) of the cells and their derivatives (n, numbers)."""
         lines, number = self.window.lines, len(state.vortices)
-        ground, model = self.given.ground, self.given.model
+        ground, model = self.assumed.ground, self.assumed.model
         speed, speed_by = self._speeds(state)
         _, time = node_angles(lines)
         later = time - self.time
@@ -279,8 +281,8 @@ class Problem:
             shifted[:, :first].reshape(len(shifted), -1, OF_VORTEX),
             shifted[:, first + second + 1 :],
             self.reference,
-            self.given.ground,
-            self.given.model,
+            self.assumed.ground,
+            self.assumed.model,
         ) + shifted[:, first : first + second].reshape(len(shifted), -1, 2)
         ahead, behind = speed[1 : 1 + len(step)], speed[1 + len(step) :]
         slope = (ahead - behind) / (2 * step)[:, None, None]
@@ -291,7 +293,7 @@ class Problem:
         vector = state.vector
         likely, weight = np.zeros_like(vector), np.zeros_like(vector)
         cores = slice(3, state.vortices.size, OF_VORTEX)
-        likely[cores], weight[cores] = np.log(self.given.core_radius), CORE_SPREAD**-2
+        likely[cores], weight[cores] = np.log(self.assumed.core_radius), CORE_SPREAD**-2
         moves = slice(state.vortices.size, state.vortices.size + state.departures.size)
         weight[moves] = max(air.sigma, _LEAST_TURBULENCE) ** -2
         weight[moves.stop] = OTHER_PROFILE**-2

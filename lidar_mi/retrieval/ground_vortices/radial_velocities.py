@@ -19,13 +19,13 @@ _SEARCH = 25.0  # m around the first guess
 
 
 def by_radial_velocities(
-    scan: PlaneScan, lidar: CoherentLidar, given: Assumptions, guess: np.ndarray
+    scan: PlaneScan, lidar: CoherentLidar, assumed: Assumptions, guess: np.ndarray
 ) -> np.ndarray | None:
     """y, z (m) and circulation (m^2/s) of the vortices (n, 3); None: no extremes.
 
     Parameters
     ----------
-    given : Assumptions
+    assumed : Assumptions
         Profile and core radius.
     guess : (n, 4) array
         Vortices as of a candidate of the detection, which say where to search.
@@ -56,8 +56,8 @@ def by_radial_velocities(
         columns = []
         for place in places:
             at = np.broadcast_to(place, (rows.size, 2, 2))
-            core = np.array([1.0, np.log(given.core_radius)])
-            columns.append(radial_velocity(lines, at, core, given.ground, given.model)[0][:, 0])
+            core = np.array([1.0, np.log(assumed.core_radius)])
+            columns.append(radial_velocity(lines, at, core, assumed.ground, assumed.model)[0][:, 0])
         design.append(np.column_stack(columns))
         values.append((scan.velocity - _background(scan))[rows, gate])
     circulation, *_ = np.linalg.lstsq(np.concatenate(design), np.concatenate(values), rcond=None)

@@ -145,7 +145,7 @@ def fit_vortices_to_lines(
     if not 0 < false_alarm < 1:
         raise InputError(f"false_alarm: {false_alarm} is not allowed; expected between 0 and 1")
     core = core_radius or (0.05 * span if span else _LIKELY_CORE)
-    given = Assumptions(profile, ground, core)
+    assumed = Assumptions(profile, ground, core)
     separations: tuple[float, ...] = SEPARATIONS
     if span is not None:
         separations = tuple(math.pi / 4 * span * factor for factor in (0.85, 1.0, 1.2))
@@ -172,7 +172,7 @@ def fit_vortices_to_lines(
                 notice("fitting vortices", (number + k / len(scans)) / len(sets))
             # matrices are small: threads would wait for each other longer than they compute
             with threadpool_limits(1, "blas"):
-                fitted_scans.append(_scan(scan, lidar, given, kind, separations, false_alarm))
+                fitted_scans.append(_scan(scan, lidar, assumed, kind, separations, false_alarm))
         remarks += _of_overlapping_gates(fitted_scans[first:], data, lidar)
     about: dict[str, str | float] = {
         "profile": profile,
@@ -220,13 +220,13 @@ def _of_overlapping_gates(
 def _scan(
     scan: PlaneScan,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     kind: Kind,
     separations: tuple[float, ...],
     false_alarm: float,
 ) -> ScanVortices:
     single = kind == "single"
-    detection = detect(scan, lidar, given, separations=separations, single=single)
+    detection = detect(scan, lidar, assumed, separations=separations, single=single)
     if not detection.candidates or detection.false_alarm > false_alarm:
         return ScanVortices(scan, detection, None, VortexFlag.NO_WAKE.value, 1 if single else 2)
     starts = [candidate.vortices for candidate in detection.candidates]
@@ -234,21 +234,21 @@ def _scan(
     if window is None:
         return ScanVortices(scan, detection, None, VortexFlag.NO_FIT.value, 1 if single else 2)
     length = min(LENGTHS, key=lambda length: abs(math.log(length / detection.air.length)))
-    fit, others = fitted(window, starts, Air(detection.air.sigma, length), given)
+    fit, others = fitted(window, starts, Air(detection.air.sigma, length), assumed)
     if scan.sweeps and scan.step * window.lines.ranges.mean() > CELL:
         # with lines so far apart it matters whether the beam moves while it measures
         standing = replace(scan, sweeps=False)
         standing_window = _window(standing, lidar, np.concatenate(starts))
         if standing_window is not None:
             standing_fit, more = fitted(
-                standing_window, [fit.state.vortices, *starts], fit.air, given
+                standing_window, [fit.state.vortices, *starts], fit.air, assumed
             )
             if standing_fit.log_likelihood > fit.log_likelihood:
                 scan, window, fit, others = standing, standing_window, standing_fit, more
     if scan.stated != "gates":
-        residual = residuals(window, fit, given)
+        residual = residuals(window, fit, assumed)
         window = window.with_noise_of(residual, limited=scan.stated == "least")
-        fit, _ = fitted(window, [fit.state.vortices], fit.air, given)
+        fit, _ = fitted(window, [fit.state.vortices], fit.air, assumed)
     return ScanVortices(scan, detection, fit, _flag(scan, fit, others, lidar), 1 if single else 2)
 
 

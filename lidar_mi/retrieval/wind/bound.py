@@ -42,15 +42,15 @@ def wind_bound(
         As `retrieve_wind`.
     """
     dt = positive("dt", dt)
-    (image1, image2), known = checked_stack([image1, image2], noise)
+    (image1, image2), checked = checked_stack([image1, image2], noise)
     frame = windows.on(image1.shape)
-    level: float | torch.Tensor | None
-    if isinstance(known, xr.DataArray):
-        level = on_device(known.clip(min=1e-3 * float(known.median())), device)
+    sigma: float | torch.Tensor | None
+    if isinstance(checked, xr.DataArray):
+        sigma = on_device(checked.clip(min=1e-3 * float(checked.median())), device)
     else:
-        level = known
+        sigma = checked
     pair = [on_device(image, device) for image in (image1, image2)]
-    covariance = displacement_bound(filled(pair[0]), filled(pair[1]), level, frame.template)
+    covariance = displacement_bound(filled(pair[0]), filled(pair[1]), sigma, frame.template)
     rows, columns = (torch.as_tensor(frame.starts(axis)) for axis in (0, 1))
     root = covariance[:2, rows][:, :, columns].sqrt()
     bound = torch.where(non_finite(pair, frame), torch.nan, root).cpu().numpy()

@@ -73,7 +73,7 @@ def checked_input(
         if not np.isfinite(image.values).any():
             raise InputError(f"image{number}: no pixel is finite; expected light somewhere")
     if len(stack) > 2 and "more" not in method.options:
-        takes = ", ".join(name for name, known in METHODS.items() if "more" in known.options)
+        takes = ", ".join(name for name, taking in METHODS.items() if "more" in taking.options)
         raise InputError(
             f"more: {len(stack)} images are not allowed with method {method.name!r}; expected two, "
             f"or method {takes}"
@@ -83,9 +83,9 @@ def checked_input(
     pixel_times = checked_times(times, stack, dt)
     frame, blur_px = windows.on(stack[0].shape), _in_pixels(blur, stack[0])
     pixels = [on_device(image, device) for image in stack]
-    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    sigma = on_device(level, device) if isinstance(level, xr.DataArray) else level
     same = identical(stack)
-    return PairInput(stack, pixels, frame, dt, known, pixel_times, blur, blur_px, same)
+    return PairInput(stack, pixels, frame, dt, sigma, pixel_times, blur, blur_px, same)
 
 
 def _in_pixels(blur: float, image: xr.DataArray) -> float:

@@ -29,9 +29,9 @@ def expected_wind(
     `noise` and `device` are those of `retrieve_wind`.
     """
     (image1,), level = checked_stack([image1], noise)
-    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    sigma = on_device(level, device) if isinstance(level, xr.DataArray) else level
     with threads_for(image1.size):
-        return expected_flow(start, on_device(image1, device), known)
+        return expected_flow(start, on_device(image1, device), sigma)
 
 
 def wind_of_slab(

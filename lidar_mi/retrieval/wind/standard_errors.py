@@ -89,8 +89,8 @@ def standard_errors(
     variational = variational.where(variational["flag"] == 0)
     names = ("v", "w", "v_stderr", "w_stderr", "vw_correlation")
     near = variational[list(names)].interp(at).transpose("z", "y")
-    given = [component.transpose("z", "y") for component in (w, v)]
-    differences = (wind - near[name] for wind, name in zip(given, "wv", strict=True))
+    vectors = [component.transpose("z", "y") for component in (w, v)]
+    differences = (wind - near[name] for wind, name in zip(vectors, "wv", strict=True))
     d = torch.stack([torch.as_tensor(difference.values) for difference in differences])
     width = _WIDTH * window / step
     use = d.isfinite().all(0)
@@ -113,8 +113,8 @@ def standard_errors(
     on = ("z", "y")
     return xr.Dataset(
         {
-            "v": (on, given[1].values, about),
-            "w": (on, given[0].values, about),
+            "v": (on, vectors[1].values, about),
+            "w": (on, vectors[0].values, about),
             "v_stderr": (on, stderr[0], about | {"long_name": "standard error of v"}),
             "w_stderr": (on, stderr[1], about | {"long_name": "standard error of w"}),
             "vw_correlation": (on, total[0, 1] / np.prod(stderr, 0), {"units": "1"}),

@@ -132,7 +132,7 @@ def retrieve_wind_volume(
     stack, level = checked_stack([volume1, volume2, *more], noise, AXES, "volume")
     frame = windows.on(stack[0].shape)
     raw = [on_device(volume, device) for volume in stack]
-    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    sigma = on_device(level, device) if isinstance(level, xr.DataArray) else level
     steps, same = spacing(stack[0]), identical(stack, "volumes")
     structure = sampling(raw) if checks else no_structure(raw)
     if structure.thinned and samples_fit(stack[0], structure, windows, False):
@@ -156,7 +156,7 @@ def retrieve_wind_volume(
         for outlier, volume in zip(outliers, pixels, strict=True)
     ]
     displacement, copy = within_memory(
-        lambda: _displacements(pixels, known, method, frame, validation, settings, steps, checks)
+        lambda: _displacements(pixels, sigma, method, frame, validation, settings, steps, checks)
     )
     if same or structure.spoilt or structure.thinned:
         displacement = displacement._replace(flag=displacement.flag | Flag.AT_REST.value)
