@@ -14,6 +14,7 @@ from .experiment.own_images import retrieve_files
 from .experiment.results import Run
 from .experiment.run import run
 from .experiment.truth.extinction import make_truth
+from .flags import Flag
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
 from .io.lines_of_sight.cfradial import write_cfradial
@@ -25,7 +26,6 @@ from .rendering.variant import use_variant
 from .retrieval.ground_vortices.vortices import fit_vortices_to_lines
 from .retrieval.ground_winds.winds import fit_winds_to_lines
 from .retrieval.images.common_grid import on_one_grid
-from .retrieval.images.quality import Flag
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
 from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines

@@ -31,7 +31,7 @@ MOST_SHEETS = 64
 
 
 def parts_of_shape(shape: Shape) -> "list[Body | Sheet]":
-    """What is on both sides of a shape whose surface lets light pass: bodies and open surfaces."""
+    """Media on both sides of shapes whose surface lets light pass: bodies and open surfaces."""
     if shape.class_name() == "Sphere":
         return [Sphere(shape)]
     if not shape.is_mesh():
@@ -227,7 +227,7 @@ def slabs(low: Point, high: Point, origin: Point, direction: Vector) -> Line:
 
 def first_hit(scene: Scene, origin: Point, direction: Vector, active: Mask) -> tuple[Float, Vector]:
     """Distance of the first surface, infinite if there is none, and its normal."""
-    # one by one: packets of rays are slower here, coherent or not
+    # single rays: packets are slower here, coherent or not
     si = scene.ray_intersect(
         mi.Ray3f(origin, direction), ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active
     )
@@ -272,11 +272,11 @@ def _is_hollow(
     """Whether a piece is a cavity: within a larger one, and wound the other way round."""
     volume, (low, high) = volumes[index], boxes[index]
     return any(
-        other * volume < 0
-        and abs(other) > abs(volume)
+        other_volume * volume < 0
+        and abs(other_volume) > abs(volume)
         and (first <= low).all()
         and (high <= last).all()
-        for other, (first, last) in zip(volumes, boxes, strict=True)
+        for other_volume, (first, last) in zip(volumes, boxes, strict=True)
     )
 
 
@@ -307,8 +307,8 @@ def _affine(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 def _pieces(corners: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, bool]]:
     """Parts of a mesh, each with whether it is closed: Mitsuba merges shapes of one medium.
 
-    A part ends at the first face after which every edge has been passed as often one way as the
-    other; edges of a rim, for which that never holds, aside.
+    A part ends at the first face after which every edge, except those of a rim, has been passed as
+    often in either direction.
     """
     # corners of one place are one, whatever their normals and texture coordinates
     _, same = np.unique(corners, axis=0, return_inverse=True)
@@ -381,11 +381,11 @@ def _volume(corners: np.ndarray, faces: np.ndarray) -> float:
 
 def _corners(mesh: Shape) -> np.ndarray:
     """Corners (P, 3), which are a tensor from Mitsuba 3.10 on and a flat buffer before."""
-    found = mesh.positions() if hasattr(mi.Mesh, "positions") else mesh.vertex_positions_buffer()
-    return np.array(found, float).reshape(-1, 3)
+    corners = mesh.positions() if hasattr(mi.Mesh, "positions") else mesh.vertex_positions_buffer()
+    return np.array(corners, float).reshape(-1, 3)
 
 
 def _faces(mesh: Shape) -> np.ndarray:
     """Numbers of the corners of every face (F, 3)."""
-    found = mesh.faces() if hasattr(mi.Mesh, "positions") else mesh.faces_buffer()
-    return np.array(found).reshape(-1, 3)
+    faces = mesh.faces() if hasattr(mi.Mesh, "positions") else mesh.faces_buffer()
+    return np.array(faces).reshape(-1, 3)

@@ -41,7 +41,7 @@ class Bounds:
         self._read: dict[Medium, _Blocks] = {}
 
     def update(self, media: Iterable[Medium], channel: int) -> None:
-        """Read the media, as far as they have changed since the last time."""
+        """Read the media that have changed since the last call."""
         read = {medium: _blocks(medium, channel, self._read.get(medium)) for medium in media}
         if not self._read or read != self._read:
             self._tabulate(read)
@@ -135,7 +135,7 @@ class _Blocks:
 
 
 def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
-    """Those of a medium; ``known`` again if it still is what it was."""
+    """Bounds of a medium; ``known`` again if it is unchanged."""
     volume = _parts(medium).get("sigma_t")
     data = _grid(volume)
     if data is None:
@@ -176,15 +176,15 @@ def _blocks(medium: Medium, channel: int, known: _Blocks | None) -> _Blocks:
 
 
 def _parts(medium: Medium) -> dict[str, Any]:
-    """What a medium consists of, by name."""
-    found: dict[str, Any] = {}
+    """Parts of a medium, by name."""
+    parts: dict[str, Any] = {}
 
     class Parts(mi.TraversalCallback):
         def put(self, name: str, value: Any, *_: object) -> None:
-            found[name] = value
+            parts[name] = value
 
     medium.traverse(Parts())
-    return found
+    return parts
 
 
 def _grid(volume: Volume) -> Tensor | None:
@@ -204,9 +204,9 @@ def _to_local(volume: Volume) -> np.ndarray:
     """
     if hasattr(volume, "to_grid"):
         return volume.to_grid()
-    found = re.search(r"matrix=\[\[(.*?)\]\]", str(volume), re.DOTALL)
-    assert found is not None  # every version of Mitsuba that is allowed prints it
-    numbers = [float(word) for word in re.split(r"[\s,\[\]]+", found[1]) if word]
+    match = re.search(r"matrix=\[\[(.*?)\]\]", str(volume), re.DOTALL)
+    assert match is not None  # every version of Mitsuba that is allowed prints it
+    numbers = [float(word) for word in re.split(r"[\s,\[\]]+", match[1]) if word]
     matrix = np.array(numbers).reshape(4, 4)
     box = volume.bbox()
     middle = (np.array(box.min, float).ravel() + np.array(box.max, float).ravel()) / 2
@@ -235,4 +235,4 @@ def _averaged(field: np.ndarray, axis: int, edge: int) -> np.ndarray:
     starts = np.arange(0, field.shape[axis], edge)
     lengths = np.diff([*starts, field.shape[axis]])
     sums = np.add.reduceat(field, starts, axis)
-    return sums / lengths.reshape([-1 if other == axis else 1 for other in range(3)])
+    return sums / lengths.reshape([-1 if dim == axis else 1 for dim in range(3)])

@@ -146,7 +146,7 @@ def define() -> type:
                 right, down = direction.y * scale, direction.z * scale
                 arrives = direction.x < 0
             else:
-                (right, down), _, arrives = _through(
+                (right, down), _, arrives = _traced(
                     self.lens, (point.y, point.z), (direction.y, direction.z, -direction.x), dr
                 )
                 arrives &= direction.x < 0
@@ -181,7 +181,7 @@ def define() -> type:
             distance = float(self.lens[-1, 2])
             behind = disc * self.m_exit  # a point in the last surface's tangent plane
             inward = dr.normalize(mi.Vector3f(behind.x - at.x, behind.y - at.y, distance))
-            (right, down), out, passes = _through(
+            (right, down), out, passes = _traced(
                 _reversed(self.lens), (at.x, at.y), (inward.x, inward.y, inward.z), dr
             )
             passes &= dr.square(right) + dr.square(down) <= dr.square(self.m_stop)
@@ -243,7 +243,7 @@ def define() -> type:
             length = np.sqrt(1 + slopes**2)
             rim = self.stop_radius * np.cos(angle), self.stop_radius * np.sin(angle)
             rays = slopes / length, np.zeros_like(slopes), 1 / length
-            (right, down), out, passes = _through(lens, rim, rays, np)
+            (right, down), out, passes = _traced(lens, rim, rays, np)
             if not passes.all():
                 fail(NAME, "lens", "light misses a surface", "surfaces that all light meets")
             back = -lens[-1, 2] / out[2]
@@ -310,7 +310,7 @@ def _reversed(lens: np.ndarray) -> np.ndarray:
     return back
 
 
-def _through(
+def _traced(
     lens: np.ndarray,
     place: tuple[Numbers, Numbers],
     direction: tuple[Numbers, Numbers, Numbers],

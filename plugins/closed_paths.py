@@ -55,8 +55,8 @@ class OpenPath:
         """Length of a flight that consumes ``used`` of the excess length."""
         return used * (0.5 * used + self.distance) / (used + self.distance * one_plus_cosine)
 
-    def left(self, direction: Vector, gap: Float, whole: Float) -> Float:
-        """Excess length that a flight leaves which ends ``gap`` before it would close the path.
+    def remaining(self, direction: Vector, gap: Float, whole: Float) -> Float:
+        """Excess length after a flight that ends ``gap`` before it would close the path.
 
         ``whole`` is the length of the flight that closes it.
         """
@@ -94,7 +94,7 @@ class OpenPath:
         return level_frame(self.away).to_world(local)
 
     def density(self, used: Float, direction: Vector) -> Float:
-        """Of `sample`, per steradian."""
+        """Density of `sample`, per steradian."""
         least, width, logarithm = self._limits(used)
         one_plus = self.one_plus_cosine(direction)
         one_minus = 0.5 * dr.squared_norm(self.away - direction)
@@ -107,11 +107,11 @@ class OpenPath:
     def _limits(self, used: Float) -> tuple[Float, Float, Float]:
         """Least 1 + cos(theta) of flights that end in view, 2 less that, and a logarithm.
 
-        It is that of the largest over the least `one_plus_cosine` + ``used`` / distance. On an
-        ellipsoid of eccentricity e the angles psi and theta at its foci obey
-        tan(psi / 2) = (1 - e) / (1 + e) tan(theta / 2); here (1 - e) / (1 + e) is
-        used / (used + 2 distance). Flights towards the telescope end where the air does; twice
-        that far, as its boundary may be oblique.
+        The logarithm is of the largest over the least `one_plus_cosine` + ``used`` / distance. On
+        an ellipsoid of eccentricity e the angles psi and theta at its foci obey tan(psi / 2) = (1 -
+        e) / (1 + e) tan(theta / 2); here (1 - e) / (1 + e) is used / (used + 2 distance). Flights
+        towards the telescope end where the air does; twice that far, as its boundary may be
+        oblique.
         """
         narrow = dr.square(used / (self.field * (2 * self.distance + used)))
         towards = used / (used + 2 * self.reach)
@@ -156,8 +156,8 @@ def shortened(end: Vector, direction: Vector, gap: Float) -> Float:
 
     ``end`` is the flight's end less the goal; without the difference of both distances.
     """
-    both = dr.norm(end) + dr.norm(end - direction * gap)
-    return gap * (1 + (2 * dr.dot(direction, end) - gap) / both)
+    total = dr.norm(end) + dr.norm(end - direction * gap)
+    return gap * (1 + (2 * dr.dot(direction, end) - gap) / total)
 
 
 def closed(origin: Point, direction: Vector, goal: Point, path: Float) -> tuple[Float, Float]:
@@ -177,7 +177,7 @@ def sample_ahead(most: Float, scale: Float, sample: Float) -> Float:
 
 
 def ahead_density(distance: Float, most: Float, scale: Float) -> Float:
-    """Of `sample_ahead`, per metre."""
+    """Density of `sample_ahead`, per metre."""
     return dr.rcp((distance + scale) * _steps(most, scale))
 
 
@@ -200,7 +200,7 @@ def sample_near(least: Float, most: Float, scale: Float, sample: Point, again: F
 
 
 def near_density(gap: Float, least: Float, most: Float, scale: Float) -> Float:
-    """Of `sample_near`, per metre."""
+    """Density of `sample_near`, per metre."""
     # of the draws that fall out of the range and are replaced by uniform ones
     outside = 1 - _near_chance(most, scale) + _near_chance(least, scale)
     density = dr.log(1 + dr.square(scale / gap)) / (dr.pi * scale)

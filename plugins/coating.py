@@ -22,7 +22,7 @@ def read_coating(props: Properties, plugin: str) -> list[tuple[complex, float]]:
         fine = len(layer) in (2, 3) and np.isfinite(layer).all()
         if not fine or layer[0] < 1 or layer[1] <= 0 or min(layer[2:], default=0) < 0:
             fail(plugin, "coating", text, "layers 'index thickness' (>= 1, > 0 m), comma-separated")
-    return [(complex(index, *rest), thickness) for index, thickness, *rest in layers]
+    return [(complex(index, *extinction), thickness) for index, thickness, *extinction in layers]
 
 
 def admittance(index: Numbers, cosine: Numbers, polarisation: str) -> Numbers:

@@ -148,7 +148,7 @@ def define() -> type:
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def _prepare(self, tuned: bool) -> None:
-            """All that needs double precision. ``tuned``: to the fraction of the order."""
+            """Quantities in double precision; ``tuned``: to the fraction of the order."""
             for field, least in (("gap", TINY), ("absorption", 0.0), ("surface_rms", 0.0)):
                 if not least <= getattr(self, field) < np.inf:
                     allowed = f"a finite number, {least:g} or more"
@@ -171,8 +171,8 @@ def define() -> type:
                 delay = change / (2 * step) * self.wavelength / (2 * np.pi * SPEED_OF_LIGHT)
             self.order = 2 * self.index * self.gap / self.wavelength
             if tuned:
-                rest = self.order + shift - self.order_fraction
-                self.order += round(rest) - rest
+                difference = self.order + shift - self.order_fraction
+                self.order += round(difference) - difference
                 self.gap = self.order * self.wavelength / (2 * self.index)
             self.order_on_axis = self.order + shift
             if not tuned:
@@ -219,7 +219,7 @@ def define() -> type:
                 return amplitudes_of(layers, self.index, self.plate_index, np)
 
         def _mirrors(self, sine2: Float) -> list[Mirrors]:
-            """Of the transverse field for s and p, at an outer angle's sine squared.
+            """Amplitudes of the transverse field for s and p, at an outer angle's sine squared.
 
             One entry where both are the same.
             """
@@ -277,7 +277,7 @@ def define() -> type:
             through = self._products(waves, lambda wave: (0, wave[1]))
             if not reflects:
                 return through, None
-            # the wave reflected at once, and the round trips that leave backwards
+            # the wave reflected at the first mirror, and round trips that leave backwards
             back = self._products(waves, lambda wave: (wave[2], wave[1] / wave[0]), sign=-1)
             return through, back
 

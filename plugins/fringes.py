@@ -93,7 +93,7 @@ def define() -> type:
             )
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 2)
             self.physical = Physical(NAME)
-            # set by whoever renders
+            # set by the caller
             self.progress: Progress | None = None
             self.batches: Batches | None = None
 
@@ -296,9 +296,9 @@ def _surfaces(scene: Scene, ray: Ray, rng: Generator, context: Context, active: 
         else:
             weight = matrix * si.to_world_mueller(weight, si.wi, si.wi)
         matrix = dr.select(active, weight, matrix)
-        rest = ray.maxt - si.t
+        remaining = ray.maxt - si.t
         ray = si.spawn_ray(ray.d)
-        ray.maxt = rest
+        ray.maxt = remaining
     return matrix
 
 

@@ -229,11 +229,11 @@ def define() -> type:
             # unreliable, and samples that were lost to rounding
             self.lit, self.untrusted, self.rejected = 0, 0, 0
             self.warned = False
-            # of the orders that count, for comparing order by order
+            # lowest order that counts, for tests of single orders
             self.lowest_order = 1
             self.physical = Physical(NAME)
             self.bounds = Bounds()
-            # set by whoever renders
+            # set by the caller
             self.progress: Progress | None = None
             self.batches: Batches | None = None
 
@@ -277,7 +277,7 @@ def define() -> type:
             trace = self._gated if self.estimator == "gated" else self._analog
             size = beams * gates * quantities
             before, arrays = stored_passes(self.batches, self.samples_per_pass, size)
-            image = _float(arrays.get("image"), size)
+            image = mi.Float(arrays["image"]) if "image" in arrays else dr.zeros(mi.Float, size)
             done, total = 0, _moments(arrays)
             # of the finished pixels that receive light: how many there are, and how many of them
             # have an unreliable standard error
@@ -297,8 +297,8 @@ def define() -> type:
                         for value, place in zip(results, cells, strict=False):
                             dr.scatter(image, value, place)
                         dr.eval(image)
-                        lit, fraction = results[0].numpy() > 0, results[-1].numpy()
-                        counts += lit.sum(), (lit & (fraction >= HALF)).sum(), 0
+                        bright, fraction = results[0].numpy() > 0, results[-1].numpy()
+                        counts += bright.sum(), (bright & (fraction >= HALF)).sum(), 0
                         total = None
                     counts[2] += rejected[0]
                     # kernels run asynchronously: what is reported or stored must have been computed
@@ -318,7 +318,7 @@ def define() -> type:
             return mi.TensorXf(image, (height, width, gates * quantities))
 
         def _warn(self, samples: int) -> None:
-            """Of an image that is not what it should be, at an integrator's first such image."""
+            """Warn of an unreliable image, at an integrator's first one."""
             said = []
             if self.untrusted > 0.01 * self.lit and not self.shares:
                 said.append(
@@ -367,12 +367,12 @@ def define() -> type:
             image = dr.zeros(mi.Float, shape[0] * shape[1] * shape[2])
             wanted, phases = differentiable(NAME, scene)
             orders = self.lowest_order, self.max_order
-            # what plugins have made of their parameters, which kernels look up
+            # quantities that plugins derive from their parameters
             dr.enqueue(dr.ADMode.Forward, wanted)
             dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
             for lidar, sample, cell, low, high, part in self._replayed(scene, sensor, seed, spp):
-                found = gradients(lidar, sample, low, high, orders, phases)
-                for value, place in zip(found, cell, strict=True):
+                gradient = gradients(lidar, sample, low, high, orders, phases)
+                for value, place in zip(gradient, cell, strict=True):
                     add(image, value * part, place)
                 dr.eval(image)
             return mi.TensorXf(image, shape)
@@ -473,7 +473,7 @@ def define() -> type:
         ) -> tuple[Lidar, Sample, UInt, Float, Float]:
             """Samples of the gates: lidar, samples, cells, twice the nearest and farthest range.
 
-            Of light emitted later there is less before the gate: the sample's delay is taken off.
+            The sample's delay is subtracted from the ranges: light emitted later travels less far.
             """
             lane = dr.arange(mi.UInt32, count * sensor.gate_count * rounds)
             # opaque, so that numbers of gates, samples and passes are not compiled into the kernel
@@ -546,7 +546,7 @@ def define() -> type:
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
             if by_order:
-                means += [one / _opaque(rounds) for one in by_order.totals(parts)]
+                means += [total / _opaque(rounds) for total in by_order.totals(parts)]
             if self.common:
                 # without the sample's number of the pass: of every beam the same passes are traced
                 odd = (
@@ -595,8 +595,8 @@ def define() -> type:
                 by_order,
             )
             dr.eval(sums, products, largest, by_order.sums if by_order else None)
-            sums = [dr.block_sum(one, parts) for one in sums]
-            products = {pair: dr.block_sum(one, parts) for pair, one in products.items()}
+            sums = [dr.block_sum(total, parts) for total in sums]
+            products = {pair: dr.block_sum(total, parts) for pair, total in products.items()}
             largest = dr.block_reduce(dr.ReduceOp.Max, largest, parts)
             number = _opaque(rounds)
             means = [s / number for s in sums]
@@ -606,7 +606,7 @@ def define() -> type:
             deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
             if by_order:
-                means += [one / number for one in by_order.totals(parts)]
+                means += [total / number for total in by_order.totals(parts)]
             return (rounds, means, deviations, largest), lidar.rejected
 
         def _products(self) -> tuple[tuple[int, int], ...]:
@@ -638,11 +638,6 @@ def _nothing_freed() -> Iterator[None]:
 def _opaque(number: float) -> Float:
     """A number that changes from scan to scan without being compiled into a kernel."""
     return dr.opaque(mi.Float, number)
-
-
-def _float(values: np.ndarray | None, size: int) -> Float:
-    """An array of floats, zero where there are none yet."""
-    return dr.zeros(mi.Float, size) if values is None else mi.Float(values)
 
 
 def _arrays(
@@ -708,8 +703,8 @@ def _errors(number: Float, deviations: list[Float]) -> list[Float]:
     if len(deviations) == 1:
         return errors
     first, second, mixed, *_ = deviations
-    both = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
-    errors[2] = dr.select(both > 0, dr.clip(mixed / both, -1, 1), 0)
+    product = dr.sqrt(dr.maximum(first, 0)) * dr.sqrt(dr.maximum(second, 0))
+    errors[2] = dr.select(product > 0, dr.clip(mixed / product, -1, 1), 0)
     return errors
 
 

@@ -119,7 +119,7 @@ def define() -> type:
             return origin, dr.normalize(mi.Vector3f(tangent * cosine, tangent * sine, 1))
 
         def _fluence(self, r2: Float) -> Float:
-            """Of a pulse of 1 J over the aperture, J/m^2, at a squared distance from its middle."""
+            """Fluence of a 1 J pulse, J/m^2, at a squared distance from the aperture's middle."""
             scale2 = dr.square(self.m_radius)
             return 2 * dr.inv_pi / (scale2 * self.m_inside) * dr.exp(-2 * r2 / scale2)
 

@@ -40,15 +40,15 @@ def coefficients(
 def narrowest_peak(media: Iterable[Medium], wavelengths: Float) -> Float:
     """The forward peak of the media's most forward-peaked phase function: a width of 1 - cos.
 
-    That of a cone which would have all light, were it everywhere as bright as ahead; 2 of isotropic
-    scattering. For guiding alone: where a phase function varies, that at the origin.
+    It is the width of a cone of the peak's density that would contain all light; 2 for isotropic
+    scattering. It only guides sampling: a phase function that varies is taken at the origin.
     """
     context, width = mi.PhaseFunctionContext(), 2.0
-    onward, beside = mi.Vector3f(0, 0, 1), dr.normalize(mi.Vector3f(1e-3, 0, 1))
+    onward, aside = mi.Vector3f(0, 0, 1), dr.normalize(mi.Vector3f(1e-3, 0, 1))
     with dr.suspend_grad():
         mei = interaction(dr.zeros(mi.MediumPtr), mi.Point3f(0), onward, wavelengths, mi.Float(0))
         for medium in media:
-            _, density = medium.phase_function().eval_pdf(context, mei, beside)
+            _, density = medium.phase_function().eval_pdf(context, mei, aside)
             width = dr.minimum(width, dr.inv_two_pi / density)
     width = mi.Float(width)
     dr.make_opaque(width)
@@ -141,12 +141,12 @@ def _walk(
         kind = bounds.kind(medium)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
         if dr.hint(chooses, mode="scalar"):
-            here = medium.get_majorant(mei, inside)[channel] + dr.rcp(distance)
-            part = dr.select(inside, here * (end - travelled), 0)
+            density = medium.get_majorant(mei, inside)[channel] + dr.rcp(distance)
+            part = dr.select(inside, density * (end - travelled), 0)
             total += part
             takes = inside & (rng.next_float32(inside) * total < part)
             anywhere = dr.lerp(travelled, end, rng.next_float32(inside))
-            chosen, rate = dr.select(takes, anywhere, chosen), dr.select(takes, here, rate)
+            chosen, rate = dr.select(takes, anywhere, chosen), dr.select(takes, density, rate)
             between = dr.select(takes, medium, between)
         # in closed form, without a random number
         uniform = inside & (kind == UNIFORM)
@@ -216,7 +216,7 @@ def collision(
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
     travelled = mi.Float(0)
-    found = mi.Bool(False)
+    real_collision = mi.Bool(False)
     crossings = air.crossings(origin, direction)
     while dr.hint(active, label="free flight"):
         end, hit, passes, medium, behind = air.next_surface(
@@ -242,12 +242,12 @@ def collision(
             _, extinction = coefficients(medium, mei, channel, collides)
             # the others are null collisions, behind which the flight goes on unchanged
             real = collides & (rng.next_float32(collides) * majorant < extinction)
-            found |= real
+            real_collision |= real
             flight = dr.select(collides, -dr.log(1 - rng.next_float32(collides)), flight - in_block)
             block = dr.select(collides, block, onward)
             travelled = dr.select(tracking, place, travelled)
             tracking &= ~real & (collides | (stop < end))
-        active &= ~found & hit & passes
+        active &= ~real_collision & hit & passes
         medium = dr.select(active, behind, medium)
-        travelled = dr.select(found, travelled, end)
-    return travelled, medium, found
+        travelled = dr.select(real_collision, travelled, end)
+    return travelled, medium, real_collision

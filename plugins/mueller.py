@@ -87,7 +87,7 @@ def define() -> type:
             if dr.grad_enabled(self.m_table):
                 attached = _attached(self.m_table, table[:, 0])
                 pairs = zip(self.m_elements, attached, strict=True)
-                self.m_elements = [dr.replace_grad(exact, one) for exact, one in pairs]
+                self.m_elements = [dr.replace_grad(exact, tracked) for exact, tracked in pairs]
             # probability of every cell but for the factor of 2 pi, exact for a1 linear in angle
             self.m_cell = mi.DiscreteDistribution(mi.Float(_cells(table)))
 

@@ -26,8 +26,8 @@ def stored_passes(
 ) -> tuple[int, Mapping[str, np.ndarray]]:
     """Number of passes that need not be traced again, and their arrays.
 
-    None, if those stored are of another size, for another machine's memory: they end at other
-    samples. None either, if their image has not so many ``values``: it is one of other quantities.
+    None if stored passes have another size, as of another machine's memory, and end at other
+    samples; none if their image has another number of ``values``, as of other quantities.
     """
     if batches is not None:
         passes, arrays = batches.stored()

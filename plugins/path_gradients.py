@@ -20,7 +20,7 @@ from .media import coefficients, interaction, transmittance
 from .variant_types import Float, Mask, MediumPtr, Point, Stokes, UInt, Vector
 
 
-class Bend(NamedTuple):
+class ScatteringVertex(NamedTuple):
     """A vertex at which a path goes on: place, both directions and the light that arrives.
 
     ``onward`` are the Stokes vectors at the telescope of light of one component that leaves it.
@@ -75,19 +75,19 @@ def gradients(
     if last == 1:
         return slopes
     least, most = (dr.opaque(mi.UInt32, order) for order in orders)
-    # matrices of paths that go on, one for each order above two
-    bends, bend = last - 2 if phases else 0, None
-    if bends:
-        bend = 2 + dr.minimum(mi.UInt32(sample.rng.next_float32() * bends), bends - 1)
+    # phase matrices at which paths go on, one for each order above two
+    count, chosen = last - 2 if phases else 0, None
+    if count:
+        chosen = 2 + dr.minimum(mi.UInt32(sample.rng.next_float32() * count), count - 1)
     with dr.suspend_grad():
-        coming, hidden, _, found = _traced(lidar, sample, path, width, least, most, bend=bend)
+        coming, hidden, _, vertex = _traced(lidar, sample, path, width, least, most, chosen=chosen)
         *_, more, _ = _traced(
             lidar, sample, path, width, least, most, coming, hidden, weights, replays=True
         )
     slopes = _plus(slopes, more)
-    if bends:
+    if count:
         with dr.resume_grad():
-            terms = [bends * term for term in _bent(lidar, sample, found)]
+            terms = [count * term for term in _light_of_vertex(lidar, sample, vertex)]
             slopes = _plus(slopes, _propagated(terms, weights))
     return slopes
 
@@ -103,33 +103,34 @@ def _traced(
     coming: Stokes | None = None,
     hidden: Stokes | None = None,
     weights: Stokes | None = None,
-    bend: UInt | None = None,
+    chosen: UInt | None = None,
     replays: bool = False,
-) -> tuple[Stokes, Stokes, Stokes, Bend | None]:
-    """One walk along the paths: the sums of their light, or what of it remains after a replay.
+) -> tuple[Stokes, Stokes, Stokes, ScatteringVertex | None]:
+    """One walk along the paths: the sums of their light, or its remainder after a replay.
 
     ``coming`` is light, ``hidden`` light that a single vertex without scattering would give, were
-    its coefficient the largest one of its medium. Of a replay also the derivatives; with ``bend``
+    its coefficient the largest one of its medium. A replay also gives the derivatives, ``chosen``
     the vertex at which a path goes on to this order.
     """
-    rng, channel, tracks = mi.PCG32(sample.rng), lidar.channel, bend is not None
+    rng, channel, tracks = mi.PCG32(sample.rng), lidar.channel, chosen is not None
     light, veiled = (_copied(s or [0] * 4) for s in (coming, hidden))
     slopes = _copied([0] * 4)
     order, missing = mi.UInt32(2), mi.UInt32(0)
     medium = mi.MediumPtr(lidar.sensor.get_medium())
     position, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
     stokes = _copied(sample.stokes)
-    # of the vertex `bend`, and the components of light from there on
-    following = 0 if bend is None else bend + 1
+    # the order of the chosen vertex's flight, and the components of light from there on
+    following = 0 if chosen is None else chosen + 1
     components = len(stokes) if tracks else 0
     parts = [_copied([0] * components) for _ in range(components)]
     onward = [_copied([0] * 4) for _ in range(components)]
-    there, place, before = mi.MediumPtr(medium), mi.Point3f(position), mi.Vector3f(direction)
+    vertex_medium, vertex_place = mi.MediumPtr(medium), mi.Point3f(position)
+    before = mi.Vector3f(direction)
     after, arriving = mi.Vector3f(direction), _copied([0] * len(stokes))
     flight, excess, weight = lidar._first_flight(rng, position, direction, sample.aperture, path)
     active = flight > 0
     while dr.hint(active, label="path replay"):
-        # what is drawn stays where it is
+        # samples are not differentiated
         with dr.resume_grad(when=replays):
             out, medium = transmittance(
                 lidar.air,
@@ -156,7 +157,7 @@ def _traced(
         instead = dr.select(dark, most, scattered)
         clear = missing == 0
         missing += dr.select(dark, mi.UInt32(1), 0)
-        # by the largest coefficient: where there is little scattering, its derivative is as large
+        # by the majorant: where there is little scattering, its derivative is as large
         likely = weight * passed * most
         weight *= passed * instead
         survival = dr.select(order == 2, 1, dr.minimum(path_sampling.ROULETTE_FACTOR * likely, 1))
@@ -165,7 +166,7 @@ def _traced(
         stokes, parts = _times(stokes, weight), _each_times(parts, weight)
         clear &= active
         with dr.resume_grad(when=replays):
-            rest, gains, active = lidar._close(
+            open_path, gains, active = lidar._close(
                 sample, rng, medium, mei, stokes, excess, width, active, parts
             )
             counts = active & (order >= first)
@@ -188,30 +189,34 @@ def _traced(
         order += 1
         active &= order <= last
         direction, stokes, flight, excess, weight = lidar._next_flight(
-            rng, medium, mei, stokes, rest, active
+            rng, medium, mei, stokes, open_path, active
         )
         active &= weight > 0
         if dr.hint(tracks, mode="scalar"):
             # as the light itself, whose S0 a flight leaves unchanged
             several, _ = lidar._scatter_all(medium, mei, [arrived, *parts], direction, active)
             factor = dr.select(active, arrived[0] / several[0][0], 0)
-            here = active & (order == following)
+            at_vertex = active & (order == following)
             parts = _each_times(several[1:], factor)
-            parts = _each_where(here, _each_times(_unit(components), factor), parts)
-            there, place = dr.select(here, medium, there), dr.select(here, position, place)
-            before, after = dr.select(here, -mei.wi, before), dr.select(here, direction, after)
-            arriving = _each_where(here, [arrived], [arriving])[0]
-    found = Bend(there, place, before, after, arriving, onward) if tracks else None
-    return light, veiled, slopes, found
+            parts = _each_where(at_vertex, _each_times(_unit(components), factor), parts)
+            vertex_medium = dr.select(at_vertex, medium, vertex_medium)
+            vertex_place = dr.select(at_vertex, position, vertex_place)
+            before = dr.select(at_vertex, -mei.wi, before)
+            after = dr.select(at_vertex, direction, after)
+            arriving = _each_where(at_vertex, [arrived], [arriving])[0]
+    vertex = vertex_medium, vertex_place, before, after, arriving, onward
+    return light, veiled, slopes, ScatteringVertex(*vertex) if tracks else None
 
 
-def _bent(lidar: "path_sampling.Lidar", sample: "path_sampling.Sample", bend: Bend) -> Stokes:
+def _light_of_vertex(
+    lidar: "path_sampling.Lidar", sample: "path_sampling.Sample", vertex: ScatteringVertex
+) -> Stokes:
     """Stokes vector at the telescope of the light that goes on at a vertex."""
-    mei = interaction(bend.medium, bend.place, bend.before, lidar.wavelengths, sample.time)
-    active = (bend.stokes[0] > 0) & (bend.medium != None)
-    scattered, _ = lidar._scatter(bend.medium, mei, bend.stokes, bend.after, active)
+    mei = interaction(vertex.medium, vertex.place, vertex.before, lidar.wavelengths, sample.time)
+    active = (vertex.stokes[0] > 0) & (vertex.medium != None)
+    scattered, _ = lidar._scatter(vertex.medium, mei, vertex.stokes, vertex.after, active)
     terms = _copied([0] * 4)
-    for part, onward in zip(scattered, bend.onward, strict=True):
+    for part, onward in zip(scattered, vertex.onward, strict=True):
         terms = _plus(terms, _times(onward, dr.select(active, part, 0)))
     return terms
 
@@ -260,6 +265,6 @@ def _each_plus(several: list[Stokes], more: list[Stokes], condition: Mask) -> li
 
 def _each_where(condition: Mask, several: list[Stokes], otherwise: list[Stokes]) -> list[Stokes]:
     return [
-        [dr.select(condition, a, b) for a, b in zip(one, other, strict=True)]
-        for one, other in zip(several, otherwise, strict=True)
+        [dr.select(condition, a, b) for a, b in zip(new, old, strict=True)]
+        for new, old in zip(several, otherwise, strict=True)
     ]

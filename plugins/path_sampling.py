@@ -135,16 +135,16 @@ class Lidar:
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
-        # of the delays, half the path: so ranges of a gate shift by as much
+        # standard deviation of the delays in range, half the path
         self.pulse_sigma = None
         if sensor.laser.pulse_duration > 0:
             sigma = FWHM_TO_SIGMA * sensor.laser.pulse_duration * SPEED_OF_LIGHT / 2
             self.pulse_sigma = dr.opaque(mi.Float, sigma)
         self.context = mi.PhaseFunctionContext()
         self.peak = narrowest_peak(media_of(scene, sensor), self.wavelengths)
-        # of each sample's beam, once they are emitted
+        # replaced by that of each sample's beam in `emit`
         self.field_tan = sensor.field_tangent(mi.UInt32(0))
-        # last vertices that were drawn in the field of view and are not in it: rounding alone
+        # last vertices drawn in the field of view that rounding puts outside
         self.rejected = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self.rejected)
 
@@ -214,7 +214,7 @@ class Lidar:
         si, back, path = self._target(sample)
         active = (path >= low) & (path < high)
         medium = mi.MediumPtr(self.sensor.get_medium())
-        # as far as in front of the surface, which would hide itself
+        # ends in front of the surface, which would occlude itself
         out, medium = transmittance(
             self.air,
             self.bounds,
@@ -307,15 +307,15 @@ class Lidar:
             active &= medium != None
             mei = interaction(medium, place, onward, self.wavelengths, time)
             scattering, _ = coefficients(medium, mei, self.channel, active)
-            here = scattering * volume / dr.squared_norm(place - end)
-            counts = dr.select(active, weight * here, 0)
+            contribution = scattering * volume / dr.squared_norm(place - end)
+            counts = dr.select(active, weight * contribution, 0)
             total += counts
             takes = rng.next_float32() * total < counts
             origin, direction = dr.select(takes, start, origin), dr.select(takes, onward, direction)
             aperture, path = dr.select(takes, end, aperture), dr.select(takes, length, path)
-            target = dr.select(takes, here, target)
+            target = dr.select(takes, contribution, target)
             number += 1
-        share = dr.select(target > 0, total / (target * mi.Float(candidates)), 0)
+        chosen_weight = dr.select(target > 0, total / (target * mi.Float(candidates)), 0)
         chosen = Sample(
             rng,
             sample.frame,
@@ -328,7 +328,7 @@ class Lidar:
             sample.delay,
             self._emitted(axes, direction),
         )
-        return chosen, path, share
+        return chosen, path, chosen_weight
 
     def further(
         self,
@@ -394,7 +394,7 @@ class Lidar:
             survival = dr.select(order == 2, 1, dr.minimum(ROULETTE_FACTOR * weight, 1))
             active &= (weight > 0) & (rng.next_float32(active) < survival)
             stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
-            rest, gains, active = self._close(
+            open_path, gains, active = self._close(
                 sample, rng, medium, mei, stokes, excess, width, active
             )
             gain = gains[0]
@@ -404,7 +404,7 @@ class Lidar:
             order += 1
             active &= order <= last
             direction, stokes, flight, excess, weight = self._next_flight(
-                rng, medium, mei, stokes, rest, active
+                rng, medium, mei, stokes, open_path, active
             )
             active &= weight > 0
         return total
@@ -434,10 +434,10 @@ class Lidar:
         active = active & (excess > 0)
         _, reach = slabs(self.low, self.high, mei.p, -away)
         # as long as the path is open, its remainder exceeds the straight way back
-        rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
+        open_path = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
         with dr.suspend_grad():
             closing, scattered, leg, volume = self._last_flight(
-                rng, sample, medium, mei, stokes, rest, active
+                rng, sample, medium, mei, stokes, open_path, active
             )
         if self.differentiable:
             # of a direction that stays where it was drawn
@@ -452,13 +452,17 @@ class Lidar:
         gains = self._connect(
             sample, rng, mei.p, closing, leg, medium, several, width * volume, volume > 0
         )
-        return rest, gains, active
+        return open_path, gains, active
 
     def _reject(self, lost: Mask) -> None:
-        """Count samples of which a sampler has left its own domain."""
-        one = mi.UInt32(1)
+        """Count samples that left their sampler's domain."""
         dr.scatter_reduce(
-            dr.ReduceOp.Add, self.rejected, one, mi.UInt32(0), lost, mode=dr.ReduceMode.Local
+            dr.ReduceOp.Add,
+            self.rejected,
+            mi.UInt32(1),
+            mi.UInt32(0),
+            lost,
+            mode=dr.ReduceMode.Local,
         )
 
     def _first_flight(
@@ -500,14 +504,12 @@ class Lidar:
         """Tangent of half the widest angle between a direction and one of the field of view."""
         local = axes.to_local(away)
         vertex = dr.norm(local.xy) / (1 + local.z)
-        field = self._half_fov()
+        # the tangent of half the angle
+        field = self.field_tan / (1 + dr.sqrt(1 + dr.square(self.field_tan)))
         return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
     def _in_view(self, axes: Frame, to_source: Vector) -> Mask:
         return self.sensor.in_field_of_view(axes, to_source, self.field_tan)
-
-    def _half_fov(self) -> Float:
-        return self.field_tan / (1 + dr.sqrt(1 + dr.square(self.field_tan)))
 
     def _last_flight(
         self,
@@ -516,7 +518,7 @@ class Lidar:
         medium: MediumPtr,
         mei: Interaction,
         stokes: Stokes,
-        rest: OpenPath,
+        open_path: OpenPath,
         active: Mask,
     ) -> tuple[Vector, Stokes, Float, Float]:
         """Direction, Stokes vector and length of the flight to the last vertex; its weight.
@@ -525,18 +527,19 @@ class Lidar:
         the telescope, selected by its contribution if there is no obstacle and the medium is the
         same. The weight includes d(length)/d(path).
         """
-        phase, axes, path = medium.phase_function(), sample.axes, rest.distance + rest.excess
+        phase, axes = medium.phase_function(), sample.axes
+        path = open_path.distance + open_path.excess
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        aimed = rest.sample(rest.excess, pair(rng))
-        inward = rest.from_telescope(self._in_field(axes, rng))
+        aimed = open_path.sample(open_path.excess, pair(rng))
+        inward = open_path.from_telescope(self._in_field(axes, rng))
         tried = []
         for wo in (drawn, aimed, inward):
-            one_plus_cosine = rest.one_plus_cosine(wo)
-            leg = rest.leg(rest.excess, one_plus_cosine)
-            volume = dr.rcp(rest.slope(rest.excess, one_plus_cosine, leg))
+            one_plus_cosine = open_path.one_plus_cosine(wo)
+            leg = open_path.leg(open_path.excess, one_plus_cosine)
+            volume = dr.rcp(open_path.slope(open_path.excess, one_plus_cosine, leg))
             end = mei.p + wo * leg
             # not from the end's coordinates, which are rounded to those of the world
-            to_end = rest.away * rest.distance + wo * leg
+            to_end = open_path.away * open_path.distance + wo * leg
             in_view = active & self._in_view(axes, to_end)
             if wo is inward:
                 self._reject(active & ~in_view)
@@ -545,10 +548,10 @@ class Lidar:
             from_telescope = dr.select(in_view, from_telescope, 0)
             in_view &= dr.all((end > self.low) & (end < self.high))
             scattered, pdf = self._scatter(medium, mei, stokes, wo, in_view)
-            there = interaction(medium, end, wo, self.wavelengths, sample.time)
+            last_vertex = interaction(medium, end, wo, self.wavelengths, sample.time)
             back = dr.normalize(sample.aperture - end)
-            received, back_pdf = self._scatter(medium, there, scattered, back, in_view)
-            density = pdf + rest.density(rest.excess, wo) + from_telescope
+            received, back_pdf = self._scatter(medium, last_vertex, scattered, back, in_view)
+            density = pdf + open_path.density(open_path.excess, wo) + from_telescope
             # never 0 where there may be light: the medium may be a different one there
             target = (0.95 * received[0] + 0.05 * scattered[0] * back_pdf) * volume
             target = dr.select(in_view & (density > 0), target, 0)
@@ -562,50 +565,57 @@ class Lidar:
         medium: MediumPtr,
         mei: Interaction,
         stokes: Stokes,
-        rest: OpenPath,
+        open_path: OpenPath,
         active: Mask,
     ) -> tuple[Vector, Stokes, Float, Float, Float]:
         """A further flight: direction, Stokes vector (of unchanged S0), length, excess, weight.
 
         The excess length is what the flight leaves.
         """
-        phase, rest = medium.phase_function(), rest.widened(WIDER)
+        phase, open_path = medium.phase_function(), open_path.widened(WIDER)
         by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.field_tan
-        nearest = self._nearest(scale, rest.reach)
+        most, scale = 0.5 * open_path.excess, 0.5 * open_path.distance * self.field_tan
+        nearest = self._nearest(scale, open_path.reach)
         # transmittances to the gate differ little: any part of the way is about as likely
         choice, sample = pair(rng), pair(rng)
         even = choice.x < EVEN_FLIGHT_FRACTION
         gap = dr.select(even, most * choice.y, sample_ahead(most, nearest, choice.y))
         mirrored = mi.Point2f(1 - sample.x, sample.y + 0.25)
-        used = rest.excess - 2 * gap
+        used = open_path.excess - 2 * gap
         # two candidates, with opposite azimuth and complementary polar sample
         tried = []
         for wo in (
-            dr.select(by_phase, drawn, rest.sample(used, sample)),
-            dr.select(by_phase, quarter_turn(-mei.wi, drawn), rest.sample(used, mirrored)),
+            dr.select(by_phase, drawn, open_path.sample(used, sample)),
+            dr.select(by_phase, quarter_turn(-mei.wi, drawn), open_path.sample(used, mirrored)),
         ):
-            one_plus_cosine = rest.one_plus_cosine(wo)
+            one_plus_cosine = open_path.one_plus_cosine(wo)
             # what is drawn after its direction is a length, so that it ends in the air
             _, leaves = slabs(self.low, self.high, mei.p, wo)
-            whole = rest.leg(rest.excess, one_plus_cosine)
+            whole = open_path.leg(open_path.excess, one_plus_cosine)
             longest = dr.minimum(whole, leaves)
             short = sample_ahead(longest, nearest, choice.y)
             short = dr.select(even, longest * choice.y, short)
-            leg = dr.select(by_phase, longest - short, rest.leg(used, one_plus_cosine))
-            left = 0.5 * dr.select(by_phase, rest.left(wo, whole - longest + short, whole), 2 * gap)
+            leg = dr.select(by_phase, longest - short, open_path.leg(used, one_plus_cosine))
+            half_excess = 0.5 * dr.select(
+                by_phase, open_path.remaining(wo, whole - longest + short, whole), 2 * gap
+            )
             scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
-            consumed = rest.excess - 2 * left
-            density = rest.density(consumed, wo)
-            density *= 0.5 * rest.slope(consumed, one_plus_cosine, leg)
-            density *= _even_or_ahead(left, most, nearest)
+            consumed = open_path.excess - 2 * half_excess
+            density = open_path.density(consumed, wo)
+            density *= 0.5 * open_path.slope(consumed, one_plus_cosine, leg)
+            density *= _even_or_ahead(half_excess, most, nearest)
             pdf *= _even_or_ahead(dr.select(by_phase, short, longest - leg), longest, nearest)
             density = 2 * dr.lerp(density, pdf, PHASE_FLIGHT_FRACTION)
             end = mei.p + wo * leg
-            inside = active & (leg > 0) & (left > 0) & dr.all((end > self.low) & (end < self.high))
+            inside = (
+                active
+                & (leg > 0)
+                & (half_excess > 0)
+                & dr.all((end > self.low) & (end < self.high))
+            )
             target = dr.select(inside & (density > 0), scattered[0], 0)
-            tried.append((target, density, (wo, scattered, leg, 2 * left)))
+            tried.append((target, density, (wo, scattered, leg, 2 * half_excess)))
         (wo, scattered, leg, excess), weight = choose(rng, *tried)
         # the change of S0 goes into the weight, on which roulette is played
         factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
@@ -696,14 +706,14 @@ class Lidar:
         weight = weight * out * self.area * -dr.dot(wo, sample.axes.n) / (distance * distance)
         several, _ = self._scatter_all(medium, mei, several, wo, active)
         axis = mi.mueller.stokes_basis(wo) if mi.is_polarized else None
-        found = []
+        light = []
         for received in several:
             if not mi.is_polarized:
                 received = [*received, mi.Float(0), mi.Float(0), mi.Float(0)]
             else:
                 received = rotate_stokes(received, wo, axis, transverse(sample.axes.s, wo))
-            found.append([dr.select(active, r * weight, 0) for r in received])
-        return found
+            light.append([dr.select(active, r * weight, 0) for r in received])
+        return light
 
     def _scatter(
         self, medium: MediumPtr, mei: Interaction, stokes: Stokes, wo: Vector, active: Mask
@@ -738,7 +748,7 @@ class Lidar:
         si, back, path = self._target(sample)
         range_ = 0.5 * path + sample.delay
         near = si.t * (1 - SKIN)
-        _, medium, found = collision(
+        _, medium, collided = collision(
             self.air,
             self.bounds,
             medium,
@@ -752,7 +762,7 @@ class Lidar:
             active,
         )
         first, _ = first_hit(self.air.opaque, sample.origin, sample.direction, active)
-        active = ~found & (first >= near) & (range_ >= low) & (range_ < high)
+        active = ~collided & (first >= near) & (range_ >= low) & (range_ < high)
         light = self._from_target(sample, rng, si, back, medium, mi.Float(1), active)
         return light, range_, active & (light[0] > 0)
 
@@ -786,15 +796,15 @@ class Lidar:
         stokes = _copied(sample.stokes)
         medium = mi.MediumPtr(self.sensor.get_medium())
         travelled, order = mi.Float(2 * sample.delay), mi.UInt32(1)
-        gate, held = mi.UInt32(0), _copied([0, 0, 0, 0])
+        gate, in_gate = mi.UInt32(0), _copied([0, 0, 0, 0])
         active = mi.Bool(True)
         if dr.hint(self.air.targets is not None, mode="scalar"):
             # a sample of whose light none is scattered in the air: it adds to no other
-            light, place, lit = self.unscattered(sample, low, high)
-            at = mi.UInt32(dr.select(lit, (place - low) / (high - low) * gates, 0))
+            light, place, meets = self.unscattered(sample, low, high)
+            at = mi.UInt32(dr.select(meets, (place - low) / (high - low) * gates, 0))
             at = row + dr.minimum(at, gates - 1) * parts
-            _deposit(sums, products, largest, magnified, at, light, lit)
-            _split(by_order, light[0], order, at, lit)
+            _deposit(sums, products, largest, magnified, at, light, meets)
+            _split(by_order, light[0], order, at, meets)
         while dr.hint(active, label="scattering orders"):
             began = mi.Bool(active)
             flight, medium, active = collision(
@@ -826,8 +836,8 @@ class Lidar:
             now = dr.minimum(mi.UInt32(dr.select(counts, fraction * gates, 0)), gates - 1)
             now = dr.select(counts, now, gate)
             done = now != gate
-            _deposit(sums, products, largest, magnified, row + gate * parts, held, done)
-            held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
+            _deposit(sums, products, largest, magnified, row + gate * parts, in_gate, done)
+            in_gate = _sum(_scaled(in_gate, dr.select(done, 0, 1)), gain)
             gate = now
             _split(by_order, gain[0], order, row + gate * parts, counts)
             order += 1
@@ -840,7 +850,7 @@ class Lidar:
             direction = mi.Vector3f(onward)
             active &= (density > 0) & (stokes[0] > 0)
             ended = began & ~active
-            _deposit(sums, products, largest, magnified, row + gate * parts, held, ended)
+            _deposit(sums, products, largest, magnified, row + gate * parts, in_gate, ended)
 
 
 def _split(by_order: Orders | None, value: Float, order: UInt, row: UInt, active: Mask) -> None:
@@ -866,17 +876,17 @@ def _deposit(
     largest: UInt,
     magnified: float,
     cell: UInt,
-    held: Stokes,
+    light: Stokes,
     active: Mask,
 ) -> None:
     """Add contributions of samples to their gates, and products of their components."""
-    active = active & (held[0] != 0)
-    for total, value in zip(sums, held, strict=True):
+    active = active & (light[0] != 0)
+    for total, value in zip(sums, light, strict=True):
         add(total, value, cell, active)
     for (i, j), total in products.items():
-        add(total, magnified * held[i] * (magnified * held[j]), cell, active)
+        add(total, magnified * light[i] * (magnified * light[j]), cell, active)
     # positive floats are ordered as their bits, of which every backend has an atomic maximum
-    square = dr.reinterpret_array(mi.UInt32, dr.square(magnified * held[0]))
+    square = dr.reinterpret_array(mi.UInt32, dr.square(magnified * light[0]))
     dr.scatter_reduce(dr.ReduceOp.Max, largest, square, cell, active, mode=dr.ReduceMode.Local)
 
 

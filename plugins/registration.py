@@ -72,7 +72,7 @@ def _register_now(name: str) -> None:
 
 
 def _refusal(name: str, variant: str) -> Callable[[Properties], NoReturn]:
-    """What a scene gets instead of a plugin in a scalar variant: one line that says so."""
+    """Replacement of a plugin in a scalar variant: raises an error of one line."""
 
     def refuse(_properties: Properties) -> NoReturn:
         raise ValueError(

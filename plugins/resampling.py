@@ -21,11 +21,12 @@ def choose(rng: Generator, *candidates: Candidate) -> tuple[Any, Float]:
     """
     (target, density, values), *others = candidates
     total = dr.select(target > 0, target / density, 0)
-    for other_target, other_density, other in others:
+    for other_target, other_density, other_values in others:
         weight = dr.select(other_target > 0, other_target / other_density, 0)
         total += weight
         takes = rng.next_float32() * total < weight
-        values, target = _either(takes, other, values), dr.select(takes, other_target, target)
+        values = _either(takes, other_values, values)
+        target = dr.select(takes, other_target, target)
     return values, dr.select(target > 0, total / target, 0)
 
 

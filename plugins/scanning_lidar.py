@@ -198,7 +198,7 @@ def define() -> type:
             return (local.z > 0) & (dr.squared_norm(local.xy) <= limit * limit)
 
         def beam_axes(self) -> tuple[np.ndarray, np.ndarray]:
-            """Of all beams: origins and directions in the world, (n, 3) each."""
+            """Origins and directions of all beams in the world, (n, 3) each."""
             beam = dr.arange(mi.UInt32, self.beam_count)
             to_world = self.world_transform()
             axes = to_world @ dr.gather(mi.Vector3f, self.m_directions, beam)
@@ -213,7 +213,7 @@ def define() -> type:
             return places, np.array([np.array(end, float) for end in ranges])
 
         def laser_places(self) -> np.ndarray:
-            """Of all beams: where the laser is, in the world, (n, 3)."""
+            """Places of the laser for all beams, in the world, (n, 3)."""
             beam = dr.arange(mi.UInt32, self.beam_count)
             offset = self.beam_frame(beam).to_world(self.laser.m_pose.translation())
             return np.array(self.world_transform() @ (self.beam_origin(beam) + offset), float).T

@@ -44,7 +44,7 @@ def check_supported(plugin: str, scene: Scene, sensor: Sensor) -> None:
 
 
 def check_sensor(plugin: str, sensor: Sensor) -> None:
-    """Raise an error for what a film, a sampler or a shutter asks for and would not get."""
+    """Raise an error for settings of film, sampler or shutter that would be ignored."""
     film, sampler = sensor.film(), sensor.sampler()
     if film.class_name() != "HDRFilm":
         fail(plugin, "film", film.class_name(), "hdrfilm")

@@ -79,11 +79,12 @@ class Air:
                 body.inside = self.around
         dr.make_opaque(self.around)
         # an open surface encloses nothing: behind it there may be air at any distance
-        everywhere = around is not None or self.sheets
-        self.bounds = _everywhere() if everywhere else (self.low, self.high)
+        self.bounds = self.low, self.high
+        if around is not None or self.sheets:
+            self.bounds = dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)
 
     def crossings(self, origin: Point, direction: Vector) -> Crossings:
-        """What each body needs to know of a line, and the distance of its first opaque surface."""
+        """Crossings of each body with a line, and the distance of the first opaque surface."""
         lines = [body.line(origin, direction) for body in self.bodies]
         if self.opaque is None:
             return lines, None
@@ -118,16 +119,16 @@ class Air:
             # outside of the largest body
             for body, inside in zip(self.bodies[::-1], within[::-1], strict=True):
                 around = dr.select(inside, body.outside, around)
-        here = around
+        part_medium = around
         for body, inside in zip(self.bodies, within, strict=True):
-            here = dr.select(inside, body.inside, here)
+            part_medium = dr.select(inside, body.inside, part_medium)
         if self.sheets:
             end, around = self._sheets(origin, direction, start, end, around, active)
         passes = mi.Bool(True)
         if self.opaque is not None:
             passes = ~((opaque > start) & (opaque <= end))
             end = dr.select(passes, end, dr.minimum(opaque, end))
-        return end, active & (end < distance), passes, mi.MediumPtr(here), around
+        return end, active & (end < distance), passes, mi.MediumPtr(part_medium), around
 
     def _sheets(
         self,
@@ -140,31 +141,31 @@ class Air:
     ) -> tuple[Float, MediumPtr]:
         """The same end, or that at an open surface, and the medium behind.
 
-        Of surfaces that coincide within rounding, light crosses first the one in front of which is
-        the medium that it is in: the last one is that whose far side is in front of no other.
+        Among surfaces that coincide within rounding, light first crosses the one whose front medium
+        it is in: the last is the one whose back medium is in front of no other.
         """
-        found = [sheet.next_crossing(origin, direction, start, active) for sheet in self.sheets]
-        for place, _, _ in found:
+        crossings = [sheet.next_crossing(origin, direction, start, active) for sheet in self.sheets]
+        for place, _, _ in crossings:
             end = dr.minimum(end, place)
         # all that the next search may miss, and more
         slack = 2 * STEP * (dr.max(dr.abs(origin)) + end)
-        at = [place <= end + slack for place, _, _ in found]
+        at = [place <= end + slack for place, _, _ in crossings]
         behind = mi.MediumPtr(medium)
-        for i, (_, front, back) in enumerate(found):
+        for i, (_, front, back) in enumerate(crossings):
             last = mi.Bool(at[i])
-            for j, (_, other, _) in enumerate(found):
+            for j, (_, other_front, _) in enumerate(crossings):
                 if i != j:
-                    last &= ~(at[j] & (other == back))
+                    last &= ~(at[j] & (other_front == back))
             # left already where surfaces overlap: the medium in front of it is another one
-            last &= (front == medium) | (front == None) | _any(at, found, i, front)
+            last &= (front == medium) | (front == None) | _any(at, crossings, i, front)
             behind = dr.select(last, back, behind)
         return end, behind
 
 
-def _any(at: Sequence[Mask], found: Sequence[Crossing], index: int, front: MediumPtr) -> Mask:
+def _any(at: Sequence[Mask], crossings: Sequence[Crossing], index: int, front: MediumPtr) -> Mask:
     """Whether another of the surfaces that coincide ends at the medium ``front``."""
     result = mi.Bool(False)
-    for j, (_, _, back) in enumerate(found):
+    for j, (_, _, back) in enumerate(crossings):
         if j != index:
             result |= at[j] & (back == front)
     return result
@@ -241,25 +242,21 @@ def _check_fronts(
         first = dr.minimum(
             first, body.next_crossing(body.line(origin, axis), origin, axis, start, every)[0]
         )
-    found = [sheet.next_crossing(origin, axis, start, every) for sheet in sheets]
-    for place, _, _ in found:
+    crossings = [sheet.next_crossing(origin, axis, start, every) for sheet in sheets]
+    for place, _, _ in crossings:
         first = dr.minimum(first, place)
     light = np.resize(light, dr.width(axis))
-    for sheet, (place, front, _) in zip(sheets, found, strict=True):
-        here = (place == first) & (place < dr.inf)
+    for sheet, (place, front, _) in zip(sheets, crossings, strict=True):
+        met_first = (place == first) & (place < dr.inf)
         for side, medium, pointer in (
             ("interior", sheet.interior, sheet.inside),
             ("exterior", sheet.exterior, sheet.outside),
         ):
-            meets = np.resize(np.array(here & (front == pointer)), len(light))
-            if medium is not None and any(other != medium for other in light[meets]):
+            meets = np.resize(np.array(met_first & (front == pointer)), len(light))
+            if medium is not None and any(arriving != medium for arriving in light[meets]):
                 fail(
                     name_of(sheet.shape),
                     side,
                     name_of(medium),
                     "behind this surface, as light of the telescope comes from another medium",
                 )
-
-
-def _everywhere() -> tuple[Point, Point]:
-    return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)

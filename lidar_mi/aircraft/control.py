@@ -29,7 +29,7 @@ Controller = Callable[[Preview, AircraftState], Commands]
 """Commands from the preview, of no loads while nothing is known, and the state."""
 
 Transfer = Callable[[Preview | None, AircraftState], Preview]
-"""The preview to steer by, from the present one (None: there is none) and the state."""
+"""The preview to steer by, from the present one, or None, and the state."""
 
 RATE_TIME = 0.5
 """A roll rate counts as much as the bank angle that it makes in this time, s."""
@@ -48,18 +48,18 @@ def bumpless_transfer() -> Transfer:
     """From a preview that is lost to no loads, over the `HORIZON` of the plan.
 
     Loads that a lost preview expects are weighted by a factor that falls linearly from 1 to 0. So
-    an aileron that holds against a wake does not let go at once, and what is extrapolated from a
-    track that has ended counts less and less. Before the first preview no loads are expected.
+    an aileron held against a wake returns gradually, and the extrapolation of an ended track loses
+    its weight. Before the first preview no loads are expected.
     """
     last: Preview = no_loads
-    seen = -np.inf
+    last_time = -np.inf
 
     def transfer(preview: Preview | None, state: AircraftState) -> Preview:
-        nonlocal last, seen
+        nonlocal last, last_time
         if preview is not None:
-            last, seen = preview, state.time
+            last, last_time = preview, state.time
             return preview
-        fraction = 1 - (state.time - seen) / HORIZON
+        fraction = 1 - (state.time - last_time) / HORIZON
         return _fraction_of(last, fraction) if fraction > 0 else no_loads
 
     return transfer
@@ -68,13 +68,13 @@ def bumpless_transfer() -> Transfer:
 def _fraction_of(preview: Preview, fraction: float) -> Preview:
     def expected(time: ArrayLike) -> Loads:
         loads = preview(time)
-        return Loads(*(fraction * one for one in (loads.force, loads.moment, loads.bending)))
+        return Loads(*(fraction * part for part in (loads.force, loads.moment, loads.bending)))
 
     return expected
 
 
 def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
-    """Levelling alone: the roll rate -roll / time (s) is asked for; without a time nothing steers.
+    """Levelling: commands the roll rate -roll / time (s); without a time nothing steers.
 
     The aileron deflects by L_p / L_da roll / time. Without limits and slow against the roll mode,
     a bank angle decays with this time.
@@ -91,12 +91,12 @@ def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
 def feedforward(aircraft: AircraftModel) -> Controller:
     """The aileron planned against the roll by the wake ahead; the other controls cancel moments.
 
-    Where the wake has more moment than the ailerons, cancelling leaves the difference. An aircraft
-    with a preview banks a little to the other side before. The deflections of the next `HORIZON`
-    minimise the sum of roll^2 + (`RATE_TIME` roll rate)^2 of the linear roll mode, from the state
-    flown and the moments expected, within the limits of deflection and rate; the first is
-    commanded, and all are planned again at the next call. Elevator and rudder cancel, as in
-    `cancelling`; the rudder's rolling moment is part of the plan.
+    Where the wake has more moment than the ailerons, cancelling is incomplete. An aircraft with a
+    preview first banks a little to the other side. The deflections of the next `HORIZON` minimise
+    the sum of roll^2 + (`RATE_TIME` roll rate)^2 of the linear roll mode, from the state flown and
+    the moments expected, within the limits of deflection and rate; the first is commanded, and all
+    are planned again at the next call. Elevator and rudder cancel, as in `cancelling`; the rudder's
+    rolling moment is part of the plan.
 
     Of a `RisingAircraft` elevator and symmetric ailerons are planned against loads (`load_plan`),
     with the travel of the ailerons that the plan of roll leaves.

@@ -110,7 +110,7 @@ class AileronLift:
 
 
 def aileron_lift(aircraft: Aircraft) -> AileronLift:
-    """What the ailerons lift, from what they roll, by strips.
+    """Lift by the ailerons, from their rolling moment, by strips.
 
     A strip with the deflection d has the lift of the angle k d. With the integrals over the
     stations eta = 2 |y| / b, I_n = 4 / pi int eta^n sqrt(1 - eta^2) d eta, the rolling moment
@@ -119,15 +119,15 @@ def aileron_lift(aircraft: Aircraft) -> AileronLift:
     """
     keys = aircraft.heave
     ends = np.array([keys.aileron_inner, keys.aileron_outer])
-    left = np.sqrt(1 - ends**2)
-    area = np.diff(ends * left + np.arcsin(ends))[0] * 2 / np.pi  # I_0
-    first = -np.diff(left**3)[0] * 4 / (3 * np.pi)  # I_1
-    one, two = (
+    chord = np.sqrt(1 - ends**2)
+    area = np.diff(ends * chord + np.arcsin(ends))[0] * 2 / np.pi  # I_0
+    first = -np.diff(chord**3)[0] * 4 / (3 * np.pi)  # I_1
+    slope, roll_slope = (
         finite_span_slope(aircraft.lift_slope, aircraft.span**2 / aircraft.wing_area, n)
         for n in (1, 2)
     )
-    effect = 2 * aircraft.aileron_power / (two * first)
-    return AileronLift(one * effect * area, one * effect * first / 2)
+    effect = 2 * aircraft.aileron_power / (roll_slope * first)
+    return AileronLift(slope * effect * area, slope * effect * first / 2)
 
 
 def wing_place(aircraft: Aircraft) -> float:
@@ -189,14 +189,14 @@ def linear_heave(
     aileron_bending : float
         Sum of both bending moments per symmetric aileron, N m per rad.
     """
-    alpha, late, turn = derivatives[:, :3].T
+    lift, lag, damping = derivatives[:, :3].T
     # per vertical speed, pitch, pitch rate; up, nose down; elevator, symmetric aileron
     known = np.column_stack(
-        [-alpha / speed, alpha, turn + late, [1.0, 0.0], [0.0, -1.0], derivatives[:, 3:]]
+        [-lift / speed, lift, damping + lag, [1.0, 0.0], [0.0, -1.0], derivatives[:, 3:]]
     )
     # alpha' = q - h'' / V
-    left = np.array([[mass + late[0] / speed, 0.0], [late[1] / speed, inertia]])
-    rise, pitch = np.linalg.solve(left, known)
+    matrix = np.array([[mass + lag[0] / speed, 0.0], [lag[1] / speed, inertia]])
+    rise, pitch = np.linalg.solve(matrix, known)
     whole = np.array([rise, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0], pitch])
     outer = np.array([0.0, aileron_bending])
     return Heave(whole[:, :3], whole[:, 3:5], whole[:, 5:], bending[0], outer, *bending[1:])

@@ -82,7 +82,9 @@ class HeaveModel:
         wind = np.array([loads.force[2], loads.moment[1], loads.moment[0]])
         start, end = (np.concatenate([wind, controls]) for controls in (before, self._deflections))
         flow, constant, ramp = self._step(dt)
-        now = flow @ self._array(state) + constant @ start + ramp @ (end - start)
+        vector = [state.z, state.vertical_speed, state.pitch]
+        vector += [state.pitch_rate, state.roll, state.roll_rate]
+        now = flow @ vector + constant @ start + ramp @ (end - start)
         self.state = self._after(state, dt, now, end, loads)
         return self.state
 
@@ -91,13 +93,8 @@ class HeaveModel:
         """Aileron, elevator, symmetric aileron, rad."""
         return np.array([self.deflection[0], self.deflection[1], self.symmetric])
 
-    def _array(self, one: AircraftState) -> np.ndarray:
-        return np.array(
-            [one.z, one.vertical_speed, one.pitch, one.pitch_rate, one.roll, one.roll_rate]
-        )
-
     def _equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Per state, and per force, pitching and rolling moment, aileron, elevator, symmetric."""
+        """Rates per state; per force, pitching and rolling moment, aileron, elevator, symmetric."""
         motion, inputs = np.zeros((_STATES, _STATES)), np.zeros((_STATES, 6))
         motion[_Z, 1] = 1.0
         motion[_HEAVE, _HEAVE] = self.heave.motion
@@ -107,7 +104,7 @@ class HeaveModel:
         return motion, inputs
 
     def _step(self, dt: float) -> tuple[np.ndarray, ...]:
-        """Of a step: per state, per inputs at its start, per change of the inputs in it."""
+        """State after a step per state, per inputs at its start, and per their change in it."""
         if dt not in self._steps:
             motion, inputs = self._equations()
             count = inputs.shape[1]
@@ -124,14 +121,14 @@ class HeaveModel:
     ) -> AircraftState:
         motion, per_input = self._equations()
         rates = motion @ now + per_input @ inputs
-        rise, turn = rates[1], rates[5]
-        both = self.heave.bent(now[_HEAVE], inputs[4:], rise)
+        rise, roll_acceleration = rates[1], rates[5]
+        total = self.heave.bent(now[_HEAVE], inputs[4:], rise)
         difference = (
             self._wing_damping * now[5]
             + self.control_moments[0, 0] * inputs[3]
-            - self._roll_relief * turn
+            - self._roll_relief * roll_acceleration
         )
-        port, starboard = loads.bending + np.array([both + difference, both - difference]) / 2
+        port, starboard = loads.bending + np.array([total + difference, total - difference]) / 2
         z, climb, pitch, pitch_rate, roll, roll_rate = map(float, now)
         return replace(
             before,
@@ -146,6 +143,6 @@ class HeaveModel:
             load_factor=1 + float(rise) / g,
             port_bending=float(port),
             starboard_bending=float(starboard),
-            # not "beyond": an angle that is no number is an upset, too
+            # NaN is an upset, too
             departed=not (abs(roll) <= LARGEST_ROLL and abs(pitch) <= LARGEST_ROLL),
         )

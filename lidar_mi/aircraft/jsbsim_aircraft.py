@@ -112,7 +112,7 @@ class JSBSimAircraft:
 
     @property
     def mass(self) -> float:
-        """Now, kg."""
+        """Mass now, kg."""
         return self._fdm["inertia/mass-slugs"] * slug
 
     @property
@@ -153,28 +153,28 @@ class JSBSimAircraft:
 
     def _read(self, time: float, by_wind: np.ndarray) -> AircraftState:
         """State in the path frame, with the wind's bending moments."""
-        found = state_in_path(self._fdm, self._origin, self._climb, time)
-        if found is None:
+        state = state_in_path(self._fdm, self._origin, self._climb, time)
+        if state is None:
             return replace(self.state, time=time, departed=True)
         port, starboard = self._bent(by_wind)
-        return replace(found, port_bending=port, starboard_bending=starboard)
+        return replace(state, port_bending=port, starboard_bending=starboard)
 
     def _bent(self, by_wind: np.ndarray) -> tuple[float, float]:
         """Bending moments of port and starboard wing, changes from the trim, N m.
 
-        JSBSim knows no lift along the span: strips of its wing at its angle of attack, which is
-        that by its motion alone, and at its roll rate.
+        JSBSim has no lift distribution along the span: it is that of strips of its wing at its roll
+        rate and its angle of attack, which is by its motion alone.
         """
         fdm, (incidence, load_factor) = self._fdm, self._trim
         motion = np.array([0.0, fdm["aero/alpha-rad"] - incidence, fdm["velocities/q-rad_sec"]])
         rise = g * (fdm["accelerations/Nz"] - load_factor)
-        both = self.heave.bent(motion, np.zeros(2), rise)
+        total = self.heave.bent(motion, np.zeros(2), rise)
         difference = (
             self._wing_damping * fdm["velocities/p-rad_sec"]
             + self.control_moments[0, 0] * self.deflection[0]
             - self._roll_relief * fdm["accelerations/pdot-rad_sec2"]
         )
-        port, starboard = by_wind + np.array([both + difference, both - difference]) / 2
+        port, starboard = by_wind + np.array([total + difference, total - difference]) / 2
         return float(port), float(starboard)
 
 
@@ -223,7 +223,7 @@ def neu_place(fdm: "FGFDMExec") -> np.ndarray:
 
 
 def air_density(fdm: "FGFDMExec") -> float:
-    """Of the air at the aircraft, kg/m^3."""
+    """Density of the air at the aircraft, kg/m^3."""
     return fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
 
 

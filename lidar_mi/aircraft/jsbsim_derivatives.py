@@ -29,9 +29,9 @@ def set_loads(fdm: "FGFDMExec", force: np.ndarray, moment: np.ndarray) -> None:
     """Let a force (N) and a moment (N m) of the body frame act from now on."""
     for k, axis in enumerate(AXES):
         # the force acts at the centre of gravity, which moves as fuel burns
-        for other in AXES:
-            place = f"external_reactions/wake-force-{axis}/location-{other}-in"
-            fdm[place] = fdm[f"inertia/cg-{other}-in"]
+        for along in AXES:
+            place = f"external_reactions/wake-force-{axis}/location-{along}-in"
+            fdm[place] = fdm[f"inertia/cg-{along}-in"]
         fdm[f"external_reactions/wake-force-{axis}/magnitude"] = _TO_OURS[k] * force[k] / lbf
         fdm[f"external_reactions/wake-moment-{axis}/magnitude-lbsft"] = (
             _TO_OURS[k] * moment[k] / (lbf * foot)
@@ -39,7 +39,7 @@ def set_loads(fdm: "FGFDMExec", force: np.ndarray, moment: np.ndarray) -> None:
 
 
 def commands_of(fdm: "FGFDMExec") -> np.ndarray:
-    """Of aileron, elevator and rudder, -1 to 1."""
+    """Commands of aileron, elevator and rudder, -1 to 1."""
     return np.array([fdm[f"fcs/{name}-cmd-norm"] for name in _CONTROLS])
 
 
@@ -126,8 +126,8 @@ def heave_derivatives(
                 elevator = per_command * (commands_of(moved) - commands_of(still))[1]
             causes.append([*change, elevator])
             effects.append(_upward(moved) - _upward(still))
-    found = np.linalg.lstsq(np.array(causes), np.array(effects), rcond=None)[0].T
-    return np.column_stack([found, np.zeros(2)])
+    derivatives = np.linalg.lstsq(np.array(causes), np.array(effects), rcond=None)[0].T
+    return np.column_stack([derivatives, np.zeros(2)])
 
 
 def _upward(fdm: "FGFDMExec") -> np.ndarray:

@@ -36,12 +36,12 @@ _NOTHING = 1e-6  # of a coefficient of lift or moment: rounding
 
 
 def such_as(name: str) -> str:
-    """Words that name a large aircraft other than this one."""
-    return f"such as {next(one for one in _LARGE if one != name)}"
+    """Words that name another large aircraft."""
+    return f"such as {next(other for other in _LARGE if other != name)}"
 
 
 def check_aeroplane(name: str, path: Path) -> None:
-    """Refuse what does not fly on wings, with ailerons, driven by an engine.
+    """Refuse aircraft without wings, ailerons or an engine.
 
     JSBSim computes its aerodynamic forces at the speed and altitude of the path, at angles of
     attack of 0 and 4 degrees, and at the latter with the ailerons deflected.
@@ -92,18 +92,18 @@ def trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec
     Raises
     ------
     InputError
-        There is no equilibrium. Or there is no JSBSim, or it has no such aircraft.
+        No equilibrium, no JSBSim, or no such aircraft.
     RuntimeError
         From JSBSim, of an aircraft that it cannot load or start.
     """
-    found = _trimmed(name, path, flap_settings)
-    if found is None:
+    fdm = _trimmed(name, path, flap_settings)
+    if fdm is None:
         raise InputError(
             f"encounter.path.speed: {name} does not trim at {path.speed:g} m/s and "
             f"{math.degrees(path.climb_angle):.3g} deg at {path.altitude:g} m; "
             f"expected {_where_it_trims(name, path)}"
         )
-    return found
+    return fdm
 
 
 def _trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec | None":
@@ -132,7 +132,7 @@ def _trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExe
 
 
 def _where_it_trims(name: str, path: Path) -> str:
-    """What to change: a speed at which it trims, or else the path or the aircraft."""
+    """Advice: a speed at which it trims, or else another path or aircraft."""
     level, raised = (_lift(_in_flow(name, path, incidence)) for incidence in (0.0, _RAISED))
     weight = _in_flow(name, path, 0.0)["inertia/weight-lbs"]
     highest = level + (raised - level) * _HIGHEST / _RAISED
@@ -142,9 +142,8 @@ def _where_it_trims(name: str, path: Path) -> str:
         for lift in (level, highest)
     )
     speeds = np.unique(np.geomspace(slow, fast, _TRIALS).round())
-    for speed in sorted(speeds, key=lambda one: abs(one - path.speed)):
-        other = path.model_copy(update={"speed": float(speed)})
-        if _trimmed(name, other, FLAPS[:1]) is not None:
+    for speed in sorted(speeds, key=lambda v: abs(v - path.speed)):
+        if _trimmed(name, path.model_copy(update={"speed": float(speed)}), FLAPS[:1]) is not None:
             return f"another speed, such as {speed:g} m/s"
     return (
         "another climb_angle or altitude, or another aircraft, "
@@ -223,7 +222,7 @@ def loaded(name: str) -> "FGFDMExec":
 
 @cache
 def _silent_logger(jsbsim: ModuleType) -> "FGLogger":
-    """In place of JSBSim's own, which writes to the terminal whatever it also raises."""
+    """Logger that writes nothing: JSBSim also raises what it writes to the terminal."""
 
     def ignore(self: object, *arguments: Any) -> None:
         pass

@@ -56,9 +56,9 @@ def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
     count = from_controls.shape[1]
     # the last unknown is the largest load factor of the intervals
     matrix = block_diag(np.concatenate([from_controls, _EFFORT * np.eye(count)]), PEAK)
-    load, one = from_controls[:KNOTS], np.ones((KNOTS, 1))
+    load, unity = from_controls[:KNOTS], np.ones((KNOTS, 1))
     within = np.pad(np.kron(np.eye(used.size), TRAVEL), ((0, 0), (0, 1)))
-    solved = least_squares(matrix, np.block([[within], [-load, one], [load, one]]))
+    solved = least_squares(matrix, np.block([[within], [-load, unity], [load, unity]]))
     # the second of the four outputs of each interval
     by_bending = np.kron([[0], [1], [0], [0]], np.eye(KNOTS)) * (BENDING / heave.level_bending)
 
@@ -71,16 +71,16 @@ def load_plan(heave: Heave, limits: Limits) -> LoadPlan:
     ) -> np.ndarray:
         without = from_state @ state + np.einsum("okl,kl->o", from_wind, wind)
         without = without + by_bending @ bending
-        room, reach = (np.tile(one[:, None], KNOTS) for one in (largest, rate * INTERVAL))
-        # what roll leaves of the ailerons' travel and rate
+        room, reach = (np.tile(limit[:, None], KNOTS) for limit in (largest, rate * INTERVAL))
+        # travel and rate of the ailerons that roll does not use
         room[1] = np.minimum(room[1], limits.deflection[0] - np.abs(ailerons[1:]))
         reach[1] = np.maximum(reach[1] - np.abs(np.diff(ailerons)), 0.0)
         ways = [least_travel(now[k], room[k], reach[k]) for k in used]
         least = np.concatenate([*ways, without[:KNOTS], -without[:KNOTS]])
         target = -np.concatenate([without, np.zeros(count + 1)])
-        found = np.zeros(2)
-        found[used] = solved(target, least)[:-1].reshape(-1, KNOTS)[:, 0]
-        return np.clip(found, -largest, largest)
+        chosen = np.zeros(2)
+        chosen[used] = solved(target, least)[:-1].reshape(-1, KNOTS)[:, 0]
+        return np.clip(chosen, -largest, largest)
 
     return plan
 
@@ -94,17 +94,17 @@ def _outputs(heave: Heave) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     whole = np.zeros((7, 7))
     whole[:3] = np.hstack([heave.motion, inputs])
     flow = expm(whole * INTERVAL)[:3]
-    # states on the first state and on all inputs
+    # derivatives of the state by the first state and all inputs
     now = np.zeros((3, 3 + 4 * KNOTS))
     now[:, :3] = np.eye(3)
     rows: list[list[np.ndarray]] = [[], [], [], []]
     for k in range(KNOTS):
-        here = slice(3 + 4 * k, 7 + 4 * k)
+        interval = slice(3 + 4 * k, 7 + 4 * k)
         after = flow[:, :3] @ now
-        after[:, here] += flow[:, 3:]
+        after[:, interval] += flow[:, 3:]
         rise = (after[0] - now[0]) / INTERVAL
         bent = heave.bending @ (now + after) / 2 - heave.relief * rise
-        bent[here] += [0.0, 0.0, *heave.bending_controls]
+        bent[interval] += [0.0, 0.0, *heave.bending_controls]
         for row, value in zip(
             rows,
             (
@@ -117,6 +117,6 @@ def _outputs(heave: Heave) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ):
             row.append(value)
         now = after
-    all_of_them = np.concatenate(rows)
-    each = all_of_them[:, 3:].reshape(4 * KNOTS, KNOTS, 4)
-    return all_of_them[:, :3], each[..., :2], each[..., 2:]
+    outputs = np.concatenate(rows)
+    each = outputs[:, 3:].reshape(4 * KNOTS, KNOTS, 4)
+    return outputs[:, :3], each[..., :2], each[..., 2:]

@@ -38,7 +38,7 @@ def least_squares(
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The x that minimises |matrix x - target| where allowed x >= least, of target and least.
 
-    As a least distance problem, solved by non-negative least squares (Lawson and Hanson 1995,
+    It is a least distance problem, solved by non-negative least squares (Lawson and Hanson 1995,
     chapter 23). The matrix has full rank, and some x is allowed.
     """
     q, r = np.linalg.qr(matrix)

@@ -55,7 +55,7 @@ class RollModel:
                 moments = loads.moment[0] + self.control_moments[0, 0] * np.array([start, end])
                 roll, rate = self._rolled(roll, rate, duration, *(moments / self.roll_inertia))
         time = state.time + dt
-        # not "beyond": a roll angle that is no number is an upset, too
+        # NaN is an upset, too
         self.state = replace(
             state,
             time=time,
@@ -79,5 +79,6 @@ class RollModel:
         free = rate - tau * (start - slope * tau)
         decay = np.exp(-dt / tau)
         after = tau * (end - slope * tau) + free * decay
-        way = tau * (dt * (start + end) / 2 - slope * tau * dt) - free * tau * np.expm1(-dt / tau)
-        return float(roll + way), float(after)
+        change = tau * (dt * (start + end) / 2 - slope * tau * dt)
+        change -= free * tau * np.expm1(-dt / tau)
+        return float(roll + change), float(after)

@@ -186,8 +186,8 @@ def loads_in_wind(
     to_path = attitude(state.roll, state.pitch, state.yaw).as_matrix()
     # only x advances: a preview does not predict the aircraft's own motion across the path
     x, y, z = (strips.places @ to_path.T + np.array([state.x, state.y, state.z])).T
-    found = wind(x + state.airspeed * (at - state.time), y, z, at)
-    body = np.stack(np.broadcast_arrays(*found), -1) @ to_path
+    uvw = wind(x + state.airspeed * (at - state.time), y, z, at)
+    body = np.stack(np.broadcast_arrays(*uvw), -1) @ to_path
     return wake_loads(strips, body, state.airspeed, density)
 
 
@@ -212,7 +212,7 @@ def ailerons_deflected(
 ) -> tuple[float, float]:
     """Both ailerons, each within its limits and at most at its rate; roll has the first claim.
 
-    Of the travel that a commanded roll leaves, the symmetric deflection gets what it asks for.
+    The symmetric deflection is limited to the travel that a commanded roll leaves.
     Antisymmetric and symmetric deflection (rad) come and go in this order, as by `deflected`.
     """
     largest, way = limits.deflection[0], limits.rate[0] * dt

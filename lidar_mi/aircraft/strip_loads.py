@@ -41,7 +41,7 @@ KUESSNER = Indicial((0.236, 0.513, 0.171), (0.058, 0.364, 2.42))
 
 
 class Memory:
-    """What strips remember of their inputs: exact for inputs that are linear between samples.
+    """Unsteady response of strips to their inputs, exact for inputs linear between samples.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ class Memory:
         self._before = np.zeros(0)
 
     def __call__(self, dt: float, value: np.ndarray) -> np.ndarray:
-        """Effective input dt (s) after the last one; the first has been there for ever; (n,)."""
+        """Effective input (n,) dt (s) after the last one; the first input is a steady state."""
         if self._state is None:
             self._state = self._weights * value
         elif dt > 0:
-            way = self._rates * dt
-            decay, mean = np.exp(-way), -np.expm1(-way) / way
+            distance = self._rates * dt
+            decay, mean = np.exp(-distance), -np.expm1(-distance) / distance
             driven = (mean - decay) * self._before + (1 - mean) * value
             self._state = decay * self._state + self._weights * driven
         self._before = value
@@ -102,7 +102,7 @@ class StripLoads:
         self._steady = self._motion(aircraft.state)
 
     def __call__(self, state: AircraftState) -> Loads:
-        """Of a state, which is later than that of the last call."""
+        """Loads in a state, which is later than that of the last call."""
         dt, self._time = state.time - self._time, state.time
         to_path = attitude(state.roll, state.pitch, state.yaw).as_matrix()
         x, y, z = (self._places @ to_path.T + np.array([state.x, state.y, state.z])).T

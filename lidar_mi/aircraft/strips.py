@@ -144,9 +144,9 @@ def in_downwash(tail: Strips, section_slope: float, aspect_ratio: float) -> Stri
     """A horizontal tail in the downwash of a wing that meets the same wind.
 
     Far behind an elliptic wing the induced angle is twice that at the wing: the tail keeps the
-    fraction 1 - 2 n a_n / (pi A) of the n-th mode, with the wing's slope a_n. The downwash is
-    there at once, and that of the wind's linear parts is taken for all of it. Slope and aspect
-    ratio are the wing's, as in `finite_span_slope`.
+    fraction 1 - 2 n a_n / (pi A) of the n-th mode, with the wing's slope a_n. The downwash has no
+    delay, and that of the wind's linear parts is used for all of it. Slope and aspect ratio are the
+    wing's, as in `finite_span_slope`.
     """
     fractions = [
         1 - 2 * n * finite_span_slope(section_slope, aspect_ratio, n) / (np.pi * aspect_ratio)
@@ -169,7 +169,9 @@ def as_wing(surface: Strips) -> Strips:
 def joined(*surfaces: Strips) -> Strips:
     """Strips of several surfaces."""
     names = ("places", "normals", "areas", "slopes", "roll_slopes", "bends", "chords")
-    return Strips(*(np.concatenate([getattr(one, name) for one in surfaces]) for name in names))
+    return Strips(
+        *(np.concatenate([getattr(surface, name) for surface in surfaces]) for name in names)
+    )
 
 
 def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float) -> Loads:
@@ -187,8 +189,8 @@ def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float)
     moment[..., 0] = (pressure * strips.roll_slopes) @ arms[:, 0]
     # what both wings have in common has the first slope, their difference the second
     across = np.where(strips.bends, strips.places[:, 1], 0.0)
-    both, difference = lift @ np.abs(across), (pressure * strips.roll_slopes) @ across
-    bending = np.stack([both + difference, both - difference], -1) / 2
+    total, difference = lift @ np.abs(across), (pressure * strips.roll_slopes) @ across
+    bending = np.stack([total + difference, total - difference], -1) / 2
     return Loads(lift @ strips.normals, moment, bending)
 
 
@@ -202,7 +204,7 @@ def roll_damping(strips: Strips, airspeed: float, density: float) -> float:
 
 
 def _angles(n: int) -> np.ndarray:
-    """Of the nodes of the quadrature, rad, shape (n,)."""
+    """Angles of the nodes of the quadrature, rad, shape (n,)."""
     if n < 2:
         raise InputError(f"strips.n: {n} is not allowed; expected 2 or more")
     return np.arange(1, n + 1) * np.pi / (n + 1)

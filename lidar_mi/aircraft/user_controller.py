@@ -1,4 +1,4 @@
-"""A controller of the user: its faults become one line with its name and what is expected."""
+"""A controller of the user, whose errors become one line with its name."""
 
 import functools
 import inspect
@@ -18,7 +18,7 @@ _CONTROLLER = "expected a function of the preview and the state that returns Com
 
 
 def name_of(maker: Callable[..., Any]) -> str:
-    """What a controller is called in tables, figures and messages."""
+    """Name of a controller in tables, figures and messages."""
     while isinstance(maker, functools.partial):
         maker = maker.func
     name = getattr(maker, "__name__", type(maker).__name__)
@@ -35,25 +35,28 @@ def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Contr
         itself when it is called: other arguments, an exception, no `Commands` of finite numbers.
     """
     called = f"controller {name_of(maker)}"
-    if not _takes(maker, 1):
-        both = _takes(maker, 2)
-        given = "a controller itself, of the preview and the state" if both else "other arguments"
-        hint = ": lambda aircraft: the controller" if both else ""
+    if not _accepts(maker, 1):
+        given, hint = "other arguments", ""
+        if _accepts(maker, 2):
+            given = "a controller itself, of the preview and the state"
+            hint = ": lambda aircraft: the controller"
         raise InputError(f"{called}: takes {given}; {_MAKER}{hint}")
     try:
         made = maker(aircraft)
     except Exception as error:
-        raise InputError(f"{called}: {_said(error)}; {_MAKER}") from error
+        raise InputError(f"{called}: {_with_line(error)}; {_MAKER}") from error
     if not callable(made):
         raise InputError(f"{called}: returned {_shown(made)} for an aircraft; {_MAKER}")
-    if not _takes(made, 2):
+    if not _accepts(made, 2):
         raise InputError(f"{called}: what it returned takes other arguments; {_CONTROLLER}")
 
     def controller(preview: Preview, state: AircraftState) -> Commands:
         try:
             commands = made(preview, state)
         except Exception as error:
-            raise InputError(f"{called}: {_said(error)} at {state.time:.2f} s of flight") from error
+            raise InputError(
+                f"{called}: {_with_line(error)} at {state.time:.2f} s of flight"
+            ) from error
         if not isinstance(commands, Commands):
             raise InputError(f"{called}: returned {_shown(commands)}; expected Commands(aileron=…)")
         for control, value in vars(commands).items():
@@ -72,7 +75,7 @@ def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Contr
     return controller
 
 
-def _takes(function: Callable[..., Any], count: int) -> bool:
+def _accepts(function: Callable[..., Any], count: int) -> bool:
     """Whether a function can be called with so many arguments; unknown ones are tried."""
     try:
         inspect.signature(function).bind(*range(count))
@@ -83,7 +86,7 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
-def _said(error: Exception) -> str:
+def _with_line(error: Exception) -> str:
     """An exception with the line of the user's file that raised it."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     words = " ".join(str(error).split())[:120]

@@ -13,7 +13,7 @@ METHOD_NAMES: Mapping[str, str] = {
     ImageMethod.VORTEX_FIT: "vortex fit",
     VolumeMethod.CORRELATION: "correlation",
 }
-"""Methods that winds are retrieved by, as figures and tables call them."""
+"""Names of the wind retrieval methods in figures and tables."""
 
 SOURCE_NAMES: Mapping[str, str] = {
     Source.BACKSCATTER: "backscatter",
@@ -22,7 +22,7 @@ SOURCE_NAMES: Mapping[str, str] = {
     Source.BLURRED: "extinction blurred by the beam",
     Source.WITHOUT_TEXTURE: "extinction without texture",
 }
-"""What winds are retrieved from, as figures and tables call it."""
+"""Names of the data that winds are retrieved from in figures and tables."""
 
 BACKSCATTER = "attenuated backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"
 
@@ -52,11 +52,11 @@ def title_of(key: str) -> str:
     'rms error of v, backscatter with detector noise, variational retrieval'
     """
     *places, quantity = key.split(".")
-    whose = "standard error of " if quantity.endswith("_stderr") else ""
+    prefix = "standard error of " if quantity.endswith("_stderr") else ""
     quantity = quantity.removesuffix("_stderr")
     start, words = next((p for p in _KINDS if quantity.startswith(p[0])), ("", ""))
     stem = quantity.removeprefix(start)
     name = _QUANTITIES.get(stem, stem)
     origin = [_ORIGINS.get(place, place) for place in places if place != "all"]
-    texts = [whose + words + name, *origin]
+    texts = [prefix + words + name, *origin]
     return ", ".join(texts).replace("_", " ")

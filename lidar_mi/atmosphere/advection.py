@@ -117,7 +117,7 @@ def advect(
         Other dims, unequal grids, uneven axes, values or dt not finite.
     """
     _check_step(dt, steps)
-    _check_grid(field, v, w, u)  # whose fault it would be of the field, of the velocities else
+    _check_grid(field, v, w, u)  # a fault of the field, or of the velocities
     return carrier(v, w, dt, steps, u)(field)
 
 
@@ -207,7 +207,7 @@ def _check_step(dt: float, steps: int) -> None:
 def _velocity(
     v: xr.DataArray, w: xr.DataArray, u: xr.DataArray | None
 ) -> dict[str, tuple[str, xr.DataArray]]:
-    """Names and components by the axis that they are along."""
+    """Names and components by axis."""
     along = {} if u is None else {"x": ("u", u)}
     return {**along, "y": ("v", v), "z": ("w", w)}
 
@@ -245,7 +245,7 @@ def _check_grid(
 
 
 def _pieces(field: xr.DataArray, whole: bool) -> np.ndarray:
-    """What moves as one: the ``whole`` volume, or every plane by itself."""
+    """Arrays that are advected together: the ``whole`` volume, or each plane."""
     order = [axis for axis in ("x", "y", "z") if axis in field.dims]
     values = field.transpose(*order).values.astype(float)
     return values.reshape(-1, *values.shape[-3 if whole else -2 :])
@@ -262,7 +262,7 @@ def _speeds(
 
 
 def _reader(field: xr.DataArray, whole: bool) -> Callable[[Sequence[np.ndarray]], xr.DataArray]:
-    """From places of the nodes of all `_pieces` (node indices) to the field there."""
+    """A function from places of the nodes of all `_pieces` (node indices) to the field there."""
     pieces = _pieces(field, whole)
     samplers = [_sampler(piece, _FINER) for piece in pieces]
     result = field.transpose(*(axis for axis in ("x", "y", "z") if axis in field.dims))

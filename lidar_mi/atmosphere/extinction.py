@@ -122,7 +122,7 @@ def extinction_from_tracer(
 
     def exhaust(name: str) -> xr.DataArray:
         fraction = _stretched(_variable(wake, name, "tracer"), stretch, reference, "tracer")
-        # on top of the background: where its aerosol is 1, the largest tracer has the maximum
+        # added to the background: the largest tracer has the maximum where the aerosol is 1
         return (maximum - background) * fraction
 
     if aerosol is not None:

@@ -9,12 +9,12 @@ import scipy
 # Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
 # their origin reach 5e-4.
 _UNEVEN = 1e-3
-# An even axis has at most so many times the nodes of a stretched one.
+# Largest ratio of the nodes of an even axis to those of a stretched one.
 _DENSEST = 4
 
 
 def is_even(nodes: np.ndarray) -> bool:
-    """Whether an ascending axis has equal steps, to what single precision leaves of them."""
+    """Whether an ascending axis has equal steps, up to single precision."""
     steps = np.diff(nodes)
     return steps.size == 0 or bool(np.ptp(steps) <= 2 * _UNEVEN * steps.mean())
 
@@ -68,7 +68,7 @@ def interpolated(
 
 
 def statement(errors: Mapping[str, float], units: Mapping[str, str]) -> str:
-    """What was interpolated and to which error, in a sentence; empty: nothing was."""
+    """A sentence on the interpolated variables and their errors; empty without any."""
     parts = [
         f"{name} to {error:.2g} {units[name]}".rstrip() for name, error in errors.items() if error
     ]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
 
-# 8 bytes each for the noise and its spectrum: half a gigabyte in all.
+# Half a gigabyte, at 8 bytes each for the noise and its spectrum.
 _LARGEST_GRID = 30_000_000
 
 
@@ -168,7 +168,7 @@ class PeriodicTexture:
 
     @property
     def period(self) -> tuple[float, ...]:
-        """After which the texture repeats along x, y and z, m."""
+        """Period of the texture along x, y and z, m."""
         return tuple(
             n * step for n, step in zip(self.coefficients.shape, self.spacing, strict=True)
         )

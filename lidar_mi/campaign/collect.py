@@ -1,6 +1,5 @@
 """The points of a campaign as one data set."""
 
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,7 @@ from lidar_mi.progress import Notice
 
 STATUS = ("done", "failed", "missing")
 
-# Points between two notices.
-_EVERY = 200
+_POINTS_PER_NOTICE = 200
 
 
 @checked_arguments
@@ -76,7 +74,7 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
     status = np.full(total, STATUS.index("missing"), np.int8)
     messages, places = np.full(total, "", object), np.full(total, "", object)
     for number in range(total):
-        if number % _EVERY == 0:
+        if number % _POINTS_PER_NOTICE == 0:
             notice("collecting points", number / total)
         place = folder.place(number)
         places[number] = str(place.relative_to(folder.path))
@@ -123,13 +121,14 @@ def _data_set(
             about["units"] = units[name]
         if scales.get(name):
             about["scale"] = scales[name]
-        # objects: NetCDF then stores text of any length
+        # object arrays: NetCDF stores text of any length
         coords[name] = (dim, np.array(along, object if isinstance(along[0], str) else None), about)
     if MEMBER in dims:
         coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})
     # sorted: the file does not depend on which point has a metric first
     variables: dict[str, Any] = {
-        _metric_name(key, coords): (dims, values[key].reshape(shape), _about(key))
+        # a metric may have the name of a key of the campaign
+        f"{key}.metric" if key in coords else key: (dims, values[key].reshape(shape), _about(key))
         for key in sorted(values)
     }
     variables["status"] = (
@@ -162,11 +161,6 @@ def knob_name(key: str) -> str:
         return "time between the images"
     words = key.replace("doppler.lidar.", "Doppler lidar ").replace("doppler.", "Doppler lidar's ")
     return words.replace(".", " ").replace("_", " ")
-
-
-def _metric_name(key: str, coords: Mapping[str, Any]) -> str:
-    """Name of a metric that is not that of a key of the campaign."""
-    return f"{key}.metric" if key in coords else key
 
 
 def _about(key: str) -> dict[str, str]:

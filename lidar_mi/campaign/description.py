@@ -18,7 +18,7 @@ KEYS = ("base", "sweep", "sample", "members")
 """Keys that only a campaign has."""
 
 LARGEST = 10**7
-"""Values of a dimension, points of a sample, members: more are a slip of the pen."""
+"""Most values of a dimension, points of a sample, members: more are a typing error."""
 
 
 class Span(Description):
@@ -46,12 +46,12 @@ class Span(Description):
 
     @property
     def scale(self) -> str:
-        """Either linear or log."""
+        """Scale: linear or log."""
         return "linear" if self.linear else "log"
 
     @property
     def unit(self) -> str:
-        """The unit of both ends, as it stands."""
+        """The unit of both ends, as written."""
         return split_quantity(self._ends()[0])[1]
 
     def ends(self) -> tuple[float, float]:
@@ -175,7 +175,7 @@ class Campaign(Description):
     @field_validator("sweep", mode="before")
     @classmethod
     def _dimensions(cls, value: Any) -> Any:
-        """Dimensions as what they are, so that a fault in one is not that of another kind."""
+        """Dimensions parsed by kind, so that a fault is reported for the right kind."""
         if not isinstance(value, dict):
             raise ValueError(f"sweep: {value!r} is not allowed; expected keys with their values")
         return {str(key): _dimension(str(key), values) for key, values in value.items()}
@@ -219,7 +219,7 @@ def _dimension(key: str, values: Any) -> Range | list[Any] | dict[str, dict[str,
 
 
 def _check_list(place: str, values: list[Any]) -> None:
-    """Values must differ and be of one unit."""
+    """Refuse equal values, and values of different units."""
     # a list: values may be lists themselves, which no set holds
     unique: list[Any] = []
     for value in values:

@@ -33,18 +33,18 @@ from lidar_mi.progress import Notice
 from lidar_mi.schema.shipped import campaign_file
 
 MOST_UNASKED = 100_000
-"""Points of a campaign that runs without a confirmation."""
+"""Most points of a campaign that runs without confirmation."""
 
 PATIENCE = 15.0
-"""Seconds for a scheduler to answer."""
+"""Longest time for a scheduler to answer, s."""
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 _TRIES = 10
-"""Workers that may be lost while they are made ready."""
+"""Most workers that may be lost while they are made ready."""
 
 _AT_ONCE = 4
-"""Tasks per thread that the scheduler holds: enough that no worker waits."""
+"""Tasks per thread that the scheduler holds, so that no worker waits."""
 
 
 @dataclass(repr=False)
@@ -188,7 +188,7 @@ def connected(
     """
     if isinstance(client, Client):
         _make_ready(client, threads, own_cache=True)
-        # the caller's: it is theirs to close
+        # the caller closes it
         yield client
         return
     if client is not None:
@@ -206,12 +206,12 @@ def connected(
         "distributed.scheduler.allowed-failures": 10**6,
         "distributed.scheduler.worker-saturation": 1.1,
         "distributed.worker.multiprocessing-method": "spawn",
-        # without dask's limit to what malloc keeps, with which every large array is mapped anew
+        # without dask's limit for malloc, by which every large array is mapped anew
         "distributed.nanny.pre-spawn-environ": dict.fromkeys(_ONE_THREAD, threads)
-        # points run in a thread of their own, whose memory is otherwise mapped anew every time
+        # points run in separate threads, whose memory is otherwise mapped anew every time
         | {"MALLOC_ARENA_MAX": 1},
         "distributed.logging.distributed": "critical",
-        # its profiler looks at the workers a hundred times a second: a fifth of a short point
+        # its profiler samples the workers a hundred times a second: a fifth of a short point's time
         "distributed.worker.profile.enabled": False,
         "distributed.worker.memory.monitor-interval": "1s",
         "distributed.admin.tick.interval": "1s",
@@ -229,7 +229,7 @@ def connected(
                 silence_logs=50,
             )
             open_until_the_end.enter_context(cluster)
-            # the default client is that of the user's own code
+            # the default client belongs to the user's code
             cluster_client = open_until_the_end.enter_context(Client(cluster, set_as_default=False))
             cluster_client.wait_for_workers(1, timeout=60)
         _make_ready(cluster_client, threads, own_cache=False)
@@ -265,16 +265,9 @@ def execute(
 class _Dispatch:
     """Submits points in their order, after the renderings that they share.
 
-    Attributes
-    ----------
-    numbers : dict of Future to int
-        Points that the scheduler has.
-    shared : dict of str to Future
-        Renderings by their signature.
-    needed : dict of str to int
-        Number of unfinished points that need the images of a signature.
-    longest : float
-        Duration of the longest point, s.
+    ``numbers`` are the points that the scheduler has, ``shared`` the renderings by signature,
+    ``needed`` the numbers of unfinished points that need these images; ``longest`` is the duration
+    of the longest point, s.
     """
 
     def __init__(
@@ -319,7 +312,7 @@ class _Dispatch:
 
     def _submit(self, number: int) -> None:
         first, ready = self._renderings(number)
-        # a key of its own: dask returns the old result of a key that it knows
+        # a new key: dask returns the old result of a known key
         future = self.client.submit(
             carry_out,
             self.path,
@@ -334,14 +327,7 @@ class _Dispatch:
         self.pending.add(future)
 
     def _renderings(self, number: int) -> tuple[list[int], list[Future[int]]]:
-        """Tasks that render what this point shares with others, each submitted once.
-
-        Returns
-        -------
-        first : list of int
-            Which of them were submitted for this point.
-        tasks : list of Future
-        """
+        """Renderings that this point shares: indices of those that it submits, and all tasks."""
         images = self.folder.index[number].images
         # most points share nothing: their experiment need not be made here
         if all(self.needed[image] < 2 for image in images):
@@ -377,7 +363,7 @@ class _Dispatch:
             return
         except InputError:  # the folder, not the point
             raise
-        except Exception as error:  # a point's own failure is an outcome
+        except Exception as error:  # a failed point is an outcome
             raise InputError(
                 f"the scheduler or its workers are lost ({one_line(error)[:100]}); start the "
                 "campaign again to complete it"

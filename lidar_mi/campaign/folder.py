@@ -35,8 +35,9 @@ ATTEMPTS = "attempts.txt"
 RUN = "run"
 """Run folder in that of a point, with ``keep: everything``."""
 
-_SHORT = 20
-"""Characters of a hash that name a folder: 80 bits, for which 10^7 points collide never."""
+_HASH_LENGTH = 20
+"""Characters of a hash that name a folder: 80 bits, by which 10^7 points collide with a probability
+of 4e-11."""
 
 
 class Row(NamedTuple):
@@ -98,7 +99,7 @@ class CampaignFolder:
 
     def images(self, signature: str) -> Path:
         """Folder of images of one signature."""
-        return self.path / IMAGES / signature[:_SHORT]
+        return self.path / IMAGES / signature[:_HASH_LENGTH]
 
     def metrics(self, number: int) -> dict[str, float | None] | None:
         """Metrics of a point; None: there are none yet, or their file is damaged."""
@@ -115,7 +116,7 @@ class CampaignFolder:
     def drop_images(self, signature: str) -> None:
         """Remove images that no point needs any more."""
         shutil.rmtree(self.images(signature), ignore_errors=True)
-        with suppress(OSError):  # it holds images of other signatures
+        with suppress(OSError):  # the folder holds images of other signatures
             (self.path / IMAGES).rmdir()
 
     def claimed(self) -> AbstractContextManager[None]:
@@ -130,7 +131,7 @@ class CampaignFolder:
 
 
 def _read_mapping(path: Path, expected: str) -> dict[str, Any] | None:
-    """Content of a JSON file; None: it is missing, or torn, so that its point is computed again."""
+    """Content of a JSON file; None: missing or torn, so that its point is computed again."""
     try:
         content = read_json(path, expected) if path.is_file() else None
     except InputError:
@@ -172,7 +173,7 @@ def read_base(campaign: Campaign, origin: str | Path) -> tuple[dict[str, Any], P
             f"{origin}: base: {campaign.base} has variants; expected an experiment without, or the "
             "campaign of its variants: lidar-mi campaign run " + str(campaign.base)
         )
-    # a name in the base would only name its own run
+    # a name in the base names only its run
     return base, path.parent.resolve()
 
 
@@ -283,7 +284,7 @@ def _row(experiment: Experiment, search_path: Path) -> Row:
     record = new_record(experiment, search_path)
     graph = stages_of(experiment)
     images = [made_by(record, graph.keys(stage)) for stage in storing_stages(graph)]
-    return Row(made_by(record)[:_SHORT], tuple(images))
+    return Row(made_by(record)[:_HASH_LENGTH], tuple(images))
 
 
 def _check_keys(points: Points) -> None:

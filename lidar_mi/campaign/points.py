@@ -12,12 +12,13 @@ from scipy.stats import qmc
 
 from lidar_mi.campaign.description import Campaign, Range
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.describe import value_at
 from lidar_mi.schema import reading
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.units import registry, split_quantity
 
 MEMBER, SAMPLE = "member", "sample"
-"""Names of dimensions that are no key."""
+"""Names of dimensions that are no keys."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Points:
     def __init__(self, campaign: Campaign, base: dict[str, Any], search_path: str | Path) -> None:
         self.campaign, self.search_path = campaign, Path(search_path)
         self.dimensions = tuple(_dimensions(campaign))
-        # a name of a point is no part of what it is
+        # the name of a point does not change its results
         self.base = reading.merged(base, _nested(campaign.set))
         self.seed = campaign.seed if campaign.seed is not None else self.base.get("seed", 1)
         _refuse_overlaps(self.dimensions)
@@ -140,7 +141,7 @@ class Points:
                 units |= {dimension.name: unit} if unit else {}
                 continue
             for key in dimension.changes[0]:
-                value = _at(reading.settings(self.experiment(0), si=True), key)
+                value = value_at(reading.settings(self.experiment(0), si=True), key)
                 if isinstance(value, str) and _number(value) is not None:
                     units[key] = value.partition(" ")[2]
         return units
@@ -150,7 +151,7 @@ class Points:
         # the first points along this dimension; of others the same values follow
         stride = math.prod(self.shape[axis + 1 :])
         values = [
-            _at(reading.settings(self.experiment(k * stride), si=True), key)
+            value_at(reading.settings(self.experiment(k * stride), si=True), key)
             for k in range(self.shape[axis])
         ]
         numbers = [_number(value) for value in values]
@@ -185,7 +186,7 @@ def _dimensions(campaign: Campaign) -> Iterator[Dimension]:
 def _sampled(campaign: Campaign) -> Dimension:
     """The points of a space-filling sample, scrambled by the campaign's seed."""
     sample = campaign.sample
-    assert sample is not None  # as `_dimensions` has asked
+    assert sample is not None  # checked by `_dimensions`
     kinds = {"sobol": qmc.Sobol, "latin_hypercube": qmc.LatinHypercube}
     # the same points at every start of the campaign
     random = np.random.default_rng(campaign.seed or 0)
@@ -263,14 +264,6 @@ def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
             value = {part: value}
         sections = reading.merged(sections, value) if sections else dict(value)
     return sections
-
-
-def _at(settings: Mapping[str, Any], key: str) -> Any:
-    """The value at a dotted key; None: there is none."""
-    value: Any = settings
-    for part in key.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value
 
 
 def _number(value: object) -> float | None:

@@ -1,7 +1,7 @@
 """Worker processes of this machine: whether they can start, and why not.
 
-A worker is a new interpreter that imports the main module of the program (``spawn``). What stops
-it shows in that process alone, and dask notices after a minute. So one process that does nothing
+A worker is a new interpreter that imports the main module of the program (``spawn``). Its faults
+appear only in that process, and dask notices them after a minute. So one process that does nothing
 is started first, with its output hidden from the terminal.
 """
 
@@ -17,14 +17,14 @@ from multiprocessing import process, spawn
 from lidar_mi.errors import InputError, causes, one_line
 
 PATIENCE = 300.0
-"""Seconds for a process to start, on a machine that is busy."""
+"""Longest time for a process to start on a busy machine, s."""
 
 _FILES, _FILES_EACH = 16, 11
 """Files that dask opens in this process, and for each worker: 25, 35 and 56 for 1, 2 and 4."""
 
 _GUARD = "the script needs if __name__ == '__main__': before what it starts"
 _TOO_FEW = "too few open files are allowed (ulimit -n); expected 64 and 16 for every worker"
-# multiprocessing's own words where a main module starts processes as it is imported
+# multiprocessing's message for a main module that starts processes on import
 _IMPORTING = "bootstrapping phase"
 
 
@@ -50,7 +50,7 @@ def check_spawning(count: int) -> None:
         try:
             with _output_to(output.fileno()):
                 process = multiprocessing.get_context("spawn").Process(target=os.getpid)
-                # the child inherits the output: this process has its own back at once
+                # the child inherits the output: it is restored here at once
                 process.start()
             process.join(PATIENCE)
         except (OSError, RuntimeError, ValueError) as error:
@@ -74,7 +74,7 @@ def check_spawning(count: int) -> None:
 
 @contextmanager
 def workers_started() -> Iterator[None]:
-    """Turn whatever stops workers from starting into one line."""
+    """Report any failure to start workers in one line."""
     try:
         yield
     except InputError:
@@ -85,7 +85,7 @@ def workers_started() -> Iterator[None]:
 
 @contextmanager
 def quiet_loggers() -> Iterator[None]:
-    """Without the tracebacks that dask and what it builds on log of what they then raise."""
+    """Suppress tracebacks that dask and its libraries log before they raise."""
     loggers = [logging.getLogger(name) for name in ("asyncio", "tornado", "distributed")]
     levels = [logger.level for logger in loggers]
     try:
@@ -115,7 +115,7 @@ def _not_started(error: BaseException) -> InputError:
     numbers = [getattr(cause, "errno", None) for cause in causes(error)]
     if errno.EMFILE in numbers or errno.ENFILE in numbers or not _may_open(_FILES_EACH):
         return _refused(_TOO_FEW)
-    # dask puts exceptions of its own over the cause
+    # dask wraps the cause in its own exceptions
     first = list(causes(error))[-1]
     return _refused(one_line(first, 150) or type(first).__name__)
 

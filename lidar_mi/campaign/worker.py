@@ -119,7 +119,7 @@ def carry_out(
     start = time.perf_counter()
     store: PointStore | None = None
     try:
-        # before anything that could kill the worker
+        # first, as anything later may kill the worker
         _count_attempt(place, session)
         experiment = campaign.points.experiment(number)
         store = PointStore(campaign, number, experiment)
@@ -133,7 +133,7 @@ def carry_out(
             _compute(campaign, run, store)
             seconds, metrics = run.seconds, run.metrics
         seconds = {"total": time.perf_counter() - start, **seconds}
-        # rendered for this point by a task of its own, so that the store found them there
+        # rendered for this point by another task, so that the store has them
         shared = sum(ready[k] for k in first)
         rounded = {step: round(value, 4) for step, value in seconds.items()}
         outcome = Outcome("done", "", rounded, store.rendered + shared, store.reused - shared)
@@ -147,7 +147,7 @@ def carry_out(
         message = one_line(error) or type(error).__name__
         outcome = Outcome("failed", message, {"total": time.perf_counter() - start}, *counts)
         write_outcome(place, outcome)
-    # it has ended by itself: attempts count killed workers only
+    # only killed workers count as attempts
     (place / ATTEMPTS).unlink(missing_ok=True)
     return outcome
 
@@ -239,7 +239,7 @@ def _compute(campaign: CampaignFolder, run: Run, store: PointStore) -> None:
         return
     record = resumable_folder.new_record(run.experiment, campaign.points.search_path)
     write_text(store.place / records.RECORD, to_yaml(record))
-    # without a report figures have no use
+    # figures are only for the report
     finish(run, store, with_figures=False)
 
 
@@ -274,14 +274,8 @@ def _signatures(experiment: Experiment, search_path: Path) -> dict[str, str]:
 
 
 def _count_attempt(place: Path, session: str) -> None:
-    """Count an attempt.
-
-    Raises
-    ------
-    InputError
-        `MOST_ATTEMPTS` earlier ones of this session killed their worker.
-    """
-    # a file: a worker that is killed can count nothing after it
+    """Count an attempt; InputError if `MOST_ATTEMPTS` of this session killed their worker."""
+    # counted in a file, as a killed worker cannot count
     path = place / ATTEMPTS
     lines = read_text(path, "attempts").splitlines() if path.is_file() else []
     ended = lines.count(session)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 NOTHING_FOUND = 1
 BAD_INPUT = 2
 BY_SIGNAL = 128
-"""Plus the number of the signal."""
+"""Exit code of a signal, less its number."""
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -71,10 +71,9 @@ def end_without_result(reason: str, flag: "xr.DataArray") -> NoReturn:
 
 def flags_in_words(flag: "xr.DataArray") -> str:
     """How many vectors have each flag, from the CF attributes; empty: all are valid."""
-    masks, names = flag.attrs["flag_masks"], flag.attrs["flag_meanings"].split()
-    counts = (
-        (name, int((flag & int(mask) != 0).sum())) for name, mask in zip(names, masks, strict=True)
-    )
+    from lidar_mi.flags import masks_of
+
+    counts = ((name, int((flag & mask != 0).sum())) for name, mask in masks_of(flag.attrs).items())
     return ", ".join(f"{name} {count}" for name, count in counts if count)
 
 
@@ -85,14 +84,14 @@ def _message(error: BaseException) -> str | None:
     if isinstance(error, OSError):
         names = [str(name) for name in (error.filename, error.filename2) if name is not None]
         return ": ".join([*names, error.strerror or str(error)])
-    # torch has no type of its own for it
+    # torch has no exception type for it
     no_memory = isinstance(error, RuntimeError) and "allocate memory" in str(error)
     if isinstance(error, MemoryError) or no_memory:
         return (
             f"not enough memory ({one_line(error, 100) or 'in all'}); expected fewer beams, gates "
             "or samples, or a larger machine"
         )
-    # numpy, scipy and torch each have their own
+    # numpy, scipy and torch each have their own type
     if type(error).__name__.lstrip("_") == "LinAlgError":
         reason = one_line(error, 100)
         return f"equations without a solution ({reason}); expected data that determine it"
@@ -118,15 +117,15 @@ def _fail_usage(error: Any) -> NoReturn:
 
 @contextmanager
 def _raised_signals() -> Iterator[None]:
-    """Let terminating signals raise `Stopped`, except those that are ignored (nohup)."""
+    """Terminating signals raise `Stopped`, except ignored ones (nohup)."""
     before = {number: signal.getsignal(number) for number in STOPPING}
-    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    signals = [number for number, handler in before.items() if handler != signal.SIG_IGN]
     try:
-        for number in caught:
+        for number in signals:
             signal.signal(number, _raise_stopped)
         yield
     finally:
-        for number in caught:
+        for number in signals:
             signal.signal(number, before[number])
 
 

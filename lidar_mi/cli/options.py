@@ -10,7 +10,7 @@ from lidar_mi.errors import InputError
 
 
 def starting(incomplete: str, names: Iterable[str], *patterns: str) -> list[str]:
-    """What a shell may complete: names, then files of some patterns and folders here."""
+    """Completions for a shell: names, then files of some patterns and folders here."""
     folder = incomplete.rpartition("/")[0]
     shown_folder = Path(folder or ("/" if incomplete.startswith("/") else "."))
     paths = sorted(

@@ -47,8 +47,8 @@ def render(
     """Render a Mitsuba scene of a `scanning_lidar` or a `ccd`, the plugins loaded.
 
     Pictures by other cameras: lidar_mi.register_plugins() and mi.render in Python. Writes an EXR,
-    and beside it a PNG of its brightness to look at, linear from black to white; which values these
-    are is said.
+    and beside it a PNG preview of its brightness, linear from black to white; the values of both
+    are printed.
     """
     from lidar_mi.instrument.products import untrusted_pixels
     from lidar_mi.io.images import read_pixels

@@ -171,7 +171,7 @@ def retrieve(
             device=device,
         )
     wind = wind.assign_attrs(software=f"lidar-mi {__version__}")
-    lost = write_wind(out, wind, wind.attrs["pixel_size"])
+    omitted = write_wind(out, wind, wind.attrs["pixel_size"])
     _print_file_remarks(wind, by_default=layer is None, from_headers=dt is None and not pixels)
     if pairs is not None:
         _print_series(wind)
@@ -182,8 +182,8 @@ def retrieve(
     if drawn is not None:
         _draw(wind, drawn, colours.value, lines.value)
         output.print(f"picture  {drawn}")
-    if lost:
-        output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
+    if omitted:
+        output.print(f"lost     {omitted}; .nc has them", soft_wrap=True)
     if not (wind["flag"] == 0).any():
         end_without_result(f"no valid vector of {wind['flag'].size}", wind["flag"])
 
@@ -210,7 +210,7 @@ def _numbers(text: str) -> list[int]:
 
 
 def _pairs(text: str) -> list[tuple[int, int]] | Literal["all"]:
-    """The pairs of images that --pairs names; whether they exist is for the retrieval to say."""
+    """The pairs of images that --pairs names; the retrieval checks that they exist."""
     if text.strip() == "all":
         return "all"
     pairs = []
@@ -226,7 +226,7 @@ def _pairs(text: str) -> list[tuple[int, int]] | Literal["all"]:
 
 
 def _print_file_remarks(wind: "xr.Dataset", *, by_default: bool, from_headers: bool) -> None:
-    """What the files said, and what contradicts it."""
+    """Layer, time step and remarks from the files."""
     layer = wind.attrs["layer"]
     if layer and by_default:
         noisy = ", with the detector's noise (--layer Y: without it)" if layer == "Y_noisy" else ""
@@ -283,12 +283,12 @@ def _print_statistics(wind: "xr.Dataset") -> None:
 
 
 def _speed(wind: "xr.Dataset") -> str:
-    """The unit of v as one writes it: m/s, px/s or px/frame."""
+    """The unit of v: m/s, px/s or px/frame."""
     return re.sub(r" (\w+)-1", r"/\1", str(wind["v"].attrs["units"]))
 
 
 def _print_series(winds: "xr.Dataset") -> None:
-    """The statistics of each pair, a row each, and what was remarked on it."""
+    """Statistics and remarks of each pair, a row each."""
     rows = []
     for number in range(winds.sizes["time"]):
         wind = winds.isel(time=number)

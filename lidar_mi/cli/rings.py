@@ -132,7 +132,7 @@ def _chosen_frame(
     average: bool,
     saturation: float | None,
 ) -> "np.ndarray":
-    """The frame that is asked for, or the mean of all."""
+    """The frame with the number, or the mean of all."""
     import torch
 
     from lidar_mi.io.images import frames_in, read_frames
@@ -162,7 +162,7 @@ def _chosen_frame(
 
 
 def _remark(frames: Sequence["np.ndarray"]) -> None:
-    """Frames that are there twice."""
+    """Warn of identical frames."""
     from lidar_mi.retrieval.checks import identical
 
     if same := identical(frames, "frames", start=0):

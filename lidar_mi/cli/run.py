@@ -21,7 +21,7 @@ EXAMPLES = (
 
 
 _LABELS = {"vortices": "vortices", "line_vortices": "vortices", "coherent_lines": "lines   "}
-"""Of results that are no winds."""
+"""Labels of results other than winds."""
 
 
 def run(

@@ -12,13 +12,13 @@ errors = Terminal(stderr=True)
 
 
 def print_answer(sentences: Sequence[str]) -> None:
-    """What a run found, a sentence a line."""
+    """The answer of a run, a sentence a line."""
     for sentence in sentences:
         output.print(sentence, soft_wrap=True)
 
 
 def print_remarks(text: str) -> None:
-    """What was found in files, a remark a line."""
+    """Remarks on files, one a line."""
     for remark in text.splitlines():
         output.print(f"remark: {remark}", soft_wrap=True)
 

@@ -12,6 +12,7 @@ from lidar_mi.atmosphere.scattering.molecules import BANDS, molecular_scattering
 from lidar_mi.atmosphere.scattering.particle_scattering import Notice
 from lidar_mi.atmosphere.scattering.tables import ScatteringTable, describe
 from lidar_mi.errors import InputError
+from lidar_mi.flags import masks_of
 from lidar_mi.io.scattering_table import aerosol_table, read_table
 from lidar_mi.io.size import fits
 
@@ -194,8 +195,7 @@ def _lines_of_sight(path: Path) -> Iterator[Section]:
         span = _span(float(values.min()), float(values.max()))
         rows.append(("radial velocity (valid)", f"{span} m/s, positive away"))
     rows.append(("valid", f"{100 * values.size / flag.size:.1f} %"))
-    words = data["flag"].attrs
-    for name, mask in zip(words["flag_meanings"].split(), words["flag_masks"], strict=True):
+    for name, mask in masks_of(data["flag"].attrs).items():
         if part := float(((flag & mask) > 0).mean()):
             rows.append((name.replace("_", " "), f"{100 * part:.1f} %"))
     rows += [("remark", text) for text in about["remarks"].splitlines()]

@@ -20,7 +20,7 @@ def on_its_device(experiment: Experiment) -> Experiment:
     """The experiment with the variants and the retrieval's device that its `device` asks for.
 
     Variants keep what follows llvm or cuda. Where rendering alone can be on the GPU, `auto` puts
-    retrieval on the processor. An experiment that is on its device stays as it is.
+    retrieval on the processor. It is idempotent.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def devices_in_words(experiment: Experiment) -> str:
 
 def _devices(device: str) -> tuple[str, str]:
     """Devices of rendering and of retrieval: CUDA's where they are there."""
-    # loaded where a device is asked for alone
+    # loaded only if a device is set
     import torch
 
     rendering, retrieval = has_cuda(), torch.cuda.is_available()

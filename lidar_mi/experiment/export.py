@@ -115,7 +115,7 @@ def export(
 def _files(
     out: Path, format: str, results: dict[str, xr.Dataset]
 ) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """Files to be, and what writes each."""
+    """Files to write, with their writers."""
     from lidar_mi.io.csv_file import write_csv
     from lidar_mi.io.mat_file import write_mat
     from lidar_mi.io.openfast import write_openfast
@@ -204,8 +204,8 @@ def _placed_scan(scan: xr.Dataset) -> xr.Dataset:
 def _placed_lines(lines: xr.Dataset) -> xr.Dataset:
     """Lines of sight with the middle of their range bins as place, a column a component."""
     direction = lines["direction"]
-    places = lines["range"] * direction  # from the telescope at rest in the first image
-    # other programs read numbers, not vectors: a variable for each component
+    places = lines["range"] * direction  # from the telescope at the first image
+    # other programs read scalars: a variable for each component
     split = lines.drop_vars([n for n in lines.variables if "axis" in lines[n].dims])
     for axis in ("x", "y", "z"):
         about = {"units": "m", "long_name": f"{axis} of the middle of the range bin"}
@@ -245,7 +245,7 @@ def _gates(lines: xr.Dataset) -> xr.Dataset:
         about = {"units": "m", "long_name": words}
         coordinates[name] = place.transpose("time", "range").assign_attrs(about)
     placed = lines.assign_coords(coordinates)
-    # what belongs to a vortex in place of a gate has no place in this list
+    # variables of vortices, not of gates, are omitted
     other = [name for name, field in placed.variables.items() if {*field.dims} - {"time", "range"}]
     return placed.drop_vars(other).stack(gate=("time", "range")).reset_index("gate")
 

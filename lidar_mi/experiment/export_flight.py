@@ -9,7 +9,7 @@ import xarray as xr
 from lidar_mi.io.netcdf import read_netcdf
 
 FLIGHT_FILES = {"series": "flight.nc", "track": "track.nc", "slabs": "slabs.nc"}
-"""Of the time series of flights, of the lidar's track, of images and wind vectors of its slabs."""
+"""Files of the time series, of the lidar's track, of images and wind vectors of its slabs."""
 
 _SIDES = ("port", "starboard")
 _FOR_A_REPLAY = ["parameter", "parameter_2", "vector_row", "vector_column", "arrival"]
@@ -36,7 +36,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
         # parameters with their covariances, and vectors, are for a replay
         track = read_netcdf(files["track"]).drop_dims(_FOR_A_REPLAY, errors="ignore")
         if placed:
-            yield from ((f"vortices_{name}", _points(track, name)) for name in _sources(track))
+            sources = map(str, track["source"].values)
+            yield from ((f"vortices_{name}", _points(track, name)) for name in sources)
         else:
             yield "track", track
     if files["slabs"].is_file():
@@ -52,10 +53,6 @@ def _of_slabs(slabs: xr.Dataset, *axes: str) -> xr.Dataset:
     names = [name for name, value in slabs.data_vars.items() if {"x", *axes} == set(value.dims)]
     chosen = slabs[names]
     return chosen.drop_vars([name for name in chosen.coords if name not in ("x", *axes)])
-
-
-def _sources(track: xr.Dataset) -> list[str]:
-    return [str(name) for name in track["source"].values]
 
 
 def _points(track: xr.Dataset, source: str) -> xr.Dataset:

@@ -83,7 +83,7 @@ class Log:
 
 
 def _no_link(path: str, flags: int) -> int:
-    """A link is removed, as lines would be appended to its target."""
+    """Open a file; not through a link, as lines would be appended to its target."""
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 

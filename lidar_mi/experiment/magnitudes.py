@@ -8,7 +8,7 @@ from lidar_mi.units import usual
 
 
 class Usual(NamedTuple):
-    """Values that a key has had, in its SI unit, and what had them."""
+    """Range of the usual values of a key, in its SI unit, and their examples."""
 
     key: str
     unit: str
@@ -33,9 +33,9 @@ _OF_A_LIDAR = (
 )
 USUAL = (
     *(
-        one._replace(key=f"{section}.{one.key}")
+        values._replace(key=f"{section}.{values.key}")
         for section in ("lidar", "doppler.lidar")
-        for one in _OF_A_LIDAR
+        for values in _OF_A_LIDAR
     ),
     Usual("lidar.aperture_radius", "m", 5e-3, 2.0, _TELESCOPES),
     Usual("doppler.lidar.telescope_area", "m^2", 1e-4, 13.0, _TELESCOPES),
@@ -50,9 +50,9 @@ USUAL = (
     Usual("wake.vortex_pair.core_radius", "m", 0.05, 15.0, "1 to 5 % of the wing span, later 15 %"),
     Usual("wake.turbine.wind_speed", "m/s", 2.0, 35.0, "from cut-in to beyond cut-out"),
 )
-"""Nothing outside is known of instruments, aircraft and wakes; 0 and infinity are idealisations."""
+"""Ranges of all known instruments, aircraft and wakes; 0 and infinity are idealisations."""
 
-# by which a unit is missed: a prefix, a degree in place of a milliradian
+# factors of likely wrong units: a prefix, a degree in place of a milliradian
 _SLIPS = (1e-3, 1e3, 1e-6, 1e6, 1e-9)
 
 

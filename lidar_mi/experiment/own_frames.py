@@ -50,7 +50,7 @@ def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") ->
 
 
 def electrons(counts: np.ndarray, ccd: CCD) -> np.ndarray:
-    """Photoelectrons of a digitiser's counts: bias off, times the gain of digitiser and CCD."""
+    """Photoelectrons from counts: less the bias, times the gains of digitiser and CCD."""
     return (np.asarray(counts, float) - ccd.bias) * ccd.gain / ccd.multiplication_gain
 
 
@@ -184,7 +184,7 @@ is determined
         calibrations,
         etalon.index * gap,
         gap_tolerance,
-        # the phase of reflection depends on the wavelength, as a gap does not
+        # the phase of reflection depends on the wavelength, unlike a gap
         mirror_orders=[
             mirrors(fixed, lamp_wavelength).order_shift for lamp_wavelength in (wavelength, *lines)
         ],
@@ -246,8 +246,8 @@ def retrieve_v_los(
 
     >>> import lidar_mi as lm
     >>> import numpy as np
-    >>> found = lm.retrieve_v_los(np.full((1, 780, 960), 30.0))
-    >>> float(found.v_los[0]), str(found.status[0].values)
+    >>> speeds = lm.retrieve_v_los(np.full((1, 780, 960), 30.0))
+    >>> float(speeds.v_los[0]), str(speeds.status[0].values)
     (nan, 'image: its gradients have no common centre; expected rings')
     """
     doppler = doppler_of(instrument)

@@ -1,4 +1,4 @@
-"""The wind in images that a user has as files: which frames are meant, when, in what light."""
+"""Wind from image files of a user: selection of the frames, their times, their noise."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -22,8 +22,8 @@ from lidar_mi.retrieval.wind.synchronised import synchronised
 
 Level = float | xr.DataArray | None
 
-_SAME = 1e-3
-"""Relative difference between a time step given and one from headers that is rounding."""
+_TOLERANCE = 1e-3
+"""Relative difference of a given time step from that of the headers by rounding."""
 
 
 @checked_arguments
@@ -102,8 +102,8 @@ def retrieve_files(
     layer = layer or _layer(inputs)
     frames_by_file = _frames(inputs, layer, frame, pairs)
     paths = [path for path, numbers in frames_by_file for _ in numbers]
-    more = len(paths) > 2 and pairs is None
-    if more and "more" not in method_of(method).options:
+    burst = len(paths) > 2 and pairs is None
+    if burst and "more" not in method_of(method).options:
         raise InputError(
             f"{len(paths)} images are not allowed with method {method}; expected two, pairs all "
             "(a wind from each pair), or variational (one wind from all)"
@@ -123,7 +123,7 @@ def retrieve_files(
     levels = [read_noise(path, layer, spacing) if noise is None else noise for path in noisy]
     beams = [read_beams(path, spacing) for path in paths]
     images, levels, beams = _on_nodes(images, levels, beams, steps)
-    beam_times = [when["beam_time"] for when in beams if when is not None and not when.frozen_air]
+    beam_times = [scan["beam_time"] for scan in beams if scan is not None and not scan.frozen_air]
     timed = len(beam_times) == len(paths)
     grid = images[0]
     if pairs is not None:
@@ -168,9 +168,9 @@ def _on_nodes(
     """Images, noise and beams, those of beams that miss the nodes resampled onto them."""
     images, levels, beams = list(images), list(levels), list(beams)
     scans: dict[int, xr.Dataset] = {}
-    for number, when in enumerate(beams):
-        if when is not None and "y_reported" in when:
-            scans[number] = when.assign(image=images[number])
+    for number, scan_beams in enumerate(beams):
+        if scan_beams is not None and "y_reported" in scan_beams:
+            scans[number] = scan_beams.assign(image=images[number])
             level = levels[number] if number < len(levels) else None
             if isinstance(level, xr.DataArray):
                 scans[number] = scans[number].assign(image_stderr=level)
@@ -189,7 +189,7 @@ def _on_nodes(
 
 
 def _in_pixels(wind: xr.Dataset, *, per_frame: bool) -> xr.Dataset:
-    """The same numbers, of pixels of 1 m, with their units; ``per_frame``: and of frames of 1 s."""
+    """A wind of 1 m pixels in units of pixels; ``per_frame``: of 1 s frames in units of frames."""
     wind = wind.copy()
     for variable in wind.variables.values():
         if "units" in variable.attrs:
@@ -203,7 +203,7 @@ def _in_pixels(wind: xr.Dataset, *, per_frame: bool) -> xr.Dataset:
 def _frames(
     files: Sequence[Path], layer: str | None, numbers: Sequence[int] | None, pairs: object
 ) -> list[tuple[Path, Sequence[int]]]:
-    """Which frames of which files are meant; what is ambiguous is refused with the choices."""
+    """The selected frames of each file; an ambiguous selection is refused with the choices."""
     if len(files) == 1:
         return [(files[0], _of_one_file(files[0], layer, numbers, pairs))]
     if numbers is None:
@@ -266,7 +266,7 @@ def _layer(paths: Sequence[Path]) -> str | None:
 def _time_steps(
     paths: Sequence[Path], dt: float | None, *, equal: bool
 ) -> tuple[list[float], list[str]]:
-    """From each image to the next as given, else from the files; remarks on contradictions."""
+    """Time steps from image to image, as given or from the files; remarks on contradictions."""
     from_headers = steps_of(paths)
     count = len(paths) - 1
     if from_headers is None:
@@ -275,7 +275,7 @@ def _time_steps(
         return [dt] * count, []
     text = ", ".join(f"{step:g}" for step in dict.fromkeys(from_headers))
     unequal = any(
-        abs(step - from_headers[0]) > _SAME * abs(from_headers[0]) for step in from_headers
+        abs(step - from_headers[0]) > _TOLERANCE * abs(from_headers[0]) for step in from_headers
     )
     if dt is not None:
         remarks = []
@@ -284,7 +284,7 @@ def _time_steps(
                 f"by their headers ({text} s) an image is not later than the one before: v and w "
                 "have the opposite sign if the images are swapped"
             )
-        elif unequal or abs(dt - from_headers[0]) > _SAME * from_headers[0]:
+        elif unequal or abs(dt - from_headers[0]) > _TOLERANCE * from_headers[0]:
             remarks.append(f"dt is {dt:g} s as given, but {text} s by the headers of the files")
         return [dt] * count, remarks
     if min(from_headers) <= 0:

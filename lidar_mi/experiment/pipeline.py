@@ -141,7 +141,7 @@ def has_samples_by_noise(experiment: Experiment) -> bool:
 
 
 def has_given_samples(experiment: Experiment) -> bool:
-    """Whether it is not."""
+    """Whether the number of Monte Carlo samples is given."""
     return not has_samples_by_noise(experiment)
 
 
@@ -209,7 +209,7 @@ STAGES = (
 
 
 class Results(TypedDict, total=False):
-    """Results of the stages by name; of a stage that an experiment has not, there is none."""
+    """Results of the stages by name; absent for stages that an experiment lacks."""
 
     footprint: Footprint
     flows: Flows
@@ -259,7 +259,7 @@ class Results(TypedDict, total=False):
 
 
 def stages_of(experiment: Experiment) -> Graph:
-    """The stages of an experiment, each behind those it needs."""
+    """The stages of an experiment, each after those that it needs."""
     return Graph(STAGES, experiment)
 
 

@@ -1,8 +1,8 @@
 """Receivers for the same light: from a lidar and its receiver to the model of the signals.
 
 All receivers get the same photons (`lidar_mi.instrument.doppler.photons`, counted in front of
-them), line, sunlight and detector; each loses what its own optics lose. The rings of an etalon take
-part as annuli of equal steps of the order, so that aerosol is a parameter of theirs, too.
+them), line, sunlight and detector; each has the losses of its own optics. The rings of an etalon
+are annuli of equal steps of the order, so that aerosol is a parameter of them, too.
 """
 
 import math
@@ -37,10 +37,10 @@ from lidar_mi.retrieval.channels.model import ChannelModel, mean_and_jacobian, p
 from lidar_mi.retrieval.rings.model import PixelNoise
 
 # Annuli of a ring image, for each order: the tenth harmonic loses 1 % of its contrast.
-_STEPS = 128
+_ANNULI_PER_ORDER = 128
 # Speeds at which the response of two filters is examined.
 _SPEEDS = 4001
-# Pulse energies between which a required one is looked for, relative to the lidar's.
+# Range of a required pulse energy, relative to the lidar's.
 _ENERGIES = (1e-6, 1e6)
 
 
@@ -142,8 +142,8 @@ def ring_receiver(
     light = camera.illumination(r2)
     cosine = fabry_perot.cosine_inside(etalon, camera.cosine(r2))
     order = fabry_perot.fractional_order(etalon, lidar.wavelength, cosine)
-    # the order, not the radius: in it all rings have the same width
-    annulus = np.floor(order * _STEPS).astype(int)
+    # by the order, not the radius, as all rings have the same width in it
+    annulus = np.floor(order * _ANNULI_PER_ORDER).astype(int)
     # orders fall towards the rim, and bincount takes no negative numbers
     annulus -= annulus.min()
     pixels = np.bincount(annulus)
@@ -238,25 +238,15 @@ def _receiver(
     pixels: float | np.ndarray = 1.0,
     ratio: bool = False,
 ) -> Receiver:
-    """A receiver of channels with these harmonics of the frequency.
+    """A receiver from complex harmonics (channels, harmonics) of the transmission of its channels.
 
-    Parameters
-    ----------
-    harmonics : array, shape (channels, harmonics)
-        Of the transmission, complex.
-    delay : float
-        Inverse of its period, s.
-    modes : float
-        Of the speckle in a channel.
-    pixels : float or array, shape (channels,)
-        Of the detector in a channel.
-    ratio : bool
-        Whether speeds are read from the ratio of two signals.
+    Their period is 1 / ``delay`` (s); a channel has so many ``modes`` of speckle and ``pixels``;
+    with ``ratio``, speeds are read from the ratio of two signals.
     """
     times = np.arange(harmonics.shape[1]) * delay
     _, usual = air_of(lidar)
     temperatures = [usual * node for node in TEMPERATURE_NODES]
-    # of molecules alone: aerosol is a signal of its own
+    # of molecules alone: aerosol is a separate signal
     lines = [_line(lidar, kelvin, 0.0).characteristic(times) for kelvin in temperatures]
     laser = laser_line(lidar.wavelength, lidar.laser_width).characteristic(times)
     # in front of the receiver, so without an etalon

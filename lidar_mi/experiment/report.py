@@ -69,7 +69,7 @@ def _backscatter(
     )
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
     wind = winds.sel(source=source)
-    # the first method with a valid vector: the others have nothing to look at
+    # the first method with a valid vector
     valid = (wind["flag"] == 0).any(("z", "y")).transpose("algorithm").values
     vectors = map_data(wind.isel(algorithm=int(valid.argmax())), ("v", "w"), cores)
     alone = () if experiment.sensor else judged(experiment, results, metrics)
@@ -103,7 +103,7 @@ def _doppler(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> Chapter:
     doppler = experiment.fringes
-    assert doppler is not None  # whose results these are
+    assert doppler is not None  # the results of this section
     drawn = doppler_figures.draw_all(
         folder,
         doppler,

@@ -116,10 +116,10 @@ def prepare(
         raise InputError(
             f"encounter: {experiment.name} is a flight, not a run; expected lidar-mi fly (lm.fly)"
         )
-    beside = experiment.folder if beside is None else beside
-    experiment = in_air_of_its_site(on_its_device(experiment), Path(beside))
+    search_path = Path(experiment.folder if beside is None else beside)
+    experiment = in_air_of_its_site(on_its_device(experiment), search_path)
     graph, log = stages_of(experiment), Log(notice)
-    prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
+    prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=search_path)
     for text in unusual(experiment):
         log.remark(text)
     # results first: a check may take those of any stage of the preflight
@@ -153,7 +153,7 @@ def complete(
     store = RunFolder(folder, prepared.experiment, prepared.search_path, shared)
     with store.claimed(overwrite):
         log = prepared.log
-        # behind the claim, which removes the log of another experiment
+        # after the claim, which removes the log of another experiment
         log.path = store.log
         log(
             f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
@@ -166,7 +166,7 @@ def complete(
             log("done")
             return prepared
         except BaseException as error:
-            # interrupts, too, which are no Exception
+            # also interrupts, which are no Exception
             if is_interrupt(error):
                 error.add_note(RESUMED)
             elif isinstance(error, Exception):
@@ -199,7 +199,7 @@ def finish(prepared: Run, store: Store | None = None, *, with_figures: bool = Tr
         if stage.name not in prepared.results and not left_out:
             _carry_out(graph, stage, prepared, store)
     if prepared.scans:
-        # of images from an earlier run the time that they took then
+        # for images of an earlier run, the time that they took
         seconds = sum(scan.attrs["render_seconds"] for scan in prepared.scans)
         prepared.seconds["render"] = seconds
     prepared.metrics = measure(prepared.experiment, prepared.results, prepared.seconds)

@@ -85,7 +85,7 @@ def run(
 
 def _of(variant: str, notice: Notice) -> Notice:
     def named(text: str, fraction: float | None) -> None:
-        # what is a warning stays one
+        # warnings remain warnings
         kind, text = ("warning: ", text[9:]) if text.startswith("warning: ") else ("", text)
         notice(f"{kind}{variant}: {text}", fraction)
 

@@ -129,12 +129,12 @@ class CCD(Description):
 
     @property
     def pixel_response_rms(self) -> float:
-        """Of the pixels of the image: means over those of the chip."""
+        """Rms response of the image's pixels, which are means over those of the chip."""
         return self.response_rms / self.binning
 
     @property
     def output_noise(self) -> float:
-        """Rms of what does not depend on the light, electrons behind the gain.
+        """Rms noise that does not depend on the light, electrons behind the gain.
 
         Read noise and 1 / sqrt(12) of a step of the digitiser.
         """
@@ -281,7 +281,7 @@ def _output(
 
 
 def _response(ccd: CCD, expected: "torch.Tensor") -> "torch.Tensor":
-    """Responses of the pixels: those of the chip, whatever is drawn on it."""
+    """Responses of the pixels, fixed for a chip."""
     import torch
 
     generator = torch.Generator().manual_seed(ccd.response_seed)
@@ -290,7 +290,7 @@ def _response(ccd: CCD, expected: "torch.Tensor") -> "torch.Tensor":
 
 
 def _bad_pixels(ccd: CCD, expected: "torch.Tensor") -> "tuple[torch.Tensor, torch.Tensor]":
-    """Whether pixels are hot, whether they are dead: those of the chip, no pixel both."""
+    """Masks of the chip's hot and dead pixels; no pixel is both."""
     import torch
 
     height, width = expected.shape[-2:]

@@ -262,7 +262,7 @@ def noise_budget(
     )
     terms = noise_terms(signal, background, dark, modes, detector, pulses)
     # relative noise has no value in the dark
-    lit = signal > 0
+    bright = signal > 0
     budget = {
         "photons": signal / efficiency(detector),
         "signal": signal,
@@ -273,8 +273,8 @@ def noise_budget(
         budget["speckle_modes"] = np.asarray(modes)
     terms["all"] = noise_variance(signal, background, dark, modes, detector, pulses)
     for name, variance in terms.items():
-        spread = np.sqrt(np.broadcast_to(variance, s0.shape)[lit])
-        budget[f"noise.{name}"] = spread / signal[lit]
+        spread = np.sqrt(np.broadcast_to(variance, s0.shape)[bright])
+        budget[f"noise.{name}"] = spread / signal[bright]
     return {name: float(np.median(value)) for name, value in budget.items()}
 
 

@@ -222,8 +222,8 @@ def _behind_etalon(etalon: Etalon, line: Line, order: float) -> Callable[[np.nda
 def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line: Line) -> float:
     """Degrees of freedom M of the speckle in one pixel of a ring image.
 
-    `channel_modes` of as many channels as pixels, with the light at the peak of a fringe, which has
-    the fewest modes.
+    That is `channel_modes` with one channel a pixel, at the peak of a fringe, where modes are
+    fewest.
     """
     return channel_modes(
         lidar, line, _behind_etalon(etalon, line, 0.0), camera.width * camera.height

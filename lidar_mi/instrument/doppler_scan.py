@@ -294,7 +294,7 @@ def scan_wind(
     toward = velocity + np.array([errors.speed, 0.0, 0.0]) - mean
     true = np.einsum("lc,lc->l", actual, toward)
     noise = np.random.default_rng(int(noise_seed)).standard_normal(len(true))
-    found = xr.Dataset(
+    measurement = xr.Dataset(
         {
             "v_los": _variable("line", true + std * noise, "m s-1", _LOS),
             "v_los_std": _variable("line", std, "m s-1", "standard error of v_los"),
@@ -315,8 +315,8 @@ def scan_wind(
         attrs={"Conventions": "CF-1.11", "title": "Line-of-sight velocities", "seed": seed},
     )
     if beams is None:
-        return found
-    return found.assign(
+        return measurement
+    return measurement.assign(
         time=_variable("line", beams.time, "s", "time from the reference time of the scan"),
         origin=_variable(
             ("line", "axis"), beams.reported_origin, "m", "place of the telescope, as reported"

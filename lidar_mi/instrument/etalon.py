@@ -275,8 +275,8 @@ def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> floa
     amplitudes = harmonics(etalon, wavelength, line)
 
     def above_half(order: float) -> float:
-        both = series(amplitudes, [order, 0.0])
-        return float(both[0] - both[1] / 2)
+        transmitted = series(amplitudes, [order, 0.0])
+        return float(transmitted[0] - transmitted[1] / 2)
 
     if above_half(0.5) >= 0:
         raise InputError("etalon: no finesse; its fringes nowhere fall to half their height")
@@ -292,8 +292,8 @@ def coated_transmission(
 ) -> np.ndarray:
     """Transmittance of perfectly even coated plates, by transfer matrices.
 
-    With all dispersion of the coatings and their dependence on angle and polarisation, which the
-    series leaves out.
+    It has the dispersion of the coatings and their dependence on angle and polarisation, which the
+    series neglects.
 
     Parameters
     ----------
@@ -328,7 +328,7 @@ def _less_whole_orders(
 def _mirror_amplitudes(
     etalon: Etalon, wavelength: float, cosine: ArrayLike, offset: ArrayLike, polarization: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of one mirror: reflection in the gap, transmission.
+    """Amplitudes of one mirror: reflection in the gap, transmission.
 
     Characteristic matrices of the layers (Macleod 2010, Thin-Film Optical Filters, chap. 2) for
     fields as exp(-i omega t), normalised so that |t|^2 is the transmitted fraction of the power.

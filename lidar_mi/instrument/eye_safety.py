@@ -160,7 +160,7 @@ def permissible_pulse(
 
 
 def time_base(wavelength: float) -> float:
-    """How long an exposure is reckoned with, s (IEC 60825-1:2014, 4.3 e).
+    """Duration of the exposure that is assessed, s (IEC 60825-1:2014, 4.3 e).
 
     0.25 s where the aversion response acts (400 to 700 nm), 3e4 s in the ultraviolet, else 100 s.
     Somebody before a moving aircraft is exposed for a shorter time: that time may be taken instead.

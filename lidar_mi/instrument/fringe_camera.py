@@ -257,7 +257,7 @@ def ring_radii(
 def _passed(
     camera: FringeCamera, etalon: Etalon, line: Line, speeds: np.ndarray, subsamples: int
 ) -> tuple[np.ndarray, float]:
-    """Light behind the etalon (N, height, width), and the sum of what came."""
+    """Light behind the etalon (N, height, width), and the total light in front of it."""
     if subsamples not in _NODES:
         raise InputError(f"subsamples: {subsamples!r} is not allowed; expected 1 or 2")
     nodes = _NODES[subsamples]

@@ -129,23 +129,23 @@ def trace(
     """
     across, along = np.broadcast_arrays(np.asarray(across, float), np.asarray(along, float))
     place = np.stack([across.ravel(), along.ravel(), np.zeros(across.size)])
-    way = np.tile([[np.sin(angle)], [0], [np.cos(angle)]], across.size)
+    direction = np.tile([[np.sin(angle)], [0], [np.cos(angle)]], across.size)
     before, distance = 1.0, lens[0, 2]
     for radius, conic, behind, index in lens[1:]:
         place[2] -= distance
         curvature = 1 / radius if radius else 0.0
         stretch = np.array([[1], [1], [1 + conic]])
         # the conic c (x^2 + y^2 + (1 + k) z^2) = 2 z on the line place + step direction
-        square = curvature * (stretch * way * way).sum(0)
-        slope = way[2] - curvature * (stretch * place * way).sum(0)
-        rest = curvature * (stretch * place * place).sum(0) - 2 * place[2]
-        place += rest / (slope + np.sqrt(slope**2 - square * rest)) * way
+        square = curvature * (stretch * direction * direction).sum(0)
+        slope = direction[2] - curvature * (stretch * place * direction).sum(0)
+        gap = curvature * (stretch * place * place).sum(0) - 2 * place[2]
+        place += gap / (slope + np.sqrt(slope**2 - square * gap)) * direction
         normal = np.array([[0], [0], [1]]) - curvature * stretch * place
         normal /= np.linalg.norm(normal, axis=0)
         ratio = before / index
-        arriving = (way * normal).sum(0)
+        arriving = (direction * normal).sum(0)
         leaving = np.sqrt(1 - ratio**2 * (1 - arriving**2))
-        way = ratio * way + (leaving - ratio * arriving) * normal
+        direction = ratio * direction + (leaving - ratio * arriving) * normal
         before, distance = index, behind
-    place += (distance - place[2]) / way[2] * way
+    place += (distance - place[2]) / direction[2] * direction
     return place[0].reshape(across.shape), place[1].reshape(across.shape)

@@ -70,14 +70,14 @@ def harmonics(michelson: Michelson) -> np.ndarray:
     by sinc(fringes / elements). Shape (outputs x elements, 2), output A first.
     """
     reflected = michelson.splitter_reflectance
-    both = reflected * (1 - reflected)
+    product = reflected * (1 - reflected)
     middle = (np.arange(michelson.elements) + 0.5) / michelson.elements
     order = michelson.order_fraction + michelson.fringes * middle
     blur = np.sinc(michelson.fringes / michelson.elements)
     # half of the amplitude 2 R T V: the conjugate has the other half
-    cosine = both * michelson.contrast * blur * np.exp(2j * math.pi * order)
-    a = np.stack([np.full_like(cosine, 2 * both), cosine], 1)
-    b = np.stack([np.full_like(cosine, 1 - 2 * both), -cosine], 1)
+    cosine = product * michelson.contrast * blur * np.exp(2j * math.pi * order)
+    a = np.stack([np.full_like(cosine, 2 * product), cosine], 1)
+    b = np.stack([np.full_like(cosine, 1 - 2 * product), -cosine], 1)
     channels = np.concatenate([a, b][: michelson.outputs])
     # each element receives an equal part of the light
     return channels * michelson.transmittance / michelson.elements

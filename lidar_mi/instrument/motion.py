@@ -185,8 +185,8 @@ def tilted(directions: np.ndarray, rms: float, random: np.random.Generator) -> n
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     above = np.cross(across, directions)
     tilt = rms * random.standard_normal((2, len(directions), 1))
-    found = directions + tilt[0] * across + tilt[1] * above
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    directed = directions + tilt[0] * across + tilt[1] * above
+    return directed / np.linalg.norm(directed, axis=1, keepdims=True)
 
 
 def random_process(
@@ -211,10 +211,10 @@ def random_process(
     # quantiles of the upper half of the distribution: frequencies are positive
     frequencies = corner / math.sqrt(3) * scipy.special.stdtrit(3, (1 + strata) / 2)
     cosine, sine = rms / math.sqrt(_WAVES) * random.standard_normal((2, _WAVES))
-    found = np.zeros(len(time))
-    for one, a, b in zip(frequencies, cosine, sine, strict=True):
-        found += a * np.cos(one * time) + b * np.sin(one * time)
-    return found
+    process = np.zeros(len(time))
+    for frequency, a, b in zip(frequencies, cosine, sine, strict=True):
+        process += a * np.cos(frequency * time) + b * np.sin(frequency * time)
+    return process
 
 
 def true_pose(
@@ -231,14 +231,16 @@ def true_pose(
     recorded = path.at(time, speed) if path else None
     offset = {axis: np.zeros(len(time)) for axis in (*PLACES, *ANGLES)}
     rate = {axis: np.zeros(len(time)) for axis in PLACES}
-    for one in motion.sinusoids:
-        angular = 2 * math.pi * one.frequency
-        offset[one.axis] += one.amplitude * np.sin(angular * time + one.phase)
-        if one.axis in rate:
-            rate[one.axis] += one.amplitude * angular * np.cos(angular * time + one.phase)
+    for sinusoid in motion.sinusoids:
+        angular = 2 * math.pi * sinusoid.frequency
+        offset[sinusoid.axis] += sinusoid.amplitude * np.sin(angular * time + sinusoid.phase)
+        if sinusoid.axis in rate:
+            rate[sinusoid.axis] += (
+                sinusoid.amplitude * angular * np.cos(angular * time + sinusoid.phase)
+            )
     if motion.attitude:
         for number, axis in enumerate(ANGLES):
-            # streams of their own: [seed, 2] and [seed, image, 1] are others'
+            # independent streams: [seed, 2] and [seed, image, 1] are used elsewhere
             random = np.random.default_rng([seed, 3, 1, number + 1])
             offset[axis] += random_process(
                 time, motion.attitude.rms, motion.attitude.bandwidth, random

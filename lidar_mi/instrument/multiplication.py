@@ -26,9 +26,9 @@ def register_output(
 ) -> "torch.Tensor":
     """Electrons behind the register, float64, of whole numbers before it.
 
-    Every electron is still there; the ones that were freed are negative binomial. That is the exact
-    law of very many stages (one electron becomes a geometric number), and has the exact mean and
-    variance for any number of them.
+    All electrons remain; the number of freed ones is negative binomial. That is the exact law of
+    very many stages (one electron becomes a geometric number), and has the exact mean and variance
+    for any number of them.
     """
     import torch
 

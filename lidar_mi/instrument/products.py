@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
 
-# whose products are computed together
+# Gates whose products are computed together.
 _GATES = 16
 _ORDER = re.compile(r"order\d+\.S0")
 
@@ -249,14 +249,14 @@ def _samples(scan: xr.Dataset) -> int:
 
 
 def untrusted_pixels(scan: xr.Dataset) -> str | None:
-    """What a rendered scan says of pixels whose standard error rests on one Monte Carlo sample.
+    """Warning of a rendered scan on pixels whose standard error rests on one Monte Carlo sample.
 
     None where there are at most 1 % of those that receive light; see ``S0_largest_share``.
     """
-    lit, untrusted = (scan.attrs.get(f"{name}_pixels", 0) for name in ("lit", "untrusted"))
-    if untrusted <= 0.01 * lit:
+    bright, untrusted = (scan.attrs.get(f"{name}_pixels", 0) for name in ("lit", "untrusted"))
+    if untrusted <= 0.01 * bright:
         return None
     return (
-        f"in {untrusted} of {lit} pixels that receive light one Monte Carlo sample carries half of "
-        "the variance or more; their standard errors are unreliable; expected more samples"
+        f"in {untrusted} of {bright} pixels that receive light one Monte Carlo sample carries half "
+        "of the variance or more; their standard errors are unreliable; expected more samples"
     )

@@ -45,7 +45,7 @@ class Directions:
 
 
 class Load(NamedTuple):
-    """What a scan asks of its scanner: rad/s and rad/s^2, the larger of both axes."""
+    """Load of the scanner: rad/s and rad/s^2, the larger of both axes."""
 
     rate: float
     acceleration: float
@@ -146,8 +146,8 @@ class ScanTiming(Description):
                 key = "duration" if self.duration is not None else "beam_rate"
                 raise ValueError(f"{key}: not allowed with pattern table, which has its own times")
         elif (self.duration is None) == (self.beam_rate is None):
-            found = "neither is" if self.duration is None else "both are"
-            raise ValueError(f"duration, beam_rate: {found} given; expected exactly one of them")
+            which = "neither is" if self.duration is None else "both are"
+            raise ValueError(f"duration, beam_rate: {which} given; expected exactly one of them")
         if pattern in _CURVES and self.cycles:
             first, second = self.cycles
             least = 1 if pattern == "lissajous" else -math.inf
@@ -199,13 +199,13 @@ class ScanTiming(Description):
             its limits: then with the smallest duration that is within them.
         """
         if self.pattern in _ROWS:
-            found = self._rows(y, z, distance)
+            schedule = self._rows(y, z, distance)
         elif self.pattern in _CURVES:
-            found = self._along(self._curve(), y, z, distance, by_angle)
+            schedule = self._along(self._curve(), y, z, distance, by_angle)
         else:
-            found = self._tabulated(table, len(y) * len(z), distance)
-        self._check_limits(found)
-        return found
+            schedule = self._tabulated(table, len(y) * len(z), distance)
+        self._check_limits(schedule)
+        return schedule
 
     def _rows(self, y: np.ndarray, z: np.ndarray, distance: float) -> Schedule:
         count = len(y) * len(z)
@@ -289,8 +289,8 @@ class ScanTiming(Description):
             half = np.full(2, half.min())
 
         def places(part: np.ndarray) -> np.ndarray:
-            found = middle + half * curve(part)
-            return distance * np.tan(found) if by_angle else found
+            point = middle + half * curve(part)
+            return distance * np.tan(point) if by_angle else point
 
         duration = count / self.beam_rate if self.beam_rate else self.duration or 0.0
         # beams in the middles of equal intervals
@@ -320,16 +320,16 @@ class ScanTiming(Description):
         load = _largest_rates(table.time, angles)
         return Schedule(time, distance * np.tan(angles), duration, rate, load)
 
-    def _check_limits(self, found: Schedule) -> None:
+    def _check_limits(self, schedule: Schedule) -> None:
         """All times in proportion: rates are divided by the factor, accelerations by its square."""
         given = [
             (name, limit, load, power, unit)
             for name, limit, load, power, unit in (
-                ("max_rate", self.max_rate, found.load.rate, 1.0, "deg/s"),
+                ("max_rate", self.max_rate, schedule.load.rate, 1.0, "deg/s"),
                 (
                     "max_acceleration",
                     self.max_acceleration,
-                    found.load.acceleration,
+                    schedule.load.acceleration,
                     0.5,
                     "deg/s^2",
                 ),
@@ -358,11 +358,13 @@ class ScanTiming(Description):
             wrong = f"beam_rate: {self.beam_rate:g} Hz is not allowed"
             allowed = f"at most {_four_digits(self.beam_rate / factor, math.floor):g} Hz{aside}"
         else:
-            sending = len(found.time) / found.beam_rate if self.dead_time else found.duration
-            turns = round((found.duration - sending) / self.dead_time) if self.dead_time else 0
+            sending = (
+                len(schedule.time) / schedule.beam_rate if self.dead_time else schedule.duration
+            )
+            turns = round((schedule.duration - sending) / self.dead_time) if self.dead_time else 0
             least = _four_digits(factor * sending + turns * dead, math.ceil)
             key = "table" if self.pattern == "table" else "duration"
-            wrong = f"{key}: {found.duration:g} s is not allowed"
+            wrong = f"{key}: {schedule.duration:g} s is not allowed"
             allowed = f"at least {least:g} s{aside}"
         raise InputError(f"{wrong}; {need}; expected {allowed}")
 
@@ -371,7 +373,7 @@ def _four_digits(value: float, rounded: Callable[[float], int]) -> float:
     if value == 0:
         return 0.0
     unit = 10.0 ** (math.floor(math.log10(value)) - 3)
-    # rounding must not lead from exact digits to the next number
+    # exact digits stay in spite of rounding
     slack = 1e-9 if rounded is math.floor else -1e-9
     return float(f"{rounded(value / unit + slack) * unit:.4g}")
 

@@ -99,5 +99,5 @@ def speckle_modes(
     spatial = spatial_modes(
         lidar.aperture_radius, lidar.wavelength, footprint_radius(lidar, distance), distance
     )
-    both = 2 / (1 + np.asarray(polarization, float) ** 2)
-    return temporal_modes(detector.line_width, duration) * spatial * both
+    states = 2 / (1 + np.asarray(polarization, float) ** 2)
+    return temporal_modes(detector.line_width, duration) * spatial * states

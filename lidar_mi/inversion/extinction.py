@@ -59,7 +59,7 @@ class LayeredAir:
 
 
 class _Rendered(NamedTuple):
-    """S0, its Monte Carlo variance and single scattering's S0, (gates, beams)."""
+    """S0, its Monte Carlo variance, and S0 of single scattering, (gates, beams)."""
 
     signal: np.ndarray
     variance: np.ndarray
@@ -164,29 +164,29 @@ def invert_extinction(
         gains.append(counts_per_signal * rendered.signal / layers.signal(profile, factor)[0])
         variances.append(counts_per_signal**2 * rendered.variance)
         gain, variance = np.mean(gains, 0), np.mean(variances, 0) / len(variances)
-        found = fit(number, gain, variance, layers, factor, known, profile)
-        steps = np.log(found.extinction / profile) ** 2 / np.diag(found.covariance)
-        profile, change = found.extinction, float(np.sqrt(steps.mean()))
+        solution = fit(number, gain, variance, layers, factor, known, profile)
+        steps = np.log(solution.extinction / profile) ** 2 / np.diag(solution.covariance)
+        profile, change = solution.extinction, float(np.sqrt(steps.mean()))
         if progress:
             progress(round_, change)
-        noisy = found.monte_carlo_fraction > settings.monte_carlo_fraction
+        noisy = solution.monte_carlo_fraction > settings.monte_carlo_fraction
         if near and change < CONVERGED and not noisy:
             reason = f"no change above {CONVERGED:g} standard errors"
             break
         if not near or change > NEAR:
             near = near or change < NEAR
             gains, variances = [], []
-    return _dataset(found, rendered, plan, air, factor, round_, reason)
+    return _dataset(solution, rendered, plan, air, factor, round_, reason)
 
 
 def attenuation_factor(rendered: _Rendered, depth: np.ndarray) -> float:
     """Factor of the attenuation that remains with multiple scattering.
 
     Platt (1981): the ratio of the signal to single scattering's is exp(2 (1 - q) t) in the optical
-    depth t. Of the least squares of its logarithm, weighted by the Monte Carlo variance.
+    depth t. Least squares of its logarithm, weighted by the Monte Carlo variance, give q.
     """
     ratio = np.log(np.maximum(rendered.signal, rendered.single) / rendered.single)
-    # of what two samples in thousands tell nothing
+    # a floor: variances from few samples are uncertain
     weights = 1 / (rendered.variance / rendered.signal**2 + 1e-4)
     slope = (weights * ratio * depth).sum() / (weights * depth**2).sum()
     return float(np.clip(1 - slope / 2, 0.3, 1))
@@ -210,7 +210,7 @@ def _render(
 
 
 def _check_light(signal: np.ndarray, plan: ScanPlan) -> None:
-    """Refuse gates without light: whatever the air is, they would count the background alone."""
+    """Refuse gates without light, which count the background alone."""
     dark = np.argwhere(~(signal > 0))
     if dark.size:
         edges = np.linspace(plan.gate_start, plan.gate_stop, plan.gate_count + 1)
@@ -234,7 +234,7 @@ def _renderer(
 
 
 def _grid(profile: np.ndarray, plan: ScanPlan, air: LayeredAir) -> xr.DataArray:
-    """The profile as a field, so wide that what leaves it sideways does not come back."""
+    """The profile as a field, so wide that light that leaves it sideways does not return."""
     lateral = max(np.abs(plan.y).max(), np.abs(plan.z).max()) * plan.gate_stop / plan.centre
     half, nodes = float(lateral + np.ptp(air.x)), air.nodes()
     field = np.broadcast_to(profile[:, None, None], (len(profile), 2, 2)).copy()
@@ -325,7 +325,7 @@ def _checked(
 
 
 def _dataset(
-    found: Fit,
+    solution: Fit,
     rendered: _Rendered,
     plan: ScanPlan,
     air: LayeredAir,
@@ -335,9 +335,9 @@ def _dataset(
 ) -> xr.Dataset:
     ratio = (rendered.signal / rendered.single).reshape(-1, len(plan.z), len(plan.y))
     layers = len(air.x)
-    mean = found.extinction.reshape(layers, -1).mean(1)
-    slopes = np.kron(np.eye(layers), np.ones(_NODES) / _NODES) * found.extinction / mean[:, None]
-    covariance = slopes @ found.covariance @ slopes.T
+    mean = solution.extinction.reshape(layers, -1).mean(1)
+    slopes = np.kron(np.eye(layers), np.ones(_NODES) / _NODES) * solution.extinction / mean[:, None]
+    covariance = slopes @ solution.covariance @ slopes.T
     stderr = mean * np.sqrt(np.diag(covariance))
     unit = {"units": "m-1"}
     return xr.Dataset(
@@ -355,8 +355,8 @@ def _dataset(
         attrs={
             "rounds": rounds,
             "reason": reason,
-            "walk_step": found.walk_step,
+            "walk_step": solution.walk_step,
             "attenuation_factor": factor,
-            "monte_carlo_fraction": found.monte_carlo_fraction,
+            "monte_carlo_fraction": solution.monte_carlo_fraction,
         },
     )

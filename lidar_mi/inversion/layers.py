@@ -7,7 +7,7 @@ _SUBDIVISIONS, _POINTS = 8, 4
 
 
 class Layers:
-    """Light that gates receive from air whose extinction changes along x alone.
+    """Light that gates receive from air whose extinction changes only along x.
 
     The extinction is linear between nodes and constant beyond them, as the renderer's grid is. A
     gate from r_1 to r_2 along a beam receives, but for a factor,
@@ -38,7 +38,7 @@ class Layers:
         x = ranges[..., None] * cosines
         step = nodes[1] - nodes[0]
         face = nodes[0] - step / 2
-        # of air, whose faces are half a step outside of the outermost nodes
+        # the air ends half a step beyond the outermost nodes
         inside = (x > face) & (x < nodes[-1] + step / 2)
         self._weights = np.broadcast_to((steps / ranges**2)[..., None], shape) * inside
         self._values = _hats(x, nodes)
@@ -51,10 +51,10 @@ class Layers:
         The extinction (m^-1) is above 0; the factor q is that of attenuation.
         """
         weights = self._weights * np.exp(-2 * factor * (self._depths @ extinction))
-        here = self._values @ extinction
-        signal = (weights * here).sum(1)
+        local = self._values @ extinction
+        signal = (weights * local).sum(1)
         slope = np.einsum("gpb,gpbn->gbn", weights, self._values)
-        slope -= 2 * factor * np.einsum("gpb,gpbn->gbn", weights * here, self._depths)
+        slope -= 2 * factor * np.einsum("gpb,gpbn->gbn", weights * local, self._depths)
         return signal, slope * extinction
 
     def depth(self, extinction: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ LEAST_WALK = 1e-6
 
 @dataclass(frozen=True)
 class Known:
-    """What is known beside the counts.
+    """What is known in addition to the counts.
 
     Attributes
     ----------

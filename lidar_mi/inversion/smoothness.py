@@ -1,4 +1,4 @@
-"""Prior of a profile: a random walk whose strength the counts tell."""
+"""Prior of a profile: a random walk whose strength is estimated from the counts."""
 
 import numpy as np
 import scipy
@@ -20,7 +20,7 @@ def strength(information: np.ndarray, score: np.ndarray) -> float:
     walk = np.tril(np.ones((count, count - 1)), -1)
     level = np.ones(count)
     total = level @ information @ level
-    # projected: what is left of the data once the level is fitted
+    # residuals about the fitted level
     projected = information - np.outer(information @ level, level @ information) / total
     residual = score - information @ level * (level @ score) / total
     gains, vectors = scipy.linalg.eigh(walk.T @ projected @ walk)

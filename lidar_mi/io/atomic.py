@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lidar_mi.errors import InputError
 
-# a process killed while writing can only leave such a file
+# a process killed while writing leaves only such a file
 TEMPORARY = ".lidar-mi.*.part"
 
 _numbers = count()
@@ -100,6 +100,6 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (PermissionError, OverflowError):  # of another user; no process has such a number
+    except (PermissionError, OverflowError):  # of another user; a number that no process can have
         return True
     return True

@@ -1,4 +1,4 @@
-"""Files that are compressed as a whole: how they begin, and which program undoes it."""
+"""Compressed files: their first bytes, and the program that unpacks them."""
 
 _PROGRAMS = (
     (b"\x1f\x8b", "gzip", "gunzip"),
@@ -9,7 +9,7 @@ _PROGRAMS = (
 
 
 def compression(start: bytes) -> tuple[str, str] | None:
-    """Name of the compression of a file that begins so, and the program; None if there is none."""
+    """Name and program of the compression, by the first bytes of a file; None: not compressed."""
     for mark, name, program in _PROGRAMS:
         if start.startswith(mark):
             return name, program

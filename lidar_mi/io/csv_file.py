@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lidar_mi.flags import masks_of
 from lidar_mi.io.text import write_text
 
 
@@ -25,8 +26,12 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     rows = data.expand_dims("row") if not data.dims else data
     table = rows.to_dataframe(dim_order=[str(dim) for dim in rows.dims]).reset_index()
     places = [axis for axis in ("x", "y", "z") if axis in data.coords]
-    # vectors that are at the centres of their windows have no place of their own
-    same = [f"{axis}_vector" for axis in places if _equal(data, axis, f"{axis}_vector")]
+    # positions that equal the centres of the windows are omitted
+    same = [
+        vector
+        for axis in places
+        if (vector := f"{axis}_vector") in data.coords and (data[axis] == data[vector]).all()
+    ]
     labels = [str(name) for name in data.coords if name not in (*places, *same)]
     columns = [*labels, *places, *(str(name) for name in data.data_vars)]
     table = table[columns]
@@ -42,16 +47,11 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     write_text(path, table.rename(columns=heads).to_csv(index=False, na_rep="NaN"))
 
 
-def _equal(data: xr.Dataset, first: str, second: str) -> bool:
-    return second in data.coords and bool((data[first] == data[second]).all())
-
-
 def _in_words(flags: np.ndarray, attributes: dict[str, Any]) -> list[str]:
     """Reasons of every flag, ``valid`` where there is none."""
-    masks = np.atleast_1d(attributes["flag_masks"]).astype(int)
-    names = attributes["flag_meanings"].split()
+    masks = masks_of(attributes)
     words = {
-        int(flag): " ".join(n for n, mask in zip(names, masks, strict=True) if int(flag) & mask)
+        int(flag): " ".join(name for name, mask in masks.items() if int(flag) & mask)
         for flag in np.unique(flags)
     }
     return [words[int(flag)] or "valid" for flag in flags]

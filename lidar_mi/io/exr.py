@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 MOST_LAYERS = 2**15 - 1
-"""Of a file: the library counts them in 16 bits."""
+"""Most layers of a file: the library counts them in 16 bits."""
 QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
 _MEANING = {
     "S0": "received energy over emitted pulse energy",

@@ -11,10 +11,10 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 
 QUALITY = 55
-"""Of lossy frames, 0 to 100."""
+"""Quality of lossy frames, 0 to 100."""
 
 VIDEO_EXTRA = "a video needs PyAV; expected pip install 'lidar-mi[film]'"
-"""What is said where there is none."""
+"""Message where PyAV is missing."""
 
 _COLOURS = 128
 # Constant rate factor of x264: 23 is its default, higher is smaller.
@@ -44,8 +44,8 @@ def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) ->
 
     if len({frame.shape for frame in frames}) != 1:
         raise InputError(f"{path}: {len(frames)} frames of one size expected")
-    # one palette for all, so that what rests does not flicker; of all colours, not of the most
-    # frequent, so that thin lines keep theirs next to a grey image
+    # one palette for all frames, so that the background does not flicker; of all colours, not the
+    # most frequent ones, so that thin lines keep theirs next to a grey image
     palette = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 4)])).quantize(
         _COLOURS, Image.Quantize.MAXCOVERAGE
     )

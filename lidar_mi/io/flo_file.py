@@ -8,7 +8,7 @@ import xarray as xr
 from lidar_mi.io.atomic import write_atomically
 
 _UNKNOWN = 1e10
-"""What the format means by a vector that is not known: above 1e9."""
+"""An unknown vector, in the format any value above 1e9."""
 
 
 def write_flo(path: str | Path, wind: xr.Dataset, pixel: tuple[float, float]) -> None:

@@ -1,4 +1,4 @@
-"""Times between images, from what the headers of a run's EXR files say."""
+"""Times between images, from the headers of a run's EXR files."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -9,14 +9,14 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.exr import read_header
 
 _OF_A_RUN = ("dt", "telescope_position", "platform_speed")
-_SAME = 1e-3  # of the way, relative
+_TOLERANCE = 1e-3  # relative, of the distance flown
 
 
 def steps_of(paths: Sequence[str | Path]) -> list[float] | None:
     """Time from each image to the next, s, negative where the later comes first.
 
-    From the scans' reference times. Files without them: from the time between the images of a run,
-    whose order is known from the telescope's way along it, unless the gates followed the air.
+    From the scans' reference times. Without them: from the time between the images of a run, whose
+    order follows from the telescope's position, unless the gates followed the air.
 
     Returns
     -------
@@ -33,11 +33,11 @@ def steps_of(paths: Sequence[str | Path]) -> list[float] | None:
 
 
 def _step(earlier: dict[str, Any], later: dict[str, Any]) -> float:
-    """The time between two images of a run; negative if the telescope has gone backwards."""
+    """The time between two images of a run; negative if the telescope moves backwards."""
     dt = _rounded(earlier["dt"])
-    way = later["telescope_position"] - earlier["telescope_position"]
+    path = later["telescope_position"] - earlier["telescope_position"]
     backwards = -earlier["platform_speed"] * dt
-    return -dt if way and abs(way - backwards) < _SAME * abs(backwards) else dt
+    return -dt if path and abs(path - backwards) < _TOLERANCE * abs(backwards) else dt
 
 
 def _rounded(seconds: float) -> float:

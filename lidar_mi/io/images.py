@@ -93,7 +93,7 @@ def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
     InputError
         As `read_pixels`.
     """
-    if kind_of(Path(path)) in _OF_ONE:
+    if kind_of(Path(path)) in _SINGLE_IMAGE:
         return 1, False
     frames = _frames(Path(path), layer)
     return frames.count, frames.channels
@@ -119,7 +119,7 @@ def _frames(path: Path, layer: str | None) -> Frames:
             f"layer: {layer!r} is not allowed for {path}; only EXR, FITS, npz, mat and HDF5 files "
             "have layers"
         )
-    return _WITHOUT[kind](path)
+    return _WITHOUT_LAYERS[kind](path)
 
 
 def _exr(path: Path, layer: str | None) -> Frames:
@@ -136,9 +136,9 @@ def _exr(path: Path, layer: str | None) -> Frames:
 
 
 _WITH_LAYERS = {"exr": _exr, "fits": read_fits, "npz": read_npz, "mat": read_mat, "hdf5": read_hdf5}
-_OF_ONE = ("exr", "png", "jpeg2000", "mat")
+_SINGLE_IMAGE = ("exr", "png", "jpeg2000", "mat")
 """Kinds that hold one image."""
-_WITHOUT = {
+_WITHOUT_LAYERS = {
     "tiff": read_tiff,
     "png": read_png,
     "picture": read_picture,
@@ -298,7 +298,7 @@ def read_noise(
     if not _is_exr(path):
         return None
     layers, layer = read_layers(path)[1], layer or default_layer(path)
-    # of random numbers that both images of a pair share: what the other does not have
+    # images of a pair share random numbers: the part of the noise that they do not share
     unshared = "gate000.S0_pair_stderr"
     error = unshared if unshared in layers else "gate000.S0_stderr"
     if layer in ("Y", "Y_noisy") and {"gate000.S0", error, "Y"} <= set(layers):
@@ -368,10 +368,10 @@ def _short(error: Exception) -> str:
 
 
 def panel_cuts(path: str | Path) -> list[float]:
-    """Where the panels of a figure side by side part, as fractions of its width.
+    """Boundaries of panels side by side, as fractions of a figure's width.
 
-    A figure of n equal columns parts at white gaps of its full height near k / n; the smallest n
-    up to 4 is taken. Empty: one column, or panels that something spans.
+    A figure of n equal columns has white gaps of its full height near k / n; the smallest n up to 4
+    is taken. Empty: one column, or an element that spans several.
 
     Raises
     ------
@@ -386,7 +386,7 @@ def panel_cuts(path: str | Path) -> list[float]:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
     white = np.flatnonzero((pixels > 250).all(0)) / max(pixels.shape[1], 1)
-    # one panel is about as high as it is wide
+    # a panel is about as high as wide
     most = min(4, round(2 * pixels.shape[1] / max(pixels.shape[0], 1)))
     for columns in range(2, most + 1):
         expected = [k / columns for k in range(1, columns)]

@@ -10,8 +10,8 @@ from pathlib import Path
 def library_name(path: str | Path) -> Iterator[str]:
     """A name under which a library opens a file, within the context.
 
-    The file's own, absolute so that no beginning such as ``~`` or ``-`` means something else; where
-    that is not UTF-8, that of an open descriptor.
+    The absolute name of the file, as libraries interpret a leading ``~`` or ``-``; if it is not
+    UTF-8, that of an open descriptor.
 
     Raises
     ------

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import h5py
 
 
-# What never written cells hold (NC_FILL_* of netcdf.h), but in types of one byte, which the library
-# does not check either, as all their values are in use.
+# Values of cells that were never written (NC_FILL_* of netcdf.h). None for types of one byte, all
+# of whose values are in use; the library does not check them either.
 _NEVER_WRITTEN = {
     "i2": -32767,
     "u2": 65535,
@@ -32,7 +32,7 @@ _NEVER_WRITTEN = {
     "f4": 9.969209968386869e36,
     "f8": 9.969209968386869e36,
 }
-# How files begin, what they are, and what makes NetCDF that is read of them.
+# First bytes of files, their kind, and the command that converts them to NetCDF.
 _KINDS = (
     (b"PK\x03\x04", "is a zip archive", "unzip {0}"),
     (b"\x0e\x03\x13\x01", "is HDF4", "ncks {0} out.nc"),
@@ -41,11 +41,11 @@ _KINDS = (
 )
 _ZARR = (".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json")
 _LIBRARY = "netCDF4"
-"""Reads files that h5py and SciPy do not, where it is installed."""
+"""Optional library for files that h5py and SciPy cannot read."""
 
 
 def open_netcdf(path: str | Path, group: str | None = None) -> xr.Dataset:
-    """A NetCDF-4 or NetCDF-3 file, its times as numbers, its values read when they are asked for.
+    """A NetCDF-4 or NetCDF-3 file, times as numbers, values read on demand.
 
     With a ``group``, the variables of that group of a NetCDF-4 file (`groups`).
 
@@ -196,7 +196,7 @@ def _missing_filters(variable: "h5py.Dataset") -> dict[int, str]:
 
 
 def _mark_missing(variable: xr.Variable) -> None:
-    """Let xarray find what CF calls missing and it does not.
+    """Mark the values that are missing by CF and that xarray does not recognise.
 
     What the library writes into cells that were never written; the sign of ``missing_value`` where
     ``_Unsigned`` changes that of the values.
@@ -209,7 +209,7 @@ def _mark_missing(variable: xr.Variable) -> None:
             attributes["missing_value"] = stored.view(f"{signs}{kind.itemsize}")
         return
     fill = _NEVER_WRITTEN.get(kind.str[1:])
-    # no measured number, also where another fill value came later
+    # never a measurement, even if another fill value was declared later
     if fill is not None and kind.kind == "f":
         also = np.append(np.ravel(attributes.get("missing_value", [])), fill)
         attributes["missing_value"] = also.astype(kind)

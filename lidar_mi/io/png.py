@@ -35,8 +35,8 @@ def write_preview(path: str | Path, pixels: np.ndarray) -> tuple[float, float]:
     """Write an image of light (top row first) as 8-bit grey, for viewers that know no EXR.
 
     Grey is linear between black, the value below which 0.5 % of the pixels are, and white, which
-    0.5 % exceed: what is there is seen, however faint its contrast. An image of one value is grey.
-    What is not finite is black. Black and white, in the image's units, are returned.
+    0.5 % exceed, so that faint contrasts are visible. An image of one value is grey. Values that
+    are not finite are black. Black and white, in the image's units, are returned.
     """
     from PIL import Image
 

@@ -13,7 +13,7 @@ from lidar_mi.atmosphere.scattering.tables import ScatteringTable
 from lidar_mi.errors import InputError
 from lidar_mi.io.text import read_text, write_text
 
-# Header lines that a table file must have.
+# Required header lines.
 _HEADER = {
     "name": str,
     "wavelength_m": float,

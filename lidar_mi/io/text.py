@@ -12,7 +12,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 
 LONGEST = 64 << 20
-"""Bytes of a text file that is read."""
+"""Most bytes of a text file."""
 
 
 def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:

@@ -7,16 +7,16 @@ import numpy as np
 from lidar_mi.errors import InputError
 
 _SINCE = re.compile(r"\s*(\S+)\s+(?:since|after|from|ref)\s+(?=\S*\d).*", re.IGNORECASE | re.DOTALL)
-# No two of them need be equally long.
+# The states need not be evenly spaced.
 _CALENDAR = re.compile(r"(common_|leap_|julian_|tropical_|gregorian_)?(months?|years?|yrs?)", re.I)
 
-# A state belongs to the time asked for to this fraction of the way to its neighbour: velocities of
-# two states are wrong by twice of it.
-_SAME = 1e-3
-# Of axes in single precision, to their rounding, where that is this fraction at most.
-_ROUNDING = 1e-2
+# Tolerance of a state's time as a fraction of the interval to its neighbour; velocities from two
+# states have twice this relative error.
+_TOLERANCE = 1e-3
+# For axes in single precision, their rounding, up to this fraction.
+_LARGEST_ROUNDING = 1e-2
 # In seconds: the fastest air of a wake, 50 m/s, moves by 5 cm.
-_LARGEST = 1e-3
+_LARGEST_TOLERANCE = 1e-3
 
 
 def count_unit(text: str, where: str) -> str:
@@ -42,22 +42,22 @@ def count_unit(text: str, where: str) -> str:
 
 
 def tolerances(times: np.ndarray, rounding: np.ndarray) -> np.ndarray:
-    """How far from each time one may be that means it, s, whatever the axis counts from.
+    """Tolerance of each time, s, whatever the origin of the axis.
 
-    1e-3 of the way to the nearest other time or, up to 1e-2 of it, the axis' own rounding; 1 ms at
-    most.
+    1e-3 of the interval to the nearest other time or, up to 1e-2 of it, the rounding of the axis;
+    at most 1 ms.
     """
     order = np.argsort(times)
     steps = np.diff(times[order])
     gaps = np.full(times.size, np.inf)
     gaps[order] = np.fmin(np.append(steps, np.inf), np.append(np.inf, steps))
-    fraction = np.maximum(_SAME * gaps, np.minimum(rounding, _ROUNDING * gaps))
+    fraction = np.maximum(_TOLERANCE * gaps, np.minimum(rounding, _LARGEST_ROUNDING * gaps))
     # text that is read and units that are converted differ by the last bits of double precision
-    return np.minimum(fraction, _LARGEST) + 2 * np.spacing(np.abs(times))
+    return np.minimum(fraction, _LARGEST_TOLERANCE) + 2 * np.spacing(np.abs(times))
 
 
 def listing(times: np.ndarray, tolerance: np.ndarray, most: int = 20) -> str:
-    """Times as the shortest numbers that mean them: "40, 40.1 ..."."""
+    """Times as their shortest numbers within the tolerance: "40, 40.1 ..."."""
     numbers = [_shortest(float(t), float(d)) for t, d in zip(times[:most], tolerance, strict=False)]
     return ", ".join(numbers) + (" ..." if times.size > most else "")
 

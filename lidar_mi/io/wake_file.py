@@ -19,7 +19,7 @@ _VARIABLES = {
     "u": ("m s-1", "velocity along the flight path"),
     "v": ("m s-1", "velocity across the flight path, positive to port"),
     "w": ("m s-1", "vertical velocity, positive upwards"),
-    "tracer": (None, "exhaust tracer"),  # any scale, any unit: its largest value is what counts
+    "tracer": (None, "exhaust tracer"),  # any unit: only ratios to its largest value matter
     "aerosol": ("1", "background aerosol relative to its mean"),
 }
 _REQUIRED = ("v", "w")
@@ -144,7 +144,7 @@ def wake_times(path: str | Path, names: Mapping[str, str] | None = None) -> np.n
 
 
 def _rounding(variable: xr.DataArray, values: np.ndarray) -> np.ndarray:
-    """To which the file rounds a variable's values; integers are as they were meant."""
+    """Rounding of a variable's values in the file; integers have none."""
     kind = np.dtype(variable.encoding.get("dtype", variable.dtype))
     half = np.spacing(np.abs(values).astype(kind)) / 2 if kind.kind == "f" else 0.0 * values
     return half.astype(float)
@@ -189,7 +189,7 @@ def _positive_down(
     heights: Iterable[str],
     path: Path,
 ) -> list[str]:
-    """Axes of heights that the file says to be depths, unless the sign is changed by their name."""
+    """Vertical axes that the file states to be depths, unless their name changes the sign."""
     down = [
         name
         for name in heights
@@ -306,11 +306,11 @@ def read_wake(
 
 
 def _hint(name: str, table: Mapping[str, str], present: Iterable[Any]) -> str:
-    """How to give the name in the file, or the one there that is nearest to the name given."""
+    """A hint: the key that gives the file's name, or the nearest name in the file."""
     if table[name] != name:
         names = [str(candidate) for candidate in present]
         close = difflib.get_close_matches(table[name], names, 1)
-        # a name that is nothing like those there: ours may be among them
+        # no similar name: ours may be among them
         close = close or ([name] if name in names else [])
         return f"; did you mean {close[0]}?" if close else ""
     none = f", or wake.extinction.{name}: null" if name in ("tracer", "aerosol") else ""
@@ -342,11 +342,6 @@ def _in_the_ground(variable: xr.DataArray, height: str, path: Path) -> int:
     return 0
 
 
-def _staggered(dims_of: Mapping[str, Mapping[str, str]], spatial: Mapping[str, str]) -> set[str]:
-    """Axes that some variable has at nodes of its own."""
-    return {ours for dims in dims_of.values() for d, ours in dims.items() if d not in spatial}
-
-
 def _read(
     data: xr.Dataset,
     table: Mapping[str, str],
@@ -372,12 +367,11 @@ def _read(
     present = [name for name in _VARIABLES if table[name] in data.data_vars]
     spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}
     dims_of = {name: _spatial_dims(data, table, name, spatial) for name in present}
-    odd = [name for name in present if not dims_of[name]]
-    if odd:
+    if unplaced := [table[name] for name in present if not dims_of[name]]:
         missing = next((n for n in ("time", "x", "y", "z") if table[n] not in data.dims), "x")
         raise InputError(
-            f"{path}: variable {table[odd[0]]!r} has the dimensions "
-            f"({', '.join(map(str, data[table[odd[0]]].dims))}); allowed: {', '.join(spatial)} "
+            f"{path}: variable {unplaced[0]!r} has the dimensions "
+            f"({', '.join(map(str, data[unplaced[0]].dims))}); allowed: {', '.join(spatial)} "
             f"and, at choice, {table['time']}, in any order, one of them staggered; expected "
             f"wake.names of the others, such as {{{missing}: its name there}}"
         )
@@ -426,7 +420,8 @@ def _read(
         axes["x"] = axes["x"][index : index + 1]
         # planes that are not needed are not read
         planes = file_nodes.get(table["x"], axes["x"])
-        if planes.size > 1 and is_even(planes) and "x" not in _staggered(dims_of, spatial):
+        staggered = {o for dims in dims_of.values() for d, o in dims.items() if d not in spatial}
+        if planes.size > 1 and is_even(planes) and "x" not in staggered:
             index = int(np.argmin(np.abs(planes - axes["x"][0])))
             data = data.isel({table["x"]: slice(index, index + 1)})
             file_nodes[table["x"]] = axes["x"]
@@ -450,9 +445,11 @@ def _read(
         along = {dims_of[name][theirs]: file_nodes[theirs] for theirs in dims}
         nodes = [along.get(d, axes[d]) for d in "xyz"]
         values = _numbers(variable, path).reshape([n.size for n in nodes]) * scale
-        amount = name in needed and name in ("tracer", "aerosol")
+        nonnegative = name in needed and name in ("tracer", "aerosol")
         where = dict(zip("xyz", nodes, strict=True))
-        _check_values(values, where, table[name], path, not amount, valid_range(variable, path))
+        _check_values(
+            values, where, table[name], path, not nonnegative, valid_range(variable, path)
+        )
         low, high = values.min(), values.max()
         values, errors[name] = interpolated(values, nodes, [axes[d] for d in "xyz"])
         if name in ("tracer", "aerosol"):

@@ -1,7 +1,7 @@
 """Boxes of wind for wind turbines: TurbSim's full fields (.bts), Mann boxes of HAWC2 (.bin).
 
-Both become a volume at rest in its mean wind, on (x, y, z): x along the wind, y to the left of who
-looks along it, z up.
+Both become a volume at rest in its mean wind, on (x, y, z): x along the wind, y to the left facing
+along it, z up.
 """
 
 import struct
@@ -14,7 +14,7 @@ from lidar_mi.errors import InputError
 
 _BTS_HEAD = struct.Struct("<h4i6f6fi")
 _BTS_KINDS = (7, 8)
-"""Of one run, and periodic."""
+"""Files of one run, and periodic ones."""
 
 _ATTRS = {"units": "m s-1"}
 
@@ -42,8 +42,8 @@ def read_bts(path: str | Path) -> xr.Dataset:
     kind, nz, ny, tower, steps, dz, dy, dt, mean, _, bottom, *scales, text = _BTS_HEAD.unpack_from(
         data
     )
-    sane = kind in _BTS_KINDS and min(nz, ny, steps) > 0 and tower >= 0 and 0 <= text <= 10_000
-    if not sane or not min(dz, dy, dt) > 0:
+    plausible = kind in _BTS_KINDS and min(nz, ny, steps) > 0 and tower >= 0 and 0 <= text <= 10_000
+    if not plausible or not min(dz, dy, dt) > 0:
         raise InputError(f"{path}: no header of a TurbSim field; expected a .bts file")
     if not mean > 0:
         raise InputError(f"{path}: mean wind at the hub of {mean:g} m/s; expected above 0")

@@ -14,7 +14,7 @@ SERIES = (".nc", ".csv", ".mat")
 """Suffixes of formats that hold several winds."""
 
 SUFFIXES = (*SERIES, ".vtk", ".vti", ".flo")
-"""Of all formats."""
+"""Suffixes of all formats."""
 
 
 def write_wind(path: str | Path, wind: xr.Dataset, pixel: tuple[float, float]) -> str:

@@ -1,4 +1,4 @@
-"""Scene files, looked at before Mitsuba parses them."""
+"""Scene files, checked before Mitsuba parses them."""
 
 from pathlib import Path
 from xml.parsers import expat
@@ -6,13 +6,14 @@ from xml.parsers import expat
 from lidar_mi.errors import InputError
 
 DEEPEST = 64
-"""Levels of tags; a scene needs six. Mitsuba's parser calls itself for each: its stack ends."""
+"""Most levels of tags; a scene needs six. Mitsuba's parser recurses into each, and its stack is
+limited."""
 
 
 def check_scene_file(path: str | Path) -> None:
-    """Refuse a scene that would take the process down, before anything parses it as a whole.
+    """Refuse a scene that would crash the process, before it is parsed as a whole.
 
-    Files that it includes are looked at, too.
+    Included files are checked, too.
 
     Raises
     ------

@@ -10,16 +10,16 @@ from lidar_mi.errors import InputError, one_line
 from lidar_mi.io.text import read_text
 
 LONGEST = 128 << 10
-"""Bytes of a YAML file."""
+"""Most bytes of a YAML file."""
 LARGEST = 10_000
-"""Values in a file, those that aliases repeat included."""
+"""Most values in a file, including those that aliases repeat."""
 DEEPEST = 40
-"""Sections in sections."""
+"""Most levels of sections."""
 
 _LARGEST_NUMBER = 10**300
 # ten times as fast where PyYAML was built with libyaml
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-# what Python raises on the text of a number or a date that is none
+# exceptions of Python for invalid numbers and dates
 _NO_VALUE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
@@ -29,7 +29,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._depth = self._count = 0
-        # values in a node, by its id; not there before the node is complete
+        # number of values in a node, by its id; absent until the node is complete
         self._sizes: dict[int, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
@@ -51,7 +51,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
             value = super().construct_object(node, deep)
-            # what is larger is no float, and cannot be shown
+            # larger integers are no floats and cannot be printed
             if not isinstance(value, int) or abs(value) < _LARGEST_NUMBER:
                 return value
         except _NO_VALUE:

@@ -252,12 +252,12 @@ def scene_dict(
     phase = loadable(phase)
     around = within = {"albedo": albedo, "phase": phase}
     if molecules:
-        both, fraction = _mixed(xr.DataArray(environment), albedo, molecules)
+        mixed_albedo, fraction = _mixed(xr.DataArray(environment), albedo, molecules)
         mixture = _blend(phase, molecules, float(fraction))
-        around = {"albedo": float(both), "phase": mixture}
-        both, fraction = _mixed(extinction, albedo, molecules)
+        around = {"albedo": float(mixed_albedo), "phase": mixture}
+        mixed_albedo, fraction = _mixed(extinction, albedo, molecules)
         mixture = _blend(phase, molecules, volume(fraction))
-        within = {"albedo": volume(both), "phase": mixture}
+        within = {"albedo": volume(mixed_albedo), "phase": mixture}
     return {
         "type": "scene",
         "integrator": {
@@ -349,8 +349,8 @@ def _move(
     parameters["sensor.gate_stop"] = plan.gate_stop
     fields = {"sigma_t": extinction}
     if molecules:
-        both, fraction = _mixed(extinction, albedo, molecules)
-        fields |= {"albedo": both, "phase_function.weight": fraction}
+        mixed_albedo, fraction = _mixed(extinction, albedo, molecules)
+        fields |= {"albedo": mixed_albedo, "phase_function.weight": fraction}
     for name, field in fields.items():
         parameters[f"slab.interior_medium.{name}.data"] = mi.TensorXf(_voxels(field))
         if "time" in field.dims:

@@ -192,7 +192,7 @@ def _field(camera: FringeCamera) -> float:
     """Angle of the light to a pixel that is farthest from the axis, rad."""
     x, y = camera.centre_pixel
     corner = math.hypot(max(x, camera.width - 1 - x) + 0.5, max(y, camera.height - 1 - y) + 0.5)
-    # what the CCD's defects let in from beyond
+    # distortion and defocus let in light from beyond the corner
     corner = corner * camera.pixel * (1 + abs(camera.distortion)) + camera.defocus / 2
     return math.atan(corner / camera.focal_length) * (1 + sum(map(abs, camera.tilt)))
 

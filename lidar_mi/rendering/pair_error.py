@@ -44,9 +44,9 @@ def unshared_fraction(
     """
     known, at = np.isfinite(second), np.nan_to_num([rows, columns], nan=-1.0)
     moved = scipy.ndimage.map_coordinates(np.where(known, second, 0.0), at, order=3, mode="nearest")
-    there = scipy.ndimage.map_coordinates(known.astype(float), at, order=1, mode="constant")
+    covered = scipy.ndimage.map_coordinates(known.astype(float), at, order=1, mode="constant")
     off = (moved - first) ** 2 / 2
-    counts = np.isfinite(off) & np.isfinite(stderr) & (there > 0.999)
+    counts = np.isfinite(off) & np.isfinite(stderr) & (covered > 0.999)
     different, whole = (
         scipy.ndimage.gaussian_filter(np.where(counts, square, 0.0), WINDOW)
         for square in (off, stderr**2)

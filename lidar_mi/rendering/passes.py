@@ -14,7 +14,7 @@ _SMALLER = 4
 
 
 def within_memory(integrator: Any, render: Callable[[], T]) -> T:
-    """What a function renders; where memory is full, again in passes of a quarter of the samples.
+    """Result of a renderer, repeated in passes of a quarter of the samples if memory is full.
 
     The integrator keeps the smaller passes, for the images that follow. Images do not depend on
     them but for rounding.
@@ -30,7 +30,8 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
         try:
             return render()
         except Exception as error:
-            if not _is_full(error):
+            # Dr.Jit has no exception of its own for this
+            if not any("out of memory" in str(cause).lower() for cause in causes(error)):
                 raise
             if integrator.samples_per_pass <= LEAST:
                 raise InputError(
@@ -42,8 +43,3 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
         gc.collect()
         dr.flush_malloc_cache()
         integrator.samples_per_pass = max(LEAST, integrator.samples_per_pass // _SMALLER)
-
-
-def _is_full(error: BaseException) -> bool:
-    """Whether Dr.Jit got no memory: it has no type for it."""
-    return any("out of memory" in str(one).lower() for one in causes(error))

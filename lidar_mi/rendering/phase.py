@@ -138,11 +138,11 @@ def table_files(scattering: Keys, folder: str | Path = ".") -> dict[str, Path]:
         One of them does not exist.
     """
     named = {f"scattering.parts.{k}.table": part for k, part in enumerate(scattering.parts or ())}
-    found = {}
+    files = {}
     for field, part in ({"scattering.table": scattering} | named).items():
         if part.table is not None:
-            found[field] = _table_file(part.table, folder, field).resolve()
-    return found
+            files[field] = _table_file(part.table, folder, field).resolve()
+    return files
 
 
 def _table_file(name: str, folder: str | Path, field: str) -> Path:

@@ -104,7 +104,7 @@ def choose_samples(
     most = settings.most_samples(beams, gates)
     if not math.isfinite(mean):  # a detector without noise: no number is enough
         return Samples(most, 2**31 - 1, math.inf, math.inf, math.inf)
-    # as much as the pilot leaves open, which beams of independent samples say
+    # two standard errors of the pilot's mean; beams are independent samples
     open_ = 2 * float(of_one.std()) / math.sqrt(of_one.size)
     wanted = (mean + open_) / settings.monte_carlo_fraction
     needed = max(_rounded_up(wanted / gates), LEAST, -(-least // gates)) * gates

@@ -90,7 +90,7 @@ def render_file(
         write_fringes(out, image)
         return image
     integrator.shares, integrator.covariance = True, bool(mi.is_polarized)
-    # what a scene does not say is the plugin's default
+    # defaults of the plugin for what the scene does not state
     given = integrator.samples_per_pass
     integrator.samples_per_pass = samples_at_once(
         None if given == MOST_AT_ONCE["llvm"] else given, None, variant
@@ -118,7 +118,7 @@ def render_file(
 
 
 def _check_names(scene_path: Path, definitions: dict[str, str]) -> None:
-    """Refuse names that Mitsuba cannot take or takes for something else."""
+    """Refuse names that Mitsuba rejects or misreads."""
     if not is_text(os.path.abspath(scene_path)):
         raise InputError(
             f"{scene_path}: a name that is not UTF-8 is not allowed for a scene; expected another "

@@ -121,8 +121,8 @@ class RenderSettings(Description):
     def scan_seed(self, seed: int, scan: int) -> int:
         """Seed of a scan's light: common numbers need one seed, independent ones one each.
 
-        Common numbers of two seeds would be errors that all beams of an image share and that
-        images do not, which image velocimetry takes for motion.
+        Common numbers of two seeds would be errors that all beams of an image share but images do
+        not, which look like motion in image velocimetry.
         """
         return seed if self.common else seed + (scan << 16)
 

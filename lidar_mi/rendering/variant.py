@@ -46,7 +46,7 @@ cuda_ad_spectral
     except ImportError as error:
         reason = NO_CUDA if name.startswith("cuda") else str(error).strip().splitlines()[0]
         raise InputError(f"variant: {name} cannot run here: {reason}") from None
-    # Mitsuba's hint that a monochrome film is monochrome is of no use to anyone here
+    # hides Mitsuba's hint that a monochrome film is monochrome
     mi.set_log_level(mi.LogLevel.Error)
 
 
@@ -57,7 +57,7 @@ def has_cuda() -> bool:
     """
     import drjit as dr
 
-    # without Mitsuba, where there is none
+    # does not import Mitsuba where there is no GPU
     if not dr.has_backend(dr.JitBackend.CUDA):
         return False
     import mitsuba as mi

@@ -1,1 +1,1 @@
-"""The estimate: displacements between two images, and the wind they mean."""
+"""The estimate: displacements between two images, and the wind that follows."""

@@ -23,8 +23,8 @@ def checked_stack(
 ) -> tuple[list[xr.DataArray], float | xr.DataArray | None]:
     """All images, and the noise if it is an image, with these dims on one uniform grid.
 
-    Noise need not be known where image 1 is not finite either, as outside of the beams of a
-    resampled scan: it is the median there, and counts for nothing.
+    Where image 1 is not finite either, as outside of the beams of a resampled scan, unknown noise
+    is replaced by the median, which has no effect.
 
     Raises
     ------
@@ -35,8 +35,8 @@ def checked_stack(
     others = {f"{name}{n}": image for n, image in enumerate(stack[1:], 2)}
     if isinstance(noise, xr.DataArray):
         noise = others["noise"] = checked_image("noise", noise, axes)
-    for other, image in others.items():
-        same_grid(stack[0], image, other, f"{name}1")
+    for label, image in others.items():
+        same_grid(stack[0], image, label, f"{name}1")
     if isinstance(noise, xr.DataArray):
         unknown = np.isnan(noise) & ~np.isfinite(stack[0])
         if bool(unknown.any()):
@@ -49,12 +49,12 @@ def identical(
 ) -> str:
     """Which images, counted from a start, are the same as the one before, in words; empty: none.
 
-    Two exposures never are: there is one image where two were meant.
+    Two exposures never are: one image was given twice.
     """
     same = [
         f"{first} and {first + 1}"
-        for first, (one, other) in enumerate(pairwise(iter(images)), start)
-        if np.array_equal(np.asarray(one), np.asarray(other), equal_nan=True)
+        for first, (image, following) in enumerate(pairwise(iter(images)), start)
+        if np.array_equal(np.asarray(image), np.asarray(following), equal_nan=True)
     ]
     more = f" and {len(same) - 3} more pairs" if len(same) > 3 else ""
     return f"{name} {', '.join(same[:3])}{more} are the same, bit for bit" if same else ""
@@ -126,9 +126,9 @@ def same_grid(
         axes = " x ".join(map(str, image1.dims))
         raise InputError(f"{name}: sizes {sizes} {unit} ({axes}) differ; both must have one grid")
     for axis in image1.dims:
-        one, other = (i.coords.variables[axis].values.astype(float) for i in (image1, image2))
-        off = np.abs(one - other).max()
-        if off > 1e-3 * np.diff(one).mean():
+        nodes1, nodes2 = (i.coords.variables[axis].values.astype(float) for i in (image1, image2))
+        off = np.abs(nodes1 - nodes2).max()
+        if off > 1e-3 * np.diff(nodes1).mean():
             raise InputError(
                 f"{name}.{axis}: up to {off:g} m off {first}'s; resample both onto one grid"
             )

@@ -16,8 +16,8 @@ NAMES = ("v_common_stderr", "w_common_stderr")
 """Variables of a data set of vectors that state it, m/s."""
 ROTATION = "rotation_common_stderr"
 """The same of a rotation, rad/s, with the attributes `centre_y` and `centre_z`, m."""
-# Least fraction of a stated error that is the vector's own.
-_LEAST_OWN = 1e-3
+# Least fraction of a stated error that is independent of the other vectors'.
+_LEAST_INDEPENDENT = 1e-3
 
 
 def with_common_error(
@@ -58,7 +58,7 @@ def with_common_error(
     for name, value, units in (("stderr", stderr, "m/s"), ("rotation", rotation, "rad/s")):
         if not 0 <= value < np.inf:
             raise InputError(f"{name}: {value!r} {units} is not allowed; expected a number >= 0")
-    found = wind.copy()
+    widened = wind.copy()
     first, second = wind["v_stderr"], wind["w_stderr"]
     arms = [
         (wind[f"{axis}_vector"] if f"{axis}_vector" in wind else wind[axis]) - middle
@@ -66,38 +66,38 @@ def with_common_error(
     ]
     turned = {"v_stderr": -rotation * arms[1], "w_stderr": rotation * arms[0]}
     for name in turned:
-        both = _hypot(_hypot(wind[name], stderr), turned[name])
-        found[name] = _like(both, wind[name])
+        total = _hypot(_hypot(wind[name], stderr), turned[name])
+        widened[name] = _like(total, wind[name])
     for name in map(str, wind.data_vars):
         of_pair = name.endswith("_stderr") and _PER_ROTATION in wind[name].attrs
         if of_pair or name in _OF_A_PAIR:
             part = wind[name].attrs.get(_PER_ROTATION, 0.0) + _moved(name, centre)
             shared = stderr if name in _OF_A_PAIR else 0.0
-            both = _hypot(_hypot(wind[name], shared), rotation * part)
-            found[name] = _like(both, wind[name])
-    larger = found["v_stderr"] * found["w_stderr"]
+            total = _hypot(_hypot(wind[name], shared), rotation * part)
+            widened[name] = _like(total, wind[name])
+    larger = widened["v_stderr"] * widened["w_stderr"]
     product = wind["vw_correlation"] * first * second + turned["v_stderr"] * turned["w_stderr"]
     correlation = (product / larger.where(larger > 0)).where(larger != 0, 0.0)
-    found["vw_correlation"] = _like(correlation, wind["vw_correlation"])
+    widened["vw_correlation"] = _like(correlation, wind["vw_correlation"])
     for name in NAMES:
         about = {"long_name": f"part of {name[0]}_stderr that all vectors share", "units": "m s-1"}
-        found[name] = (), float(stderr), about
+        widened[name] = (), float(stderr), about
     turning: dict[str, str | float] = {
         "long_name": "part of v_stderr and w_stderr that is a rotation of all vectors",
         "units": "rad s-1",
         "centre_y": float(centre[0]),
         "centre_z": float(centre[1]),
     }
-    found[ROTATION] = (), float(rotation), turning
-    return found.assign_attrs(pointing_offset=str(offset))
+    widened[ROTATION] = (), float(rotation), turning
+    return widened.assign_attrs(pointing_offset=str(offset))
 
 
-def _hypot(one: xr.DataArray, other: xr.DataArray | float) -> xr.DataArray:
-    return xr.apply_ufunc(np.hypot, one, other)
+def _hypot(a: xr.DataArray, b: xr.DataArray | float) -> xr.DataArray:
+    return xr.apply_ufunc(np.hypot, a, b)
 
 
 def _like(values: xr.DataArray, like: xr.DataArray) -> xr.DataArray:
-    """In the type, the order of dims and with the attributes of another field."""
+    """Values with the type, order of dims and attributes of another field."""
     return values.transpose(*like.dims).astype(like.dtype).assign_attrs(like.attrs)
 
 
@@ -133,7 +133,7 @@ def own_errors(
     if not common.any():
         return stderr, correlation
     part = np.reshape(common, (2, *[1] * (stderr.ndim - 1)))
-    own = np.sqrt(np.maximum(stderr**2 - part**2, (_LEAST_OWN * stderr) ** 2))
+    independent = np.sqrt(np.maximum(stderr**2 - part**2, (_LEAST_INDEPENDENT * stderr) ** 2))
     with np.errstate(invalid="ignore", divide="ignore"):
-        scaled = correlation * stderr.prod(0) / own.prod(0)
-    return own, np.clip(scaled, -0.999, 0.999)
+        scaled = correlation * stderr.prod(0) / independent.prod(0)
+    return independent, np.clip(scaled, -0.999, 0.999)

@@ -1,4 +1,4 @@
-"""Where a retrieval computes, and what it does where the memory there is full."""
+"""Device of a retrieval, and smaller tiles where its memory is full."""
 
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -35,7 +35,7 @@ def divisor() -> int:
 
 
 def within_memory(compute: Callable[[], T]) -> T:
-    """What a function returns; where the device's memory is full, again with smaller tiles.
+    """Result of a function, repeated with smaller tiles where the device's memory is full.
 
     Raises
     ------

@@ -12,10 +12,10 @@ def most_likely(
     terms: np.ndarray,
     limits: np.ndarray,
     number: np.ndarray | float,
-    held: np.ndarray | float = 0.0,
+    fixed: np.ndarray | float = 0.0,
     floor: float = 1e-9,
 ) -> tuple[float, np.ndarray]:
-    """Factors a, from 0 to their limits, of variances `held` + sum a_k terms_k of mean squares.
+    """Factors a, from 0 to their limits, of variances `fixed` + sum a_k terms_k of mean squares.
 
     A mean square of n normal numbers has a gamma distribution: its negative log-likelihood is
     n / 2 (r - 1 - ln r), with r the square over its variance, but for a constant. Least squares
@@ -32,7 +32,7 @@ def most_likely(
         Above 0; may be infinite.
     number : np.ndarray or float
         n / 2, of each square or of all: of complex numbers, how many.
-    held : np.ndarray or float
+    fixed : np.ndarray or float
         Variance that is known.
     floor : float
         Least square and least variance, over the mean of the squares.
@@ -44,10 +44,10 @@ def most_likely(
     factors : np.ndarray, shape (terms,)
     """
     mean = squares.mean()
-    # terms of one size, as the solver wants them
+    # terms scaled to one size for the solver
     sizes = np.maximum(terms.mean(1), np.finfo(float).tiny)
     scaled, most = terms / sizes[:, None], limits * (sizes / mean)
-    observed, known = np.maximum(squares / mean, floor), held / mean
+    observed, known = np.maximum(squares / mean, floor), fixed / mean
 
     def variances(factors: np.ndarray) -> np.ndarray:
         return np.maximum(factors @ scaled + known, floor)
@@ -60,11 +60,11 @@ def most_likely(
     reached = misfit(factors)
     for _ in range(_ROUNDS):
         weight = np.sqrt(number) / variances(factors)
-        wanted = np.maximum(observed - known, 0.0) * weight
+        wanted = (observed - known) * weight
         step = lsq_linear((scaled * weight).T, wanted, (0.0, most), method="bvls").x - factors
-        # a whole step can go too far, to variances of nearly nothing
+        # a full step may overshoot, to variances near 0
         tried = [factors + 0.5**n * step for n in range(_HALVINGS)]
-        after = [misfit(one) for one in tried]
+        after = [misfit(trial) for trial in tried]
         best = int(np.argmin(after))
         if after[best] >= reached - _CONVERGED:
             break

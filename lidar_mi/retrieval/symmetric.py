@@ -27,5 +27,5 @@ def largest_eigenvalue(matrices: torch.Tensor) -> torch.Tensor:
     if matrices.shape[-1] == 2:
         return eigenvalues(matrices[..., 0, 0], matrices[..., 1, 0], matrices[..., 1, 1])[1]
     flat = matrices.flatten(0, -3) if matrices.ndim > 2 else matrices[None]
-    found = torch.cat([torch.linalg.eigvalsh(part)[:, -1] for part in flat.split(MOST)])
-    return found.reshape(matrices.shape[:-2])
+    largest = torch.cat([torch.linalg.eigvalsh(part)[:, -1] for part in flat.split(MOST)])
+    return largest.reshape(matrices.shape[:-2])

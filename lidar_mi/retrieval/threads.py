@@ -57,17 +57,17 @@ def mapped(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> list
 def in_turn(
     function: Callable[[_Part], _Result], parts: Iterable[_Part]
 ) -> Generator[_Result, None, None]:
-    """What `mapped` returns, in the parts' order, each as soon as it is there."""
+    """Results of the parts in their order, each as soon as it is computed."""
     parts = list(parts)
     before = torch.get_num_threads()
     number = min(len(parts), _AVAILABLE.get() or before)
     if number < 2:
         yield from map(function, parts)
         return
-    # modes are of a thread
-    alike = torch.inference_mode(torch.is_inference_mode_enabled())(function)
+    # inference mode is local to a thread
+    in_mode = torch.inference_mode(torch.is_inference_mode_enabled())(function)
     try:
         with ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            yield from pool.map(alike, parts)
+            yield from pool.map(in_mode, parts)
     finally:
         torch.set_num_threads(before)

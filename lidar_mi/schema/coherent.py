@@ -115,7 +115,7 @@ class CoherentScan(Section):
 
     @property
     def duration(self) -> float:
-        """Of one scan, s."""
+        """Duration of one scan, s."""
         if self.kind == "dbs":
             return 5 * (self.accumulation + self.move)
         if self.kind == "stare":

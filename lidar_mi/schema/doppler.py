@@ -117,7 +117,7 @@ class Doppler(Section):
         try:
             number = to_si(value, "", "350")
         except ValueError:
-            # in no range: both faults have one message
+            # without a range: both faults have one message
             number = math.nan
         if not _MODES.holds(number):
             raise ValueError(f"{value!r} is not allowed; expected derived or {_MODES.words()}")

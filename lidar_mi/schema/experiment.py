@@ -37,7 +37,7 @@ NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
 
 
 def _kind_of(doppler: object) -> str:
-    """Of a Doppler lidar; an unknown one is the fault of the section of the default kind."""
+    """The kind of a Doppler lidar; the section of the default kind refuses an unknown one."""
     kind = doppler.get("kind") if isinstance(doppler, dict) else getattr(doppler, "kind", None)
     return "coherent" if kind == "coherent" else "fringes"
 

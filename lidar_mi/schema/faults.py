@@ -1,4 +1,4 @@
-"""Faults that pydantic finds in a description, in words of who wrote it."""
+"""Faults that pydantic finds in a description, in the terms of its author."""
 
 import difflib
 import enum
@@ -12,7 +12,7 @@ from lidar_mi.schema.section import section_in, tagged_section
 from lidar_mi.units import Unit, Within, to_si
 
 A_NAME = "at most 100 letters, digits, _, . and -, a letter or digit first"
-"""What the only pattern allows, that of names."""
+"""The names that the pattern allows."""
 
 
 def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
@@ -54,7 +54,7 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     text = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
     if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
         if unit and not isinstance(value, float):
-            # as it was understood, with its unit
+            # the interpreted value, with its unit
             text = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
         expected = word + within.words(symbol)
         if symbol == "rad" and isinstance(value, str):
@@ -86,7 +86,7 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
 def _steps(
     model: type[BaseModel], location: tuple[int | str, ...]
 ) -> Iterator[tuple[int | str, Any, Any, bool]]:
-    """Of each part of a location: it, the field and the section there, whether it is a tag."""
+    """Each part of a location, with its field and section, and whether it is a tag."""
     field: Any = None
     section: Any = model
     for part in location:
@@ -110,7 +110,7 @@ def _key(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
 
 
 def _metadata_at(model: type[BaseModel], location: tuple[int | str, ...], kind: type) -> Any:
-    """The part of a kind in the annotation of the key at a location; None if there is none."""
+    """Metadata of a type in the annotation of the key at a location; None without any."""
     field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     pending = [field.annotation, *field.metadata] if field else []
     while pending:
@@ -132,7 +132,7 @@ def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:
 
 
 def _words_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The words that members of the list at a location may be; empty: others than words."""
+    """The words allowed in the list at a location; empty: its members are no words."""
     field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
     members = get_args(field.annotation) if field else ()
     kind = members[0] if members else None

@@ -1,6 +1,6 @@
 """The keys of an experiment file in words: what each does, its unit, its default, what is allowed.
 
-All of it is read from the descriptions, which check a file by it.
+It is read from the models that check a file.
 """
 
 import difflib
@@ -32,7 +32,7 @@ OF_A_FILE = {
     "keys are merged over those of the base, and null removes a section",
     "variants": "several experiments in one file: names, each with the keys that it changes",
 }
-"""Keys of a file that are none of an experiment."""
+"""Keys of a file that are not keys of an experiment."""
 
 _MOST_SUGGESTED = 4
 
@@ -50,7 +50,7 @@ class Key:
     words: tuple[str, ...]
     """Values that are words, if it takes any."""
     more: tuple[str, ...]
-    """Paragraphs of its section about it; of a section, all of its own."""
+    """Paragraphs of its section about it; for a section, all of them."""
     keys: tuple[str, ...]
     """Names of the keys of a section."""
     listed_in: str
@@ -81,9 +81,12 @@ def names() -> list[str]:
 
 
 def settable() -> list[str]:
-    """Those that ``--set`` can change one at a time: no sections, nor keys of lists of sections."""
-    fields = _fields()
-    return [name for name, (_, field, within) in fields.items() if not within and _is_leaf(field)]
+    """Keys that ``--set`` can change: no sections, nor keys of lists of sections."""
+    return [
+        name
+        for name, (_, field, within) in _fields().items()
+        if not within and section_in(field.annotation) is None
+    ]
 
 
 def explain(name: str) -> Key:
@@ -152,7 +155,7 @@ class Kind:
 
 
 def kinds(name: str) -> tuple[Kind, ...]:
-    """Those of a section; none: it has no key ``kind`` that chooses its keys."""
+    """The kinds of a section; none: it has no key ``kind`` that chooses its keys."""
     annotation = _fields()[name][1].annotation
     if f"{name}.kind" not in _fields():
         return ()
@@ -196,25 +199,21 @@ def _is_list(field: FieldInfo) -> bool:
     )
 
 
-def _is_leaf(field: FieldInfo) -> bool:
-    return section_in(field.annotation) is None
-
-
 def _nearest(name: str, fields: Mapping[str, object]) -> list[str]:
-    """Keys that end with these levels, that begin so, or the one that is written most alike."""
+    """Keys that end with these levels or begin with them, or the most similar one."""
     ends = [key for key in fields if key.endswith(f".{name}")]
     ends = ends or [key for key in fields if key.startswith(name)]
     return ends[:_MOST_SUGGESTED] or difflib.get_close_matches(name, [*fields, *OF_A_FILE], 1)
 
 
 def _paragraphs(model: type[BaseModel]) -> tuple[str, ...]:
-    """Those of a section's documentation, each as one line."""
+    """Paragraphs of a section's documentation, each as one line."""
     text = inspect.cleandoc(model.__doc__ or "")
     return tuple(" ".join(part.replace("``", "`").split()) for part in text.split("\n\n"))
 
 
 def _first(field: FieldInfo, kind: type) -> Any:
-    """The first part of a kind in the annotation of a key; None if there is none."""
+    """Metadata of a type in the annotation of a key; None without any."""
     pending = [*field.metadata, field.annotation]
     while pending:
         part = pending.pop(0)
@@ -237,7 +236,7 @@ def _as_in_a_file(value: Any, symbol: str) -> str:
 
 
 def _words(annotation: Any) -> Iterator[str]:
-    """Words that a key may have as its value, those in lists aside."""
+    """Words allowed as the value of a key, except those in lists."""
     if get_origin(annotation) is Literal:
         yield from (str(word) for word in get_args(annotation))
     elif annotation is bool:
@@ -282,7 +281,7 @@ def _allowed(annotation: Any, metadata: Any, symbol: str) -> list[str]:
 
 
 def _list_of(parts: tuple[Any, ...], symbol: str) -> str:
-    """A list of any length, or of as many values as it has parts."""
+    """A list of any length, or with one value for each of its parts."""
     each = ", ".join(_allowed(parts[0], (), symbol))
     if Ellipsis in parts:
         return f"a list of {each}" if section_in(parts[0]) is None else "a list of sections"

@@ -41,7 +41,7 @@ def new_file(name: str, shipped: str, path: Path, command: str) -> str:
         YAML, with a comment on every key and the names of the keys that a section has besides.
     """
     data = read_keys(path) | {"name": name}
-    # the paper's air is that of the shipped experiments; one's own is real
+    # shipped experiments have the paper's air; a user's has molecules
     real = data.get("wake", {}).get("extinction", {}).get("molecules") == 0
     if real:
         data["wake"]["extinction"]["molecules"] = "auto"

@@ -76,7 +76,7 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
         raise InputError(f"variant: {variant!r} is not allowed; expected {expected}")
     experiment = variants[str(variant)] if variants else load(path)
     if changes:
-        # keys that the file does not have stay defaults: checks tell them from chosen ones
+        # keys that the file lacks remain defaults: checks distinguish them from set ones
         data = settings(experiment) if variants else read_keys(path)
         for key, value in changes.items():
             # a.b: x is {a: {b: x}}, built from the inside
@@ -166,12 +166,12 @@ def merged(data: Any, changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_keys(path: str | Path) -> dict[str, Any]:
-    """The keys of an experiment file as they stand, over those of its ``base`` if it has one."""
+    """The keys of an experiment file, merged into those of its ``base`` if it has one."""
     return _read_keys(Path(path), ())
 
 
 def _read_keys(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
-    """The same of a file that those ``above`` are based on."""
+    """`read_keys` of a file that those ``above`` are based on."""
     if path.suffix == ".xml":
         raise InputError(
             f"{path}: a Mitsuba scene, not an experiment; expected lidar-mi render {path}"
@@ -248,12 +248,12 @@ def in_si(data: dict[str, Any]) -> dict[str, Any]:
 
 @functools.lru_cache(64)
 def _in_si(text: str) -> dict[str, Any]:
-    """The same of their JSON: a run asks once for each of its stages."""
-    # text, as dictionaries are no keys of a cache
+    """`in_si` of the JSON, cached: every stage of a run needs it."""
+    # as text, since a cache has no dictionaries as keys
     data = json.loads(text)
     try:
         return settings(check(data, ""), si=True)
-    except InputError:  # of a version that knew other keys
+    except InputError:  # of a version with other keys
         return data
 
 

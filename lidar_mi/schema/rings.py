@@ -54,7 +54,7 @@ class Reference(Section):
 
 
 class Assumed(Section):
-    """What the retrieval takes for the instrument's, where that is not the true value."""
+    """Values that the retrieval assumes for the instrument in place of the true ones."""
 
     focal_length: Annotated[Length, Within(0.001, 100, "as of the camera")] | None = Field(
         None, description="taken by the retrieval in place of the true one; default: the true one"

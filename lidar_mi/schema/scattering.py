@@ -34,7 +34,7 @@ class _Scatterer(Section):
     )
 
     @model_validator(mode="after")
-    def _named_what_it_needs(self: Any) -> Any:  # kinds of scatterers have a phase
+    def _check_phase(self: Any) -> Any:  # kinds of scatterers have a phase
         for name in ("table", "aerosol"):
             value = getattr(self, name)
             if (self.phase == name) != (value is not None):

@@ -1,4 +1,4 @@
-"""What the sections of an experiment file have in common."""
+"""Common properties of the sections of an experiment file."""
 
 from collections.abc import Iterator
 from typing import Any, get_args
@@ -24,12 +24,12 @@ def sections_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def section_in(annotation: Any) -> type[BaseModel] | None:
-    """The first of them; None: there is none."""
+    """The first section in an annotation; None: there is none."""
     return next(sections_in(annotation), None)
 
 
 def tagged_section(annotation: Any, tag: object) -> type[BaseModel] | None:
-    """That of a kind, by its tag in a discriminated union; None: there is none."""
+    """The section of a kind, by its tag in a discriminated union; None: there is none."""
     if any(isinstance(part, Tag) and part.tag == tag for part in get_args(annotation)):
         return section_in(annotation)
     sections = (tagged_section(part, tag) for part in get_args(annotation))

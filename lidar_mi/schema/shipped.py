@@ -12,7 +12,7 @@ from lidar_mi.io.yaml import read_yaml
 
 
 class _Kind(NamedTuple):
-    """What a file is called, and where those of the package are."""
+    """Name of a kind of file, and its folder in the package."""
 
     called: str
     folder: str
@@ -38,7 +38,7 @@ def experiments() -> list[str]:
 
 
 def flights() -> list[str]:
-    """Those of `experiments` that are flights: with the section ``encounter``, or on such a one."""
+    """The `experiments` that are flights: with the section ``encounter``, or based on a flight."""
     names: set[str] = set()
     data_of = {
         name: read_yaml(_folder(_EXPERIMENT) / f"{name}.yaml", "an experiment")
@@ -126,7 +126,7 @@ def experiment_file(name: str | Path) -> Path:
 
 
 def campaign_file(name: str | Path) -> Path:
-    """The same of a campaign, or of an experiment, whose variants are one.
+    """As `experiment_file`, for a campaign, or for an experiment with variants.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def _shipped_of(name: str | Path, kinds: Sequence[_Kind]) -> Path:
     )
     hint = f"did you mean {close[0]}? Expected" if close else "expected"
     names = ", ".join(_names(kinds[0]))
-    # those of the package have no files of one's own beside them
+    # instruments are only those of the package
     if kinds == [_INSTRUMENT]:
         raise InputError(f"{name}: no such instrument; {hint} one of {names}")
     raise InputError(f"{name}: no such file; {hint} {kinds[0].called} or one of {names}")

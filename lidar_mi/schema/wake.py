@@ -61,7 +61,7 @@ class VortexPair(Section):
 
     @field_validator("aircraft")
     @classmethod
-    def _known(cls, value: str | None) -> str | None:
+    def _check_aircraft(cls, value: str | None) -> str | None:
         if value is not None and value not in TYPES:
             raise ValueError(f"{value!r} is not allowed; expected one of {', '.join(TYPES)}")
         return value
@@ -70,7 +70,7 @@ class VortexPair(Section):
     def _of_the_aircraft(self) -> Self:
         if self.aircraft is None:
             for name in ("mass", "speed", "altitude"):
-                # a description that was saved has all defaults
+                # a saved description has all defaults
                 if getattr(self, name) != type(self).model_fields[name].default:
                     raise ValueError(f"{name}: not allowed without aircraft")
             return self

@@ -1,6 +1,6 @@
-"""What this machine can run, and what to type where it cannot.
+"""What this machine can run, and the commands that repair the rest.
 
-Everything that could crash, hang or take an abort from LLVM is tried in a process of its own.
+Whatever could crash, hang or be aborted by LLVM is tried in a separate process.
 """
 
 import os
@@ -31,7 +31,7 @@ LLVM_VARIANTS = (
 CUDA_VARIANT = "cuda_ad_mono_polarized"
 DEFAULT_VARIANT = "llvm_ad_mono_polarized"
 
-MEMORY_NEEDED = 2 * GIB  # a full scan with all its kernels stays below
+MEMORY_NEEDED = 2 * GIB  # more than a full scan with all its kernels needs
 DISK_NEEDED = 1 * GIB
 
 # Random numbers, a recorded loop and a scatter with a known sum, then a render: the first shows
@@ -110,7 +110,7 @@ class Check:
 
 @dataclass(frozen=True, repr=False)
 class Checkup(Tabular):
-    """What was found on this machine."""
+    """The checks of this machine."""
 
     checks: tuple[Check, ...]
 
@@ -159,7 +159,8 @@ def doctor() -> Checkup:
     checks = [_check_python(), *_check_dependencies(), _check_llvm()]
     with ThreadPoolExecutor(max_workers=_cores()) as pool:
         checks += pool.map(lambda trial: trial(), trials)
-    checks += [_check_cores(), _check_memory(), _check_disk(), _check_exr_tools()]
+    checks.append(Check("cores", True, f"{_cores()} usable of {os.cpu_count()}"))
+    checks += [_check_memory(), _check_disk(), _check_exr_tools()]
     return Checkup(tuple(checks))
 
 
@@ -178,7 +179,7 @@ def _check_dependencies() -> list[Check]:
     try:
         lines = metadata.requires("lidar-mi") or []
     except metadata.PackageNotFoundError:
-        return []  # the line about Python has said so
+        return []  # the line about Python states it
     requirements = [Requirement(line) for line in lines]
     return [_check_dependency(r) for r in requirements if r.marker is None or r.marker.evaluate()]
 
@@ -232,7 +233,7 @@ def _install_command() -> str:
 
 
 def _attempt(code: str, *arguments: str, timeout: float = 180.0) -> tuple[bool, str]:
-    """Run code in a fresh interpreter: whether it succeeded, and the last line it said."""
+    """Run code in a fresh interpreter: whether it succeeded, and its last line."""
     # -P: a file named like a module in the working folder must not be imported instead of it.
     command = [sys.executable, "-P", "-c", code, *arguments]
     try:
@@ -310,10 +311,6 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _check_cores() -> Check:
-    return Check("cores", True, f"{_cores()} usable of {os.cpu_count()}")
 
 
 def _check_memory() -> Check:

@@ -126,7 +126,7 @@ def check_llvm(
 
     The library is opened and asked for its version, so a file whose name lies is found out.
     """
-    choice = select_llvm(folders, dict(environ))  # a copy: judging changes nothing
+    choice = select_llvm(folders, dict(environ))  # a copy: the check changes nothing
     if not choice:
         return None
     if choice == NOT_FOUND:

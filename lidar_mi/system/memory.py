@@ -1,4 +1,4 @@
-"""The machine's memory, as far as a process may have it."""
+"""The memory that a process of this machine may have."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ from pathlib import Path
 
 GIB = 1 << 30
 UNKNOWN_GPU = 2 * GIB
-"""Bytes that a GPU is taken to have free where nothing says how many."""
+"""Free bytes assumed for a GPU where they are unknown."""
 
 
 def machine_memory() -> int:
@@ -25,7 +25,7 @@ def available_memory() -> int:
 def gpu_memory() -> int:
     """Bytes that are free on the GPU that renders: by the driver's tool, or else by torch.
 
-    Where neither says it, `UNKNOWN_GPU`.
+    If neither states it, `UNKNOWN_GPU`.
     """
     device = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0] or "0"
     query = ["nvidia-smi", "-i", device, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]

@@ -1,8 +1,8 @@
-"""Plugins that are there as soon as Mitsuba is, without loading it for those who do not need it.
+"""Registers the plugins when Mitsuba is imported, without importing it.
 
 ``import lidar_mi`` and ``import mitsuba``, in either order, are enough for scenes that name the
 plugins. Mitsuba 3.10 and later do the same by entry points, without this module. A CUDA variant
-that cannot be had says why, whoever asks for it.
+that cannot run raises an error with the reason.
 """
 
 import importlib
@@ -43,7 +43,7 @@ class _Finder:
             self.searching = False
         if spec is None or spec.loader is None:
             return spec
-        loader: Any = spec.loader  # whose methods are replaced, of this instance alone
+        loader: Any = spec.loader  # methods of this instance alone are replaced
         if name == _MITSUBA:
             loader.exec_module = _with_plugins(loader.exec_module)
         else:

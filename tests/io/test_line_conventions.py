@@ -9,7 +9,8 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
-from lidar_mi.io.lines_of_sight.flags import LineFlag, repeated
+from lidar_mi.flags import LineFlag
+from lidar_mi.io.lines_of_sight.flags import repeated
 from lidar_mi.io.lines_of_sight.scan import toward_in_words
 
 RANGES = 105 + 30.0 * np.arange(26)

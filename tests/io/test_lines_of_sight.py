@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 import lidar_mi as lm
 from lidar_mi.experiment.describe import sections
+from lidar_mi.flags import LineFlag
 from lidar_mi.io.lines_of_sight.dataset import scan_kind
-from lidar_mi.io.lines_of_sight.flags import LineFlag
 from lidar_mi.io.netcdf import write_netcdf
 from tests.support import line_files as made
 

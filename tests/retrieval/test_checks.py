@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.checks import checked_stack, identical
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.series import retrieve_winds
 from tests.support.flows import data_array

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 from tests.support.experiments import as_seen, blob, check, small, without_figures, write_wake
 
 

@@ -15,7 +15,9 @@ from typing import Literal
 from zlib import crc32
 
 import numpy as np
+import xarray as xr
 from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortices.vortex import Model, Vortex, velocity, vortex_pair
@@ -32,6 +34,9 @@ WIDTH, HEIGHT = 109.0, 69.0
 
 VOLUME = Path(str(files("lidar_mi.scenes"))) / "wake_volume_40s.nc"
 """The simulated wake: 20 planes 1 m apart, of which the shipped experiments show x = 20.5 m."""
+
+WAKES = Path(__file__).parent / "wakes"
+"""Planes of other simulated wakes, each with the parameters of its simulation."""
 
 
 @dataclass(frozen=True)
@@ -231,6 +236,43 @@ def box(low: float, high: float) -> Draw:
     return draw
 
 
+@cache
+def _wake(name: str) -> xr.Dataset:
+    return xr.load_dataset(WAKES / f"{name}.nc")
+
+
+def wake(name: str) -> Draw:
+    """A plane of another simulated wake, mirrored or upside down or not.
+
+    The pair's middle is within 8 m of the image's. The wind is the cubic spline through the nodes,
+    and periodic as the simulation is. Planes are 5 to 6 m apart.
+    """
+
+    def draw(random):
+        planes = _wake(name)
+        plane = planes.isel(x=int(random.integers(planes.sizes["x"])))
+        first = [float(plane[axis][0]) for axis in "yz"]
+        step = float(plane["y"][1] - plane["y"][0])
+        splines = [
+            spline_filter(plane[component].values, 3, mode="grid-wrap") for component in "vw"
+        ]
+        signs, middle = random.choice([-1.0, 1.0], 2), random.uniform(-8, 8, 2)
+
+        def wind(y, z):
+            nodes = [
+                (sign * (np.asarray(a, float) - a0) - start) / step
+                for sign, a, a0, start in zip(signs, (y, z), middle, first, strict=True)
+            ]
+            return tuple(
+                sign * map_coordinates(spline, nodes, mode="grid-wrap", prefilter=False)
+                for sign, spline in zip(signs, splines, strict=True)
+            )
+
+        return wind
+
+    return draw
+
+
 def turbine(random) -> Wind:
     """Swirl and turbulence 2.5 to 4 diameters behind a rotor, its axis within 8 m of the middle."""
     diameter = random.uniform(45, 65)
@@ -397,6 +439,12 @@ FAMILIES = (
         box(25, 30),
     ),
     Family("turbine", "swirl and turbulence behind a rotor, 9 to 14 m/s", "judge", turbine),
+    Family(
+        "wake of a light aircraft, strong turbulence",
+        "large eddy simulation, 20 m apart, 10 s old",
+        "build",
+        wake("light_strong_turbulence"),
+    ),
 )
 
 BY_NAME = {family.name: family for family in FAMILIES}

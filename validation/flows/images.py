@@ -90,6 +90,7 @@ TEXTURED = (
     "planar turbulence 40 to 3 m",
     "jet",
     "simulated wake, x = 25 to 30 m",
+    "wake of a light aircraft, strong turbulence",
 )
 """Families that are seen with all textures."""
 

@@ -1,7 +1,4 @@
-"""What a figure shows, in words and numbers, read off the figure: the text for who does not see it.
-
-Being read off what was drawn, it cannot speak of another figure.
-"""
+"""Alternative text of a figure, read off what was drawn: panels, ranges, largest values."""
 
 import re
 from collections.abc import Iterator
@@ -17,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.quiver import Quiver
 
 TRUE_CORE = "true core"
-"""What labels of markers of true vortices begin with."""
+"""Prefix of the labels of true vortices."""
 
 _MOST_LINES = 8
 

@@ -161,9 +161,9 @@ def draw_all(
 
 
 def _with_valid(winds: xr.Dataset, *sources: str) -> tuple[list[str], str]:
-    """Methods with a valid vector from each source, and what to say of the others.
+    """Methods with a valid vector from each source, and a sentence on the others.
 
-    Without a valid vector there is nothing to see: the others are random numbers.
+    Vectors of a method without a valid one are random numbers.
     """
     valid = (winds["flag"].sel(source=list(sources)) == 0).any(("z", "y")).all("source")
     methods = [str(name) for name in winds["algorithm"].values]
@@ -188,7 +188,7 @@ def _arrows(axes: Axes, wind: xr.Dataset, cores: Sequence[Core], title: str, sca
     }
     flagged, valid = retrieved & (flag != 0), retrieved & (flag == 0)
     if flagged.any():
-        # no longer than arrows are apart: noise is not as vivid as wind
+        # no longer than the spacing of the arrows, as most of it is noise
         most = scale.limit / scale.length
         shorter = most / np.maximum(np.hypot(v, w)[flagged], most)
         clipped = v[flagged] * shorter, w[flagged] * shorter
@@ -243,7 +243,7 @@ def overview(
 
 
 def _crosses(cores: Sequence[Core]) -> str:
-    """What of the caption speaks of the vortices, where there are any."""
+    """The part of the caption about the vortices; empty without any."""
     return ", red crosses mark the true cores" if cores else ""
 
 
@@ -333,7 +333,7 @@ def _deviation_maps(winds: xr.Dataset, source: str, reference: str | None) -> Ca
         error = deviations(wind, compared).where((wind["flag"] == 0) & (compared["flag"] == 0))
         limit = _upper(abs(error["speed"]), 0.99) or 1.0
         for axis in row:
-            # shows where there is no vector
+            # visible where there is no vector
             axis.set_facecolor("0.7")
         image_panel(
             row[0],

@@ -25,7 +25,7 @@ from lidar_mi.assessment.metrics.sensitivity import SobolIndices
 
 FAILED, ABSENT, DOT = "#a4161a", "#e4e4e4", "#3b6ea5"
 _FEW = 6
-"""Up to so many values along an axis each has its tick, and every cell its number."""
+"""Most values of an axis with a tick each, and numbers in the cells."""
 COLOURS = ("#1f5fa8", "#c2571a", "#2c7a3f", "#8a3a8f", "#7a6200", "#4a4a4a", "#b0306a", "#0d7f86")
 
 
@@ -70,7 +70,7 @@ def colour_scale(values: xr.DataArray) -> Normalize:
 
 
 Limits = Mapping[str, xr.DataArray]
-"""What is not negative where a limit is met, over the knobs, by what the limit is called."""
+"""Margins over the knobs, by the name of the limit; negative where it is not met."""
 
 
 def draw_map(
@@ -200,8 +200,8 @@ def draw_margins(
     marks = []
     for k, value in enumerate(worst):
         finite = np.isfinite(value)
-        lost = "failed" if bool(points.failed.values[k]) else "no value"
-        text = f"smallest margin {100 * value:+.0f} %" if finite else lost
+        missing = "failed" if bool(points.failed.values[k]) else "no value"
+        text = f"smallest margin {100 * value:+.0f} %" if finite else missing
         colour = (MET if value >= 0 else UNMET) if finite else ABSENT
         marks.append(_dot(across[k], up[k], text, colour, points, k))
     _scale(axes, x, y)
@@ -286,11 +286,11 @@ def draw_scatter(
             colour = COLOURS[1] if front is not None and front[k] else DOT
             marks.append(_dot(across[k], up[k], f"{y.label}: {three(up[k])}", colour, points, k))
         elif np.isfinite(across[k]):
-            lost = bool(points.failed.values[k])
-            text = "failed" if lost else f"{y.label}: no value"
-            if lost:
+            failed = bool(points.failed.values[k])
+            text = "failed" if failed else f"{y.label}: no value"
+            if failed:
                 axes.plot(across[k], low, "x", color=FAILED, ms=6, clip_on=False)
-            marks.append(_dot(across[k], low, text, FAILED if lost else ABSENT, points, k))
+            marks.append(_dot(across[k], low, text, FAILED if failed else ABSENT, points, k))
     if line is not None:
         chosen = np.flatnonzero(line)
         order = chosen[np.argsort(across[chosen])]

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, save_all
 from lidar_mi.assessment.metrics.coherent import PUBLISHED, vortex_errors
 
-_SHOWN = 3  # slices
-_ASIDE = 110.0  # m about the vortices
+_MOST_SLICES = 3  # slices
+_MARGIN = 110.0  # m about the vortices
 _TRUE, _FOUND = "k", "tab:green"
 _SIDES = (("v", "nearer vortex"), ("^", "farther vortex"))
 
@@ -53,10 +53,10 @@ def _slices(lines: xr.Dataset, vortices: xr.Dataset) -> Captioned:
     sweeps = np.unique(lines["sweep"])
     usable = np.flatnonzero(vortices["flag"].values == 0)
     usable = usable if usable.size else np.arange(sweeps.size)
-    chosen = usable[np.unique(np.linspace(0, usable.size - 1, _SHOWN).round().astype(int))]
+    chosen = usable[np.unique(np.linspace(0, usable.size - 1, _MOST_SLICES).round().astype(int))]
     places = vortices.isel(scan=chosen)
-    left, right = float(places["y_true"].min()) - _ASIDE, float(places["y_true"].max()) + _ASIDE
-    top = float(places["z_true"].max()) + 0.6 * _ASIDE
+    left, right = float(places["y_true"].min()) - _MARGIN, float(places["y_true"].max()) + _MARGIN
+    top = float(places["z_true"].max()) + 0.6 * _MARGIN
     # panels are 5.7 inches wide and true to scale
     height = 5.7 * top / (right - left) + 0.5
     figure = Figure(figsize=(13, height * len(chosen) + 0.4), layout="constrained")

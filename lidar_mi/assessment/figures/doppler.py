@@ -65,7 +65,7 @@ def draw_all(
         Images of the laser and of the air at the first speed, without and with noise.
     samples : xr.Dataset or None
         Image of the laser's light, traced path by path.
-    found, metrics
+    velocities, metrics
         From `lidar_mi.experiment.stages.ring_velocities.velocities`,
         `lidar_mi.assessment.metrics.velocities`.
     """
@@ -97,8 +97,8 @@ def _rings(doppler: Doppler, exposure: RingImages, samples: xr.Dataset | None) -
     images = [(exposure.noisy, f"one pulse, air at {doppler.v_los[0]:g} m/s", "photoelectrons")]
     if samples is not None:
         # every path has the same energy
-        hits = samples["S0"].values * samples["S0"].size * samples.attrs["samples_per_pixel"]
-        images.append((hits, "the laser's light, traced path by path through a lens", "samples"))
+        counts = samples["S0"].values * samples["S0"].size * samples.attrs["samples_per_pixel"]
+        images.append((counts, "the laser's light, traced path by path through a lens", "samples"))
     # the last panel holds profiles
     for axis, (image, title, label) in zip(axes, images, strict=False):
         # single noisy pixels must not determine the scale

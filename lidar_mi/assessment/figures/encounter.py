@@ -305,7 +305,7 @@ def _track(track: xr.Dataset) -> Captioned:
     for row, (name, label) in zip(panels, _ROWS, strict=True):
         for axes, (side, colour) in zip(row, SIDES.items(), strict=True):
             key = f"{side}_{name}"
-            # along the path places change by far more than they are wrong
+            # along the path, places change by far more than their errors
             zero = truth[key].values if name in "yz" else 0.0
             spread = TWO_SIGMA * tracked[f"{key}_stderr"].values
             middle, single = tracked[key].values - zero, estimate[key].values - zero
@@ -352,8 +352,8 @@ def _fit_limits(axes: Axes, truth: np.ndarray, estimates: np.ndarray, spread: np
     inside = np.isfinite(estimates)
     values = np.concatenate([truth[inside], estimates[inside]]) if inside.any() else truth
     # the band of a track that begins is many times as wide as later
-    wide = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
-    margin = max(0.3 * float(np.ptp(values)), 2 * wide, 0.05)
+    band = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
+    margin = max(0.3 * float(np.ptp(values)), 2 * band, 0.05)
     if np.isfinite([values.min(), values.max(), margin]).all():
         axes.set_ylim(values.min() - margin, values.max() + margin)
 

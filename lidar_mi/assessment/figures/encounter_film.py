@@ -1,6 +1,7 @@
 """The flight as a film in real time: the last slab delivered, the wings, where the aircraft is.
 
-States are interpolated from frame to frame. What rests is drawn once, what moves on top of it.
+States are interpolated from frame to frame. The background is drawn once, moving parts on top of
+it.
 """
 
 from collections.abc import Iterator
@@ -22,12 +23,12 @@ RATE = 25
 """Frames per second of flight and of film."""
 
 SCALE_LENGTH, SCALE_SPEED = 20.0, 10.0
-"""Of the scales in the film: a length in m, a wind in m/s."""
+"""Scales in the film: a length in m, a wind in m/s."""
 
 _SIZE, _DOTS = (7.2, 8.0), 90  # even numbers of pixels, as video codecs expect
 _WINGS = ("off", "feedforward")
 _EDGE: list[AbstractPathEffect] = [withStroke(linewidth=2.5, foreground="black")]
-"""Of white words, seen on bright backscatter too."""
+"""Edge of white words, visible also on bright backscatter."""
 
 
 class Frame(NamedTuple):

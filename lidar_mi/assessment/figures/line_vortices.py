@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 _COLOURS = ("tab:blue", "tab:red")
-_BESIDE = 70.0  # m of the scan that is drawn around the vortices
+_MARGIN = 70.0  # m of the scan that is drawn around the vortices
 
 
 def draw_line_vortices(lines: xr.Dataset, vortices: xr.Dataset, title: str = "") -> Figure:
@@ -65,9 +65,9 @@ def _scan(figure: Figure, axes: Axes, lines: xr.Dataset, vortices: xr.Dataset, s
             *place, yerr=error[1], xerr=error[0], fmt="+", ms=12, c=colour, label=label, mew=1.5
         )
     if np.isfinite(pair["y"].values).all():
-        axes.set_xlim(float(pair["y"].min()) - _BESIDE, float(pair["y"].max()) + _BESIDE)
+        axes.set_xlim(float(pair["y"].min()) - _MARGIN, float(pair["y"].max()) + _MARGIN)
         axes.set_ylim(
-            max(float(pair["z"].min()) - _BESIDE, float(z.min())), float(pair["z"].max()) + _BESIDE
+            max(float(pair["z"].min()) - _MARGIN, float(z.min())), float(pair["z"].max()) + _MARGIN
         )
         axes.legend(loc="upper right", title="circulation, 95 % of place")
     time = str(pair["time"].values)[:19].replace("T", " ")

@@ -66,7 +66,7 @@ def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
     body = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     size = re.search(r'viewBox="([^"]*)"', body)
-    # what holds links is no image
+    # an element that contains links is no image
     role = "group" if marks else "img"
     start = f'<svg viewBox="{size[1] if size else ""}" role="{role}" aria-label="{escape(spoken)}">'
     drawn = "".join(_element(axes, mark, height) for mark in marks)

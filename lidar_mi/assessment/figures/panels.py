@@ -36,7 +36,7 @@ Captioned = tuple[Figure, str]
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure file and what it shows; `alt_text` says it in numbers, for who does not see it."""
+    """A figure file with its title, caption and alternative text."""
 
     path: Path
     title: str
@@ -70,7 +70,7 @@ def sheet(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
 
 
 def panels_of(number: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels for slabs, in rows of two or three, and none that is empty."""
+    """A figure with this number of panels for slabs, in rows of two or three."""
     columns = 3 if number % 2 and number > 1 else min(number, 2)
     rows = -(-number // columns)
     figure, grid = sheet(rows, columns)

@@ -42,7 +42,7 @@ def _scan(lines: xr.Dataset, cores: Sequence[Core]) -> Captioned:
     speed, true = lines["v_los"].values, lines["v_los_true"].values
     normalised = (speed - true) / lines["v_los_std"].values
     read = np.isfinite(speed)
-    # without a velocity there is only where lines are
+    # without velocities only the places of the lines are drawn
     figure = Figure(figsize=(13.6 if read.any() else 6.8, 4.6), layout="compressed")
     panels = figure.subplots(1, 1 + read.any(), sharex=True, sharey=True, squeeze=False)[0]
     span = np.quantile(np.where(read, speed, true), (0.0, 1.0))
@@ -130,7 +130,7 @@ def _maps(wind: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Caption
 
 
 def _crosses(cores: Sequence[Core], colour: str) -> str:
-    """What of a caption speaks of the vortices, where there are any."""
+    """The part of a caption about the vortices; empty without any."""
     return f"{colour} crosses: true cores." if cores else ""
 
 

@@ -1,4 +1,4 @@
-"""Numbers of a campaign: its dimensions, means over members, requirements, stated errors.
+"""Numbers of a campaign: its dimensions, means over members, requirements, coverages.
 
 A campaign's data set has the swept keys as dimensions, or a dimension ``sample`` with the keys as
 coordinates; ``member`` if points were repeated with random numbers of their own.
@@ -95,10 +95,10 @@ def chosen(metrics: Mapping[str, xr.DataArray], names: Sequence[str] | None) -> 
     combined = any(f"sensor.rmse_{name}" in finite for name in "uvw")
     head, components = ("sensor", "uvw") if combined else (best, "vw")
     defaults = [
-        # an error beside how often it lies within what is stated
+        # each error with its coverage
         *(f"{head}.{what}_{name}" for name in components for what in ("rmse", "coverage_95")),
         *(() if head == "sensor" else (f"{best}.valid_fraction",)),
-        # of these, what the simulation's own noise adds
+        # the part of it by Monte Carlo noise
         f"{best}.monte_carlo_w",
         *vortex,
         "sensor.rmse_v_los",
@@ -115,8 +115,8 @@ def chosen(metrics: Mapping[str, xr.DataArray], names: Sequence[str] | None) -> 
         "encounter.lead_time",
         "encounter.normalised_innovation",
     ]
-    found = [key for key in defaults if key in finite]
-    return found or sorted(finite)[:8]
+    present = [key for key in defaults if key in finite]
+    return present or sorted(finite)[:8]
 
 
 def _best_method(metrics: Mapping[str, xr.DataArray], finite: set[str]) -> str:
@@ -156,9 +156,9 @@ def requirements(metrics: Mapping[str, xr.DataArray]) -> dict[tuple[str, str], d
 
 
 def judged(dataset: xr.Dataset, key: str) -> xr.DataArray:
-    """A margin, -1 (nothing of what is required) where a finished run gave nothing to be judged.
+    """A margin; -1 where a finished run has no value to judge.
 
-    NaN where the run is of another phase of flight, whose speed its aircraft does not have.
+    NaN where the run is of another phase of flight.
     """
     margin, phase = dataset[key], key.rsplit(".", 2)[0]
     nothing = (dataset["status"] == 0) & margin.isnull()
@@ -168,7 +168,7 @@ def judged(dataset: xr.Dataset, key: str) -> xr.DataArray:
 
 
 def spaced_by_factors(values: np.ndarray) -> bool:
-    """Whether values are spaced more evenly by factors than by differences; two, by 8 or more."""
+    """Whether values are spaced evenly by factors, not by differences; of two, by 8 or more."""
     at = np.sort(np.asarray(values, dtype=float))
     if len(at) < 2 or at[0] <= 0:
         return False
@@ -233,8 +233,8 @@ def boundaries(margin: Interval, logarithmic: bool) -> list[Boundary]:
         if np.isfinite(curves[1]).any():
             # met above: the upper curve crosses first
             sides = (ends[1], ends[0]) if above else (ends[0], ends[1])
-            before = [at for at, way in sides[0] if way == above and at <= value]
-            after = [at for at, way in sides[1] if way == above and at >= value]
+            before = [at for at, positive in sides[0] if positive == above and at <= value]
+            after = [at for at, positive in sides[1] if positive == above and at >= value]
             span = [max(before, default=-math.inf), min(after, default=math.inf)]
         at, low, high = (
             math.exp(k) if logarithmic and math.isfinite(k) else k for k in (value, *span)
@@ -255,7 +255,7 @@ def _crossings(x: np.ndarray, y: np.ndarray) -> list[tuple[float, bool]]:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often errors lie within what is stated, of a quantity, over points and members."""
+    """Fraction of errors of a quantity within the stated errors, over points and members."""
 
     quantity: str
     count: int
@@ -266,11 +266,10 @@ class Coverage:
 
 
 def coverages(metrics: Mapping[str, xr.DataArray]) -> list[Coverage]:
-    """Of winds the mean of the runs' coverages; of vortices that of their parameters.
+    """Coverages of winds and of vortex parameters, averaged over runs.
 
-    Every run counts once. The standard error of a mean of runs is that of their spread; members
-    of one point have errors of their own, runs of one member at several points may not: the members
-    are the unit where there are any.
+    Every run counts once. The standard error is that of the spread over members, which have
+    independent errors, or over runs where there are no members.
     """
     rows = []
     for key, inner in metrics.items():

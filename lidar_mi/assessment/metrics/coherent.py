@@ -9,11 +9,11 @@ import xarray as xr
 from lidar_mi.assessment.metrics.errors import error_statistics
 
 PREFIX = "coherent."
-"""Of all metrics here."""
+"""Prefix of all metrics here."""
 
 PUBLISHED = {"circulation_error": 0.04, "place_error": 0.06}
-"""Errors of circulation and place that are published for simulated scans with known truth, of the
-circulation and of the separation (DLR's LES Lidar Simulator; J. Atmos. Oceanic Technol. 42(3),
+"""Published errors of circulation and place for simulated scans with known truth, relative to the
+circulation and the separation (DLR's LES Lidar Simulator; J. Atmos. Oceanic Technol. 42(3),
 2025)."""
 
 _QUANTITIES = ("y", "z", "circulation")
@@ -21,7 +21,7 @@ _CIRCULATION = "circulation_5_15"
 
 
 def lines_metrics(lines: xr.Dataset) -> dict[str, float]:
-    """Number of lines, and noise of their velocities: stated, and found against the truth.
+    """Number of lines, and noise of their velocities: as stated, and against the truth.
 
     ``coherent.lines``, ``coherent.noise`` (median of the stated standard errors, m/s),
     ``coherent.rmse_v_los`` and ``coherent.bias_v_los`` (m/s), ``coherent.cnr`` (median, dB), of
@@ -127,7 +127,7 @@ def _sizes(prefix: str, errors: xr.Dataset) -> dict[str, float]:
 
 
 def _track_metrics(vortices: xr.Dataset) -> dict[str, float]:
-    """Of the places that all slices together give: ``coherent.track.place_error``, coverages."""
+    """Errors of the places tracked over all slices: ``coherent.track.place_error``, coverages."""
     relative, metrics = [], {}
     for name in "yz":
         error = (vortices[f"{name}_tracked"] - vortices[f"{name}_true"]).values
@@ -151,7 +151,7 @@ def _peer_errors(vortices: xr.Dataset) -> xr.Dataset:
 
 
 def errors_by_age(vortices: xr.Dataset, bins: int = 4) -> Sequence[Mapping[str, float]]:
-    """Medians of the errors in intervals of equal numbers of scans, of the wake's age.
+    """Medians of the errors in intervals of the wake's age with equal numbers of scans.
 
     Returns
     -------

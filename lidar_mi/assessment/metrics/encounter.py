@@ -19,7 +19,7 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 from lidar_mi.assessment.metrics.wind_ahead import wind_ahead_metrics
 
 CONTROLLER = "controller"
-"""Attribute of the time series: the name of a controller of one's own."""
+"""Attribute of the time series: the name of a user's controller."""
 
 MET = "met"
 """Attribute of the time series: what a flight meets, "wake" (by default) or "air"."""
@@ -46,7 +46,7 @@ AFTER = 5
 _ROUNDING = 1e-9
 
 _FELT = 0.1
-"""Fraction of the largest rolling moment of the wake from which on it counts as felt."""
+"""Fraction of the wake's largest rolling moment at which it counts as felt."""
 
 _CIRCULATIONS = ("port_circulation", "starboard_circulation")
 _PLACES = ("port_y", "port_z", "starboard_y", "starboard_z")
@@ -84,8 +84,8 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
             added = float(fraction_added(before, ours, best, least))
             metrics[f"encounter.removed_beyond_autopilot.{quantity}"] = added
     if track is not None:
-        more = _tracking(series, track) | wind_ahead_metrics(track)
-        metrics |= {f"encounter.{k}": v for k, v in more.items()}
+        tracking = _tracking(series, track) | wind_ahead_metrics(track)
+        metrics |= {f"encounter.{k}": v for k, v in tracking.items()}
     return {key: value for key, value in metrics.items() if np.isfinite(value)}
 
 
@@ -144,11 +144,11 @@ def felt_from(series: xr.Dataset) -> float:
 def measured_in_flight(
     series: xr.Dataset, track: xr.Dataset, slab_depth: float
 ) -> dict[str, float]:
-    """Rows of a requirement table in flight: range from the time from an estimate to its slab.
+    """Rows of a requirement table, as measured in flight.
 
-    The range is what the aircraft flies from the moment at which an estimate is there to its slab;
-    errors are those of valid vectors and of lines of sight against the truth; u and lines of sight
-    are absent without a Doppler lidar.
+    The range is the distance flown from the delivery of an estimate to its slab; errors are those
+    of valid vectors and of lines of sight against the truth; u and lines of sight are absent
+    without a Doppler lidar.
     """
     measured = track.where(track["vectors"] > 0, drop=True)
     # as the flight begins: the wake changes it
@@ -260,8 +260,8 @@ def _latencies(track: xr.Dataset) -> dict[str, float]:
 
 def _errors(track: xr.Dataset, slabs: np.ndarray) -> dict[str, float]:
     """Largest errors of circulations (relative) and cores (m) of the track; fraction in 2 sigma."""
-    some = track.isel(slab=slabs)
-    ours, truth = some.sel(source="track"), some.sel(source="truth")
+    part = track.isel(slab=slabs)
+    ours, truth = part.sel(source="track"), part.sel(source="truth")
     relative = [np.abs(ours[q] / truth[q] - 1) for q in _CIRCULATIONS]
     cores = [
         np.hypot(ours[f"{side}_y"] - truth[f"{side}_y"], ours[f"{side}_z"] - truth[f"{side}_z"])

@@ -3,8 +3,8 @@
 Severity is the rolling moment needed against the wake over the largest that the controls have. The
 simplified hazard areas around wake vortices end where it is 0.2: outside, pilots in full-flight
 simulators found every encounter uncritical (Schwarz and Hahn 2006). It is a limit of undisturbed
-flight, not of an accident, and it is of the wake: controls that act before the wake is there make
-moments of their own.
+flight, not of an accident. It describes the wake alone: controls that act before the wake add
+moments.
 
 A hazard is what the aircraft does: a bank angle at which the monitoring pilot calls out on a
 stabilised approach (Flight Safety Foundation 2000, briefing note 7.1).
@@ -19,7 +19,7 @@ ACCEPTED_RATIO = 0.2
 """Roll control ratio of the wake up to which it is uncritical (Schwarz and Hahn 2006)."""
 
 ACCEPTED_BANK = math.radians(7)
-"""Bank angle (rad) beyond which it is called out on an approach (Flight Safety Foundation 2000)."""
+"""Largest bank angle (rad) on an approach without a call-out (Flight Safety Foundation 2000)."""
 
 
 def roll_control_ratio(moment: ArrayLike, largest: float) -> float:

@@ -235,7 +235,7 @@ def moved_rigidly(
     truth : xr.Dataset
         v, w on (z, y).
     retrieve : callable
-        Retrieves the wind from a pair by found's method, with windows so many pixels apart.
+        Retrieves the wind from a pair by the method of `wind`, with windows so many pixels apart.
 
     Returns
     -------
@@ -254,7 +254,7 @@ def moved_rigidly(
         start = start[:, None] if axis == 0 else start[None, :]
         pixel = np.arange(search)[:, None] if axis == 0 else np.arange(search)[None, :]
         shift = np.nan_to_num(mean[component].values) * dt / spacing
-        # the air of a window comes from where its mean wind leads back to
+        # where the air of a window comes from, by its mean wind
         place = (start - shift)[:, :, None, None] + pixel
         places.append(np.broadcast_to(place, regions.shape))
     advected = scipy.ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
@@ -262,13 +262,13 @@ def moved_rigidly(
     def cut(image: np.ndarray) -> np.ndarray:
         return sliding_window_view(image, (search, search))[::stride, ::stride]
 
-    # what is not the blurred air, mostly noise, stays as it was
+    # the difference to the blurred air, mostly noise, is unchanged
     remaining = cut(measured[1].values - blurred[1].values)
     pair = [
         _side_by_side(blocks, measured[0])
         for blocks in (cut(measured[0].values), advected + remaining)
     ]
-    # a stride of a search region: one window in each block
+    # with a stride of a search region there is one window in each block
     rigid = retrieve(pair, search)
     return wind.assign({name: (("z", "y"), rigid[name].values) for name in ("v", "w")})
 
@@ -335,7 +335,7 @@ def error_budget(
         errors["time_step"] = _difference(wind, dict(zip("vw", chord, strict=True)))
     if perfect is not None:
         bias = _difference(perfect, truth_at_vectors(perfect, truth))
-        # as of the other causes: the errors without it
+        # as for the other causes: the errors without it
         errors["method"] = errors[""] - bias
     chosen = np.logical_and.reduce([np.isfinite(e).all(0) for e in errors.values()])
     if not flagged:

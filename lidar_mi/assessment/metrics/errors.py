@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lidar_mi.atmosphere.vortices.cores import Core, outside_cores
+from lidar_mi.flags import masks_of
 
 
 def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
@@ -164,10 +165,9 @@ def error_by_quality(
 
 def commonest_flag(flag: xr.DataArray) -> str:
     """The most frequent flag, in words; ``flag`` has its CF attributes."""
-    meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
     fractions = {
-        text: float(((flag.values & mask) != 0).mean())
-        for text, mask in zip(meanings, masks, strict=True)
+        meaning: float(((flag.values & mask) != 0).mean())
+        for meaning, mask in masks_of(flag.attrs).items()
     }
     worst = max(fractions, key=fractions.__getitem__)
     return f"{round(100 * fractions[worst])} % have the flag {worst}"

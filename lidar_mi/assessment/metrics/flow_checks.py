@@ -1,7 +1,7 @@
 """Whether a cross-flow can be that of a wake: its sense of rotation, its divergence.
 
-A velocity or an axis of the wrong sign makes a flow that no air has, or one that rises where wakes
-descend. Every number of a run is then computed without complaint.
+A velocity or an axis of the wrong sign gives an impossible flow, or a wake that rises, and no error
+message.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,10 @@ import xarray as xr
 from lidar_mi.atmosphere.vortices.cores import Core, ring_averages
 
 MOST_DIVERGENCE = 0.5
-"""Of a cross-section, by `relative_divergence`. Sections of a simulated wake have 0.1, those of
-isotropic turbulence 1 / sqrt(5) (Taylor 1935: <(du/dx)^2> is a fifth of the mean square of a
-component of the vorticity). With a component or an axis of the wrong sign they have 1."""
+"""Largest plausible `relative_divergence` of a cross-section. Sections of a simulated wake have
+0.1, those of isotropic turbulence 1 / sqrt(5) (Taylor 1935: <(du/dx)^2> is a fifth of the mean
+square of a component of the vorticity). With a component or an axis of the wrong sign they have
+1."""
 
 
 def relative_divergence(wind: xr.Dataset) -> float:
@@ -27,10 +28,10 @@ def relative_divergence(wind: xr.Dataset) -> float:
     v, w = (wind[name].transpose("z", "y").values.astype(float) for name in ("v", "w"))
     if min(v.shape) < 2:
         return float("nan")
-    along = np.gradient(v, spacing["y"], axis=1) + np.gradient(w, spacing["z"], axis=0)
-    turning = np.gradient(w, spacing["y"], axis=1) - np.gradient(v, spacing["z"], axis=0)
-    rms = np.sqrt((turning**2).mean())
-    return float(np.sqrt((along**2).mean()) / rms) if rms > 0 else float("nan")
+    divergence = np.gradient(v, spacing["y"], axis=1) + np.gradient(w, spacing["z"], axis=0)
+    vorticity = np.gradient(w, spacing["y"], axis=1) - np.gradient(v, spacing["z"], axis=0)
+    rms = np.sqrt((vorticity**2).mean())
+    return float(np.sqrt((divergence**2).mean()) / rms) if rms > 0 else float("nan")
 
 
 def rises(cores: Sequence[Core]) -> bool:

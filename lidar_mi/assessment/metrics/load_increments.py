@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 INCREMENTS = ("largest_load_increment", "largest_bending_increment")
-"""What `load_increments` finds: load factor, and bending moment of a wing root (N m)."""
+"""Results of `load_increments`: load factor, and bending moment of a wing root (N m)."""
 
 
 def load_increments(flight: xr.Dataset) -> dict[str, float]:

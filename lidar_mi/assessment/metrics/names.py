@@ -21,11 +21,11 @@ RENDERED = (Source.BACKSCATTER, Source.NOISY)
 """Sources that are images of the lidar; the second one behind a detector."""
 
 OUTSIDE_CORES = "outside_cores."
-"""Of errors beyond two core radii, before the quantity."""
+"""Prefix to the quantity for errors beyond two core radii."""
 
 
 def far_from_cores(metrics: Mapping[str, float], prefix: str, quantity: str) -> str:
-    """`OUTSIDE_CORES` where there are cores that it leaves out, of u, v or w; else nothing."""
+    """`OUTSIDE_CORES` if it excludes any vector of u, v or w; else empty."""
     for component in "uvw":
         far = metrics.get(f"{prefix}{OUTSIDE_CORES}{quantity}{component}")
         if far is not None and far != metrics.get(f"{prefix}{quantity}{component}"):
@@ -34,12 +34,12 @@ def far_from_cores(metrics: Mapping[str, float], prefix: str, quantity: str) -> 
 
 
 def wind_key(source: str, method: str, quantity: str) -> str:
-    """Of a method's winds from a source."""
+    """Key of a method's winds from a source."""
     return f"{source}.{method}.{quantity}"
 
 
 def ring_key(method: str, centre: str, averaged: int, quantity: str) -> str:
-    """Of a method's line-of-sight velocities from averages of a number of images."""
+    """Key of a method's line-of-sight velocities from averages of a number of images."""
     return f"doppler.{method}.centre_{centre}.averaged_{averaged}.{quantity}"
 
 
@@ -53,27 +53,27 @@ def reference_key(cause: str) -> str:
 
 
 def bound_key(centre: str, averaged: int) -> str:
-    """Of the Cramer-Rao bound of line-of-sight velocities."""
+    """Key of the Cramer-Rao bound of line-of-sight velocities."""
     return ring_key("bound", centre, averaged, "std")
 
 
 def budget_key(method: str, quantity: str) -> str:
-    """Of the error budget of a method's winds; quantities as of `error_budget.error_budget`."""
+    """Key of the error budget of a method's winds; quantities as in `error_budget`."""
     return f"error_budget.{method}.{quantity}"
 
 
 def sweep_key(rms: float, quantity: str) -> str:
-    """Of the winds at a relative rms of the sub-grid texture."""
+    """Key of the winds at a relative rms of the sub-grid texture."""
     return f"texture_sweep.{round(100 * rms)}_percent.{quantity}"
 
 
 def vortex_key(origin: str, quantity: str) -> str:
-    """Of the vortex pair of an origin: the truth, the images or the wind vectors."""
+    """Key of the vortex pair from the truth, the images or the wind vectors."""
     return f"vortex.{origin}.{quantity}"
 
 
 def timing_key(step: str) -> str:
-    """Of the duration of a step, s."""
+    """Key of the duration of a step, s."""
     return f"timing.{step}_s"
 
 

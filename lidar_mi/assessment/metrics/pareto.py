@@ -35,7 +35,7 @@ def pareto_front(objectives: ArrayLike, maximised: Sequence[bool] = ()) -> NDArr
     if len(maximised):
         values[:, np.asarray(maximised, dtype=bool)] *= -1
     finite = np.flatnonzero(np.isfinite(values).all(axis=1))
-    # what dominates a point is before it in this order
+    # in this order a point comes after all that dominate it
     order = finite[np.lexsort(values[finite].T[::-1])]
     front = np.zeros(len(values), dtype=bool)
     best = np.empty((0, values.shape[1]))

@@ -186,7 +186,7 @@ def as_rows(findings: Sequence[Finding]) -> list[tuple[str, str, str, str, str]]
 
 
 Judged = Sequence[tuple[RequirementTable, Sequence[Finding]]]
-"""Requirement tables with what was found for each."""
+"""Requirement tables with the findings for each."""
 
 
 def _section(data: object, place: str) -> Mapping[str, object]:

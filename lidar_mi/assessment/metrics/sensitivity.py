@@ -22,9 +22,9 @@ LEAST_EXPLAINED = 0.5
 _POINTS_PER_KNOB = 8
 # Draws of hyperparameters, functions of each, rows of Saltelli's matrices.
 _PROCESSES, _FUNCTIONS, _SALTELLI = 12, 16, 1024
-# Functions of the process are smoother than some metrics. Intervals are wider by this much and by
-# this fraction of the variance that the process does not explain: then they hold the indices of the
-# test functions of Ishigami and Sobol' at 256 points, with and without noise.
+# Functions of the process are smoother than some metrics. Intervals are widened by this and by this
+# fraction of the unexplained variance: then they contain the indices of the test functions of
+# Ishigami and Sobol' at 256 points, with and without noise.
 _RESOLUTION, _MISSED = 0.01, 0.25
 
 
@@ -198,7 +198,7 @@ def _index_draws(drawn: Sequence[Process], rng: np.random.Generator) -> tuple[Ar
     for process in drawn:
         pairs = qmc.Sobol(2 * knobs, seed=rng).random(_SALTELLI)
         a, b = pairs[:, :knobs], pairs[:, knobs:]
-        # one column of A at a time is that of B
+        # A with one column at a time replaced by that of B
         mixed = np.where(np.eye(knobs, dtype=bool)[:, None], b, a)
         places = np.concatenate([a, b, *mixed])
         functions = process.functions(places, _FUNCTIONS, rng).T

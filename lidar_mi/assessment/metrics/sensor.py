@@ -54,7 +54,7 @@ def vector_metrics(wind: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, 
     if wind is None:
         return {"sensor.valid_fraction": 0.0, "sensor.vectors": 0}
     # with torch, which `check` does without
-    from lidar_mi.retrieval.combined.combine import CombinedFlag
+    from lidar_mi.flags import CombinedFlag
 
     valid = wind["flag"].values == 0
     z, y = np.meshgrid(wind["z"], wind["y"], indexing="ij")
@@ -76,7 +76,7 @@ def vector_metrics(wind: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, 
         if beyond.any():
             rmse = error_statistics(error, where=beyond)["rmse"]
             metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
-            # errors as large as this are those of zero wind
+            # the rms error of zero wind
             strength = float(np.sqrt((true[beyond] ** 2).mean()))
             metrics[f"sensor.outside_cores.rms_{name}"] = strength
             metrics[f"sensor.outside_cores.std_{name}"] = float(true[beyond].std())
@@ -84,10 +84,10 @@ def vector_metrics(wind: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, 
 
 
 def without_skill(metrics: Mapping[str, float]) -> list[str]:
-    """Components whose rms error is as large as the true wind varies, beyond two core radii.
+    """Components whose rms error equals the spread of the true wind: without skill.
 
-    Their mean would do as well. As large: less than it by no more than the standard error of an rms
-    of so many values, 1 / sqrt(2 n) of it (Gaussian).
+    Beyond two core radii. Equal: not smaller by more than the standard error of an rms of n values,
+    1 / sqrt(2 n) of it (Gaussian).
     """
     number = metrics.get("sensor.vectors", 0)
     components = []

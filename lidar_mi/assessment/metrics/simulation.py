@@ -1,4 +1,4 @@
-"""Which part of the wind's error is noise of the simulation, and not the lidar's."""
+"""The part of the wind's error that is noise of the simulation, not of the lidar."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,14 +22,14 @@ def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:
     """Monte Carlo samples of both scans, and their noise relative to a detector's.
 
     ``backscatter.samples_per_beam``; behind a detector ``backscatter_noisy.monte_carlo_fraction``,
-    their variance over that of its noise in the scan where that is larger, see
+    their variance over that of the detector's noise, in the scan with the larger ratio, see
     `lidar_mi.rendering.samples.monte_carlo_fraction`.
     """
     metrics: dict[str, float] = {}
     if "samples_per_beam" in scans[0].attrs:
         key = f"{Source.BACKSCATTER}.samples_per_beam"
         metrics[key] = float(scans[0].attrs["samples_per_beam"])
-    # one scan without it leaves the larger of both unknown
+    # without it in one scan the larger ratio is unknown
     fraction = max(scan.attrs.get("monte_carlo_fraction", math.inf) for scan in scans)
     if math.isfinite(fraction):
         metrics[f"{Source.NOISY}.monte_carlo_fraction"] = float(fraction)
@@ -39,7 +39,7 @@ def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:
 def simulation_metrics(
     changes: xr.Dataset, winds: xr.Dataset, cores: Sequence[Core]
 ) -> dict[str, float]:
-    """Standard deviation that the simulation's noise has in the wind, by method.
+    """Standard deviation of the wind by the simulation's noise, for each method.
 
     Parameters
     ----------
@@ -88,15 +88,15 @@ class SimulationPart(NamedTuple):
     place: str
 
     def exceeds(self, allowed: float) -> bool:
-        """Whether the simulation's part is more than ``allowed`` times that of all else."""
+        """Whether the simulation's part is more than ``allowed`` times all other parts."""
         return self.fraction > allowed * (1 - self.fraction)
 
 
 def largest_parts(metrics: Mapping[str, xr.DataArray]) -> xr.DataArray | None:
     """Largest part of the simulation in any method's mean square error, at every point.
 
-    1 at most; None if no point has any. Points without `simulation_metrics`, at which the part is
-    as small as asked for, are NaN.
+    At most 1; None if no point has any. NaN at points without `simulation_metrics`, where the part
+    is as small as requested.
     """
     parts: list[xr.DataArray] = []
     for place, source in product((OUTSIDE_CORES, ""), RENDERED):
@@ -114,7 +114,7 @@ def largest_parts(metrics: Mapping[str, xr.DataArray]) -> xr.DataArray | None:
 
 
 def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> list[SimulationPart]:
-    """Of the most complete images, by every method with known errors.
+    """The parts in winds from the most complete images, by every method with known errors.
 
     Parameters
     ----------

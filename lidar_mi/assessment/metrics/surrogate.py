@@ -120,13 +120,13 @@ def _spread(logs: Array, points: Array, values: Array) -> Array:
         for step in steps
     ]
     curvature = np.array(gradients) / 2e-3
-    # minus twice a log density; nothing is known less well than before
+    # of minus twice a log density; the posterior is no wider than the prior
     precision, axes = np.linalg.eigh((curvature + curvature.T) / 4)
     return np.asarray((axes / np.sqrt(np.maximum(precision, _PRIOR_STD**-2))).T)
 
 
 def _covariance(points: Array, logs: Array) -> Array:
-    """Of the values, over the function's variance."""
+    """Covariance of the values over the function's variance."""
     correlation = _matern(points, points, np.exp(logs[:-1]))
     return correlation + np.exp(logs[-1]) * np.eye(len(points))
 

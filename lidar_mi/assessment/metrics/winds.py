@@ -48,7 +48,7 @@ def efficiency(wind: xr.Dataset) -> dict[str, float]:
 
 
 def coverage(wind: xr.Dataset) -> dict[str, float]:
-    """How often errors of valid vectors lie within what a method states, of v and w.
+    """Fractions of the errors of valid v and w within the stated errors.
 
     ``coverage_68_*``, ``coverage_95_*``: as of `errors.error_statistics`; empty for methods that
     state no errors.
@@ -67,13 +67,13 @@ def coverage(wind: xr.Dataset) -> dict[str, float]:
 
 
 def skill(wind: xr.Dataset) -> dict[str, float]:
-    """What a method states of its own errors; empty for methods that state none.
+    """Standard errors as a method states them; empty for methods that state none.
 
     ``stderr_*``: rms standard error, m/s, of vectors that are valid, or whose only flag is
     `no_skill`. ``no_skill_fraction``: 1 where they equal the rms of the true wind or exceed it,
     else the fraction of all vectors with that flag.
     """
-    from lidar_mi.retrieval.images.quality import Flag
+    from lidar_mi.flags import Flag
 
     flag = wind["flag"].values
     # no flag, or this one alone

@@ -29,16 +29,16 @@ from lidar_mi.schema.experiment import Experiment
 from lidar_mi.tables import with_error
 from lidar_mi.units import shown
 
-# Fraction of errors within 1.96 standard errors below which, and within 1 above which, they are
-# reported not to hold: four standard errors of these fractions for the eighty independent windows
-# of an image of 219 x 139 pixels, from a fifth of valid vectors on.
-_HOLDS, _ENOUGH = (0.85, 0.89), 0.2
+# Stated errors are reported as wrong if less than the first fraction of errors is within 1.96 of
+# them, or more than the second within 1: four standard errors of these fractions for the eighty
+# independent windows of 219 x 139 pixels. Judged if at least a fifth of the vectors is valid.
+_COVERAGE_LIMITS, _LEAST_VALID = (0.85, 0.89), 0.2
 # Standard errors of a circulation from which its error is named.
-_FAR_OFF = 3.0
+_LEAST_DEPARTURE = 3.0
 
 
 def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
-    """What a run found, the same on the terminal, in the report and in `summary.txt`.
+    """The results of a run in sentences, on the terminal, in the report and in `summary.txt`.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def _sensor(experiment: Experiment, metrics: Mapping[str, float]) -> str:
     if not metrics["sensor.vectors"]:
         return f"{head}: no valid wind vector."
     far = far_from_cores(metrics, "sensor.", "rmse_")
-    # an error of what is not there says nothing
+    # a component that is zero has no error
     components = "vw" if metrics.get(f"sensor.{far}rms_u") == 0 else "uvw"
     errors = _values(metrics, f"sensor.{far}rmse_", components)
     true = _values(metrics, f"sensor.{far}rms_", components)
@@ -165,7 +165,7 @@ def _rings(doppler: Doppler, metrics: Mapping[str, float]) -> Iterator[str]:
 
 
 def _misstatements(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
-    """Standard errors that do not hold here, of the winds that the answer names."""
+    """Sentences on wrong standard errors of the winds that the answer names."""
     if "sensor.vectors" in metrics:
         yield from _misstated("both lidars", metrics, "sensor.", "uvw")
     elif experiment.imaged_wake:
@@ -180,13 +180,13 @@ def _misstated(
     name: str, metrics: Mapping[str, float], head: str, components: str
 ) -> Iterator[str]:
     stated = [component for component in components if f"{head}coverage_95_{component}" in metrics]
-    if not stated or metrics.get(f"{head}valid_fraction", 1.0) < _ENOUGH:
+    if not stated or metrics.get(f"{head}valid_fraction", 1.0) < _LEAST_VALID:
         return
     inner, outer = (
         sum(metrics[f"{head}coverage_{level}_{component}"] for component in stated) / len(stated)
         for level in (68, 95)
     )
-    low, high = _HOLDS
+    low, high = _COVERAGE_LIMITS
     if outer < low:
         size, covered = (
             "small",
@@ -213,7 +213,11 @@ def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:
             abs(metrics[key] - expected) / metrics.get(f"{key}_stderr", math.inf)
             for key, expected in zip(keys, true, strict=True)
         )
-        beyond = f", off by up to {departure:.2g} standard errors" if departure > _FAR_OFF else ""
+        beyond = (
+            f", off by up to {departure:.2g} standard errors"
+            if departure > _LEAST_DEPARTURE
+            else ""
+        )
         yield (
             f"Vortex pair: circulations {fitted[0]} and {fitted[1]} m²/s, true "
             f"{true[0]:.0f} and {true[1]:.0f} m²/s{beyond}."

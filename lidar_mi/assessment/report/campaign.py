@@ -1,7 +1,7 @@
 """The report of a campaign: one self-contained HTML file, from its data set alone."""
 
 import re
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Container, Hashable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import product
 
@@ -27,7 +27,7 @@ from lidar_mi.units import conversion, usual_unit
 _PANELS = 16
 _FEW = 4
 _ROWS = 36
-"""Of the table of points, at most."""
+"""Most rows of the table of points."""
 _DONE, _FAILED = 0, 1
 
 
@@ -86,7 +86,7 @@ def answer(dataset: xr.Dataset) -> str:
 
 
 Margins = Mapping[tuple[str, str], Mapping[str, numbers.Interval]]
-"""Of each quantity, by application and phase of flight."""
+"""Margins of each quantity, by application and phase of flight."""
 
 
 def _axes(dataset: xr.Dataset) -> dict[str, Axis]:
@@ -127,7 +127,7 @@ def _axis(dataset: xr.Dataset, name: str) -> Axis:
     at = dataset[name]
     if not numbers.is_numeric(dataset, name):
         return Axis(name, label_of(at, name), False, tuple(str(value) for value in at.values))
-    # the description of a list does not say
+    # the description of a list does not state its scale
     guess = "log" if numbers.spaced_by_factors(at.values) else "linear"
     return Axis(name, label_of(at, name), at.attrs.get("scale", guess) == "log")
 
@@ -160,15 +160,10 @@ def _place(dataset: xr.Dataset, at: Mapping[str, int]) -> str:
     )
     words = []
     for name in names:
-        coordinate = dataset[name].isel(
-            {dim: k for dim, k in at.items() if dim in dataset[name].dims}
-        )
-        value = coordinate.item()
+        coordinate = dataset[name].isel(at, missing_dims="ignore")
+        value, about = coordinate.item(), coordinate.attrs
         number = f"{value:.4g}" if isinstance(value, float) else str(value)
-        words.append(
-            f"{coordinate.attrs.get('long_name', name)} = {number} "
-            f"{coordinate.attrs.get('units', '')}".strip()
-        )
+        words.append(f"{about.get('long_name', name)} = {number} {about.get('units', '')}".strip())
     return ", ".join(words)
 
 
@@ -291,14 +286,12 @@ def _lead(
     if not margins:
         return text + " No requirement was judged."
     counts, missed = [], []
-    for (application, phase), rows in margins.items():
+    for group, rows in margins.items():
         met = [numbers.met(margin) for margin in rows.values()]
         every = xr.concat(met, "row", coords="minimal", compat="override").min("row", skipna=False)
         judged = int(np.isfinite(every).sum())
-        counts.append(
-            f"{application.replace('_', ' ')}, {phase}: at {int(every.sum())} of {judged} points"
-        )
-        missed += _missed(dataset, f"{application.replace('_', ' ')}, {phase}", rows, every)
+        counts.append(f"{_title(group)}: at {int(every.sum())} of {judged} points")
+        missed += _missed(dataset, _title(group), rows, every)
     text += f" All rows of the requirements are met for {'; '.join(counts)}."
     return " ".join([text, *missed])
 
@@ -334,11 +327,21 @@ def _range(dataset: xr.Dataset, name: str) -> str:
     return ends if SAMPLE in dataset.dims else f"{values.size} values, {ends}"
 
 
+def _title(group: tuple[str, str]) -> str:
+    """Application and phase of flight."""
+    return f"{group[0].replace('_', ' ')}, {group[1]}"
+
+
+def _along(array: xr.DataArray, dims: Container[Hashable]) -> xr.DataArray:
+    """An array without its other dimensions, which have the length 1."""
+    return array.squeeze([dim for dim in array.dims if dim not in dims], drop=True)
+
+
 def _requirement_rows(
     margins: Margins, axes: Mapping[str, Axis]
 ) -> list[tuple[str, str, list[str]]]:
     rows = []
-    for (application, phase), quantities in margins.items():
+    for group, quantities in margins.items():
         for name, margin in quantities.items():
             met = numbers.met(margin)
             judged, many = int(np.isfinite(met).sum()), int(met.sum())
@@ -348,8 +351,7 @@ def _requirement_rows(
                 else "not known"
             )
             where = _boundary_text(margin, axes)
-            label = f"{application.replace('_', ' ')}, {phase}: {name}"
-            rows.append((label, "", [f"{many} of {judged}", open_, where]))
+            rows.append((f"{_title(group)}: {name}", "", [f"{many} of {judged}", open_, where]))
     return rows
 
 
@@ -377,11 +379,7 @@ def _boundary_text(margin: Interval, axes: Mapping[str, Axis]) -> str:
                 low = three(boundary.low) if np.isfinite(boundary.low) else "beyond the sweep"
                 high = three(boundary.high) if np.isfinite(boundary.high) else "beyond the sweep"
                 words += f" (95 %: {low} to {high})"
-            place = [
-                str(boundary)
-                for dim, boundary in zip(remaining, labels, strict=True)
-                if dim in axes
-            ]
+            place = [str(x) for dim, x in zip(remaining, labels, strict=True) if dim in axes]
             texts.append(": ".join([*place, words]))
     return "; ".join(texts)
 
@@ -415,8 +413,8 @@ def _sweep_block(
     dataset: xr.Dataset, key: str, values: xr.DataArray, axes: Mapping[str, Axis], points: Points
 ) -> Block:
     label = label_of(values, key)
-    values = values.squeeze([d for d in values.dims if d not in axes and d != MEMBER], drop=True)
-    flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
+    values = _along(values, (*axes, MEMBER))
+    flat = Points(*(_along(p, axes) for p in points))
     title = f"{label.partition(' / ')[0]}"
     if not axes:
         return Block(
@@ -464,13 +462,12 @@ def _sweep_block(
 def _limits(dataset: xr.Dataset, key: str, axes: Mapping[str, Axis]) -> dict[str, xr.DataArray]:
     """Margins of the requirements of a metric, by application and phase of flight."""
     limits = {}
-    for (application, phase), rows in numbers.requirements(numbers.metrics_of(dataset)).items():
+    for group, rows in numbers.requirements(numbers.metrics_of(dataset)).items():
         row = rows.get(key.replace("sensor.rmse_", "error_"))
         if row is None:
             continue
         mean = numbers.over_members(numbers.judged(dataset, row)).mean
-        remaining = [dim for dim in mean.dims if dim not in axes]
-        limits[f"{application.replace('_', ' ')}, {phase}"] = mean.squeeze(remaining, drop=True)
+        limits[_title(group)] = _along(mean, axes)
     return limits
 
 
@@ -499,14 +496,11 @@ def _member_panel(dataset: xr.Dataset, values: xr.DataArray, label: str) -> list
     """A metric of every member of a single point."""
     if MEMBER not in values.dims:
         return []
-    run = dataset[["status", "folder"]].squeeze([d for d in dataset.dims if d != MEMBER], drop=True)
     runs = xr.Dataset(
         {
             "number": (MEMBER, np.zeros(values.size, int)),
-            "failed": run["status"] != _DONE,
-            "link": _links(dataset, dataset["folder"].astype(str)).squeeze(
-                [d for d in dataset.dims if d != MEMBER], drop=True
-            ),
+            "failed": _along(dataset["status"], (MEMBER,)) != _DONE,
+            "link": _along(_links(dataset, dataset["folder"].astype(str)), (MEMBER,)),
             "value": values,
         }
     ).rename({MEMBER: "run"})
@@ -518,20 +512,17 @@ def _member_panel(dataset: xr.Dataset, values: xr.DataArray, label: str) -> list
 def _requirement_maps(
     dataset: xr.Dataset, margins: Margins, axes: Mapping[str, Axis], points: Points
 ) -> Iterator[Block]:
-    for (application, phase), rows in margins.items():
+    for group, rows in margins.items():
         dims = next(iter(rows.values())).mean.sizes
         at, _, remaining = _layout(axes, dims) if axes else ([], None, [])
         if len(at) != 2:
             continue
-        flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
+        flat = Points(*(_along(p, axes) for p in points))
         drawn = []
         for name, where in _panels(dataset, remaining)[:_PANELS]:
             intervals = {
                 row: Interval(
-                    *(
-                        part.squeeze([d for d in part.dims if d not in axes], drop=True).isel(where)
-                        for part in (margin.mean, margin.low, margin.high)
-                    )
+                    *(_along(x, axes).isel(where) for x in (margin.mean, margin.low, margin.high))
                 )
                 for row, margin in rows.items()
             }
@@ -546,7 +537,7 @@ def _requirement_maps(
             if with_members
             else ". Their uncertainty is not known: there is one member."
         )
-        yield Block(f"{application.replace('_', ' ')}, {phase}", text, drawn)
+        yield Block(_title(group), text, drawn)
 
 
 def _coverage_rows(metrics: Mapping[str, xr.DataArray]) -> list[tuple[str, str, list[str]]]:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 GOAL = 0.8
-"""Fraction of what perfect preview removes beyond the autopilot that the lidar should remove: the
-project's own goal, from no standard and not from the paper."""
+"""Goal for the lidar, as a fraction of what perfect preview removes beyond the autopilot: the
+project's own, from no standard and not from the paper."""
 
 _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
@@ -196,10 +196,10 @@ def encounter_answer(
             "missed, or both wings meet the same wind, as in a wake across the path.",
             *loads_answer(metrics),
         ]
-    parts = [
-        f"{'upset' if _lost(metrics, mode) else _degrees(roll)} ({flight_name(mode, controller)})"
-        for mode, roll in rolls.items()
-    ]
+    parts = []
+    for mode, roll in rolls.items():
+        size = "upset" if _lost(metrics, mode) else f"{three(math.degrees(roll))} degrees"
+        parts.append(f"{size} ({flight_name(mode, controller)})")
     best = "feedforward" if "feedforward" in rolls else "perfect" if "perfect" in rolls else "off"
     verdict = "stays below" if rolls[best] <= ACCEPTED_BANK else "exceeds"
     ratio = metrics[f"encounter.{best}.roll_control_ratio"]
@@ -231,8 +231,8 @@ def encounter_answer(
 def what_the_lidar_added(metrics: Mapping[str, float], controller: str = "") -> list[str]:
     """The verdict: what the lidar removes beyond the autopilot, of what perfect preview does.
 
-    Nothing without a flight with the lidar. A lidar that never had a preview, or too late, is said
-    first. Roll is always judged, the load factor where the aircraft rises.
+    Nothing without a flight with the lidar. It begins with a preview that came too late, or never.
+    Roll is always judged, the load factor where the aircraft rises.
     """
     if "encounter.feedforward.largest_roll" not in metrics:
         return []
@@ -361,10 +361,6 @@ def _values(
 
 def _lost(metrics: Mapping[str, float], mode: str) -> bool:
     return metrics.get(f"encounter.{mode}.departed", 0) > 0
-
-
-def _degrees(angle: float) -> str:
-    return f"{three(math.degrees(angle))} degrees"
 
 
 def _with_unit(value: float | None, factor: float) -> str:

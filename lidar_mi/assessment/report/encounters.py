@@ -96,5 +96,5 @@ def _added(metrics: Mapping[str, xr.DataArray]) -> str:
 def _fraction(met: np.ndarray) -> str:
     """Percentage with its standard error, by Laplace's rule so that none and all have one, too."""
     mean, count = met.mean(), met.size
-    ruled = (met.sum() + 1) / (count + 2)
-    return f"{with_error(100 * mean, 100 * np.sqrt(ruled * (1 - ruled) / count))} %"
+    estimate = (met.sum() + 1) / (count + 2)
+    return f"{with_error(100 * mean, 100 * np.sqrt(estimate * (1 - estimate) / count))} %"

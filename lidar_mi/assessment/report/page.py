@@ -19,7 +19,6 @@ from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.schema.encounter import Encounter
 from lidar_mi.schema.experiment import Experiment
-from lidar_mi.schema.platform import Platform
 from lidar_mi.units import shown
 
 # Models of an aircraft that are not JSBSim's, as the report calls them.
@@ -64,7 +63,7 @@ class Film(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A figure as a data URL, the fractions of its width at which panels part, and what is seen."""
+    """A figure as a data URL, its panel boundaries as fractions of the width, and its alt text."""
 
     title: str
     caption: str
@@ -134,7 +133,7 @@ def page(
         name=experiment.name,
         simulated=simulated(experiment, versions, metrics),
         resolved=resolved,
-        metrics={key: _rounded(key, value) for key, value in metrics.items()},
+        metrics={key: f"{value:.4g} {unit_of(key)}".strip() for key, value in metrics.items()},
         answer=answer,
         overview=overview,
         data=data,
@@ -213,15 +212,17 @@ def simulated(
                 f"{percent(rotor.turbulence)}"
             )
         else:
-            when = "" if wake.time is None else f" at {wake.time:.15g} s"
-            flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
+            time = "" if wake.time is None else f" at {wake.time:.15g} s"
+            flow = f"{wake.file}{time}, {wake.spacing:g} m grid"
         texture = "no texture added"
         if wake.texture.rms:
             scale = f"outer scale {wake.texture.outer_scale:g} m"
             texture = f"texture of {percent(wake.texture.rms)} rms, {scale}"
         rows.append(("wake", f"{flow}; {texture}"))
         flight = experiment.encounter
-        rows.append(_flight(flight) if flight else _platform(experiment.platform))
+        steps = f"{shown(experiment.platform.dt, 's')} apart"
+        platform = "platform", f"{shown(experiment.platform.speed, 'm/s')}, images {steps}"
+        rows.append(_flight(flight) if flight else platform)
         distance = flight.look_ahead if flight else scan.range
         beam = (
             f"{shown(lidar.wavelength, 'nm')}, {shown(lidar.pulse_energy, 'mJ')}, "
@@ -267,10 +268,6 @@ def simulated(
     return rows
 
 
-def _platform(platform: Platform) -> tuple[str, str]:
-    return "platform", f"{shown(platform.speed, 'm/s')}, images {shown(platform.dt, 's')} apart"
-
-
 def _flight(encounter: Encounter) -> tuple[str, str]:
     path, model = encounter.path, encounter.aircraft.model
     kind = _MODELS.get(model, f"JSBSim's {model}")
@@ -280,8 +277,3 @@ def _flight(encounter: Encounter) -> tuple[str, str]:
         f"{kind}, at {shown(path.speed, 'm/s')}, {crossing if wake else ''}on a path of "
         f"{math.degrees(path.climb_angle):+.3g} degrees; {encounter.rate:g} slabs a second"
     )
-
-
-def _rounded(key: str, value: float) -> str:
-    """A metric with four digits and its unit."""
-    return f"{value:.4g} {unit_of(key)}".strip()

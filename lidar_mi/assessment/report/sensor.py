@@ -96,7 +96,7 @@ def _limit_of_u(metrics: Mapping[str, float]) -> list[str]:
 
 
 def _not_stated(errors: PlatformErrors) -> list[str]:
-    """That the platform has errors which standard errors do not include."""
+    """A sentence on errors of the platform that standard errors do not include."""
     if errors == PlatformErrors():
         return []
     text = (
@@ -141,8 +141,8 @@ def _rate(metrics: Mapping[str, float], name: str) -> str:
     rate, power, beams = (
         metrics[f"sensor.{name}.{key}"] for key in ("pulses_per_second", "average_power", "beams")
     )
-    at_once = f", {beams} directions at a time" if beams > 1 else ""
-    return f"{three(rate)} pulses per second{at_once}, {three(power)} W of light"
+    parallel = f", {beams} directions at a time" if beams > 1 else ""
+    return f"{three(rate)} pulses per second{parallel}, {three(power)} W of light"
 
 
 def _numbers(metrics: Mapping[str, float]) -> NumberTable:

@@ -14,17 +14,17 @@ from lidar_mi.schema.experiment import Experiment
 
 _FRACTION = f"{Source.NOISY}.monte_carlo_fraction"
 _SAMPLES = f"{Source.BACKSCATTER}.samples_per_beam"
-# Of an error: what the rest of it is, and so the number of samples, follows from a small difference
-_NEARLY_ALL = 0.9
-# Of a mean square error that is the simulation's, 5 % of the rms error: worth a sentence.
+# Above this fraction of the error the remainder, and so the number of samples, is ill-determined.
+_LARGEST_PART = 0.9
+# Least fraction of the mean square error that is mentioned: 5 % of the rms error.
 _LEAST_PART = 0.1
 
 
 def simulation_sentence(experiment: Experiment, metrics: Mapping[str, float]) -> str:
-    """Which part of the wind's error is the simulation's; empty where it is as small as asked for.
+    """The part of the wind's error by the simulation; empty where it is as small as requested.
 
-    Which part of the images' noise it is, of volumes, whose winds are not retrieved once more, and
-    where no method has a vector that is valid with this noise and with as much again.
+    The part of the images' noise for volumes, whose winds are not retrieved again, and where no
+    vector is valid with twice this noise.
     """
     if _SAMPLES not in metrics:
         return ""
@@ -77,7 +77,7 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
             else ""
         )
         return f"render.max_samples: {text}{times}"
-    # two digits of it are known
+    # it is known to two digits
     expected = f"{float(f'{sufficient:.2g}'):.0f} or more" if sufficient else "more"
     visible = 0.0 if sufficient else _texture_visible(experiment, metrics)
     if visible > samples:
@@ -126,7 +126,7 @@ def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str])
 
 
 def _texture_visible(experiment: Experiment, metrics: Mapping[str, float]) -> float:
-    """Samples per beam at which the noise is as small a part of the texture; 0: no texture."""
+    """Samples per beam for the same fraction of the texture's variance; 0: no texture."""
     texture = experiment.wake.texture.rms if experiment.wake else 0.0
     if not texture:
         return 0.0
@@ -135,10 +135,10 @@ def _texture_visible(experiment: Experiment, metrics: Mapping[str, float]) -> fl
 
 
 def _sufficient_samples(experiment: Experiment, metrics: Mapping[str, float]) -> float:
-    """Samples per beam that are enough; 0: not known, as hardly any error is of something else."""
+    """Samples per beam that suffice; 0: unknown, as nearly all of the error is the simulation's."""
     samples, allowed = metrics[_SAMPLES], experiment.render.monte_carlo_fraction
     if _FRACTION in metrics:
         return samples * metrics[_FRACTION] / allowed
     parts = () if experiment.volume else simulation_parts(metrics, experiment.retrieval.methods)
     largest = max((part.fraction for part in parts), default=1.0)
-    return samples * largest / (1 - largest) / allowed if largest < _NEARLY_ALL else 0.0
+    return samples * largest / (1 - largest) / allowed if largest < _LARGEST_PART else 0.0

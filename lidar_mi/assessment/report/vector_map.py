@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.atmosphere.vortices.cores import Core
+from lidar_mi.flags import masks_of
 
 # A map about as dense as vectors can be selected on a screen.
 _COLUMNS = 55
@@ -47,8 +48,6 @@ def map_data(
         node = np.meshgrid(thin["y"], thin["z"])[0 if axis == "y" else 1]
         at = thin[f"{axis}_vector"].values if f"{axis}_vector" in thin.variables else node
         place[axis] = [round(float(p), 2) for p in np.where(np.isfinite(at), at, node).ravel()]
-    flag = thin["flag"].attrs
-    meanings = [text.replace("_", " ") for text in flag["flag_meanings"].split()]
     step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
     return {
         **place,
@@ -66,8 +65,8 @@ def map_data(
         ],
         "flag": [int(bits) for bits in thin["flag"].values.ravel()],
         "flags": {
-            str(int(mask)): text
-            for mask, text in zip(np.ravel(flag["flag_masks"]), meanings, strict=True)
+            str(mask): meaning.replace("_", " ")
+            for meaning, mask in masks_of(thin["flag"].attrs).items()
         },
         "cores": [[round(core.y, 2), round(core.z, 2)] for core in cores],
     }

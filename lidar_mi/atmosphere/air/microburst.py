@@ -19,8 +19,6 @@ OUTFLOW_HEIGHT = 0.22
 BOUNDARY_LAYER = 12.5
 """z* over the height of the boundary layer."""
 
-OUTFLOW_RADIUS = 1.1212
-"""Radius of the largest outflow over that of the downdraft."""
 
 LARGEST_OUTFLOW = 0.2357
 """Largest outflow over lambda R."""

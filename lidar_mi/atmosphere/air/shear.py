@@ -68,7 +68,7 @@ class LogarithmicShear:
             )
 
     def wind_at(self, height: ArrayLike) -> np.ndarray:
-        """Of the surface layer, m/s, at heights above the ground (m)."""
+        """Wind of the surface layer, m/s, at heights above the ground (m)."""
         above = np.maximum(np.asarray(height, float) / self.roughness, 1.0)
         return self.speed * np.log(above) / math.log(self.reference / self.roughness)
 
@@ -80,6 +80,6 @@ class LogarithmicShear:
 
 
 def _full(values: np.ndarray, *others: ArrayLike) -> np.ndarray:
-    """Values in the shape that all have together."""
+    """Values broadcast to the common shape."""
     shape = np.broadcast_shapes(values.shape, *(np.shape(a) for a in others))
     return np.broadcast_to(values, shape)

@@ -27,7 +27,7 @@ UNSTEADINESS = 0.5
 """Rate of a mode over sqrt(k^3 E(k)) (Fung et al., J. Fluid Mech. 236, 281-318, 1992)."""
 
 MODES = 600
-"""Waves of a field."""
+"""Number of modes of a field."""
 
 # Longest waves over the length scale, 2 pi / (k L): 5e-5 of von Karman's energy is in longer ones.
 _LOWEST = 0.05
@@ -68,8 +68,8 @@ def energy_spectrum(k: ArrayLike, sigma: float, length: float, spectrum: Spectru
 class Turbulence:
     """One realisation of turbulence: a Gaussian field without divergence.
 
-    u(x, t) = sum over modes of a cos(k x - w t) + b sin(k x - w t) with a and b normal to k. Each
-    octave of wavenumbers has as many modes as any other; they hold the energy of the spectrum.
+    u(x, t) = sum over modes of a cos(k x - w t) + b sin(k x - w t) with a and b normal to k. Every
+    octave of wavenumbers has the same number of modes, with the energy of the spectrum.
 
     Attributes
     ----------

@@ -90,7 +90,7 @@ class AirVolume:
 
     @cached_property
     def times(self) -> np.ndarray:
-        """Of the states, s; of frozen air one."""
+        """Times of the states, s; one for frozen air."""
         return self.flow["time"].values if "time" in self.flow.dims else np.zeros(1)
 
     def _state(self, index: int) -> xr.Dataset:
@@ -99,17 +99,17 @@ class AirVolume:
     @cached_property
     def mean_wind(self) -> tuple[float, float]:
         """Mean u and v of the volume at the height, m/s, over all states."""
-        over = [name for name in ("time", "x", "y") if name in self.flow.dims]
-        level = self.flow[["u", "v"]].mean(over).interp(z=self.height)
-        # below the lowest or above the highest nodes that of the nearest
-        nearest = self.flow[["u", "v"]].mean(over).sel(z=self.height, method="nearest")
+        averaged = [name for name in ("time", "x", "y") if name in self.flow.dims]
+        level = self.flow[["u", "v"]].mean(averaged).interp(z=self.height)
+        # beyond the lowest and highest nodes, the nearest
+        nearest = self.flow[["u", "v"]].mean(averaged).sel(z=self.height, method="nearest")
         wind = level.where(np.isfinite(level), nearest)
         return float(wind["u"]), float(wind["v"])
 
     def _moved(self, last: float) -> tuple[tuple[float, float], tuple[float, float]]:
         """How far the mean wind has carried the air at the first and at the last state needed, m.
 
-        Frozen air is looked up where it was at the only state.
+        Frozen air has a single state.
         """
         state = min(int(np.searchsorted(self.times, last)), len(self.times) - 1)
         u, v = self.mean_wind
@@ -119,7 +119,7 @@ class AirVolume:
     def missing(
         self, x: ArrayLike, y: ArrayLike, z: ArrayLike, last: float = 0.0
     ) -> dict[str, tuple[float, float, float, float]]:
-        """Along each axis that does not hold all places: its extent, and that of the places; m.
+        """Axes too short for the places: extent of the axis and of the places, m.
 
         With states until the time ``last`` (s) of a series.
         """
@@ -159,10 +159,10 @@ class AirVolume:
         """u, v, w (m/s) at places (m) and times (s), which broadcast."""
         places = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
         shape = places[0].shape
-        at_x, at_y, at_z, when = (part.ravel() for part in places)
-        wind, count = np.zeros((3, when.size)), len(self.times)
-        # 2.0: halfway between the states 1 and 2 is 1.5
-        position = np.interp(when, self.times, np.arange(count)) if count > 1 else 0.0 * when
+        at_x, at_y, at_z, times = (part.ravel() for part in places)
+        wind, count = np.zeros((3, times.size)), len(self.times)
+        # as an index: halfway between the states 1 and 2 is 1.5
+        position = np.interp(times, self.times, np.arange(count)) if count > 1 else 0.0 * times
         mean_u, mean_v = self.mean_wind
         for index in np.unique([np.floor(position), np.ceil(position)]).astype(int):
             weight = np.clip(1 - np.abs(position - index), 0, None)

@@ -125,8 +125,8 @@ class Line:
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Frequency offsets of ``n`` photons, Hz."""
-        which = rng.choice(len(self.weights), n, p=self.weights)
-        return self.offsets[which] + self.sigmas[which] * rng.standard_normal(n)
+        component = rng.choice(len(self.weights), n, p=self.weights)
+        return self.offsets[component] + self.sigmas[component] * rng.standard_normal(n)
 
     def shifted(self, offset: float) -> "Line":
         """The line shifted by ``offset`` Hz."""

@@ -157,13 +157,13 @@ def molecular_scattering(
     """
     king = king_factor(wavelength, co2)
     # extinction is by the whole band, the received light that of one
-    whole, passed = anisotropy(king, "rayleigh"), anisotropy(king, band)
+    whole, in_band = anisotropy(king, "rayleigh"), anisotropy(king, band)
     density = number_density(pressure, temperature)
     sigma = cross_section(wavelength, co2)
     extinction = density * sigma
     # Intensity ratios of a freely turning linear molecule (Placzek): total 45 + 10 e,
     # backward 45 + 7 e with 3/(8 pi) of the isotropic part.
-    per_extinction = 3 / (8 * math.pi) * (45 + 7 * passed) / (45 + 10 * whole)
+    per_extinction = 3 / (8 * math.pi) * (45 + 7 * in_band) / (45 + 10 * whole)
     return MolecularScattering(
         band=band,
         wavelength=wavelength,
@@ -173,11 +173,11 @@ def molecular_scattering(
         king_factor=king,
         cross_section=sigma,
         extinction=extinction,
-        albedo=(45 + 10 * passed) / (45 + 10 * whole),
+        albedo=(45 + 10 * in_band) / (45 + 10 * whole),
         backscatter=extinction * per_extinction,
         lidar_ratio=1 / per_extinction,
         depolarization=depolarization_factor(king, band),
-        depolarization_ratio=3 * passed / (45 + 4 * passed),
+        depolarization_ratio=3 * in_band / (45 + 4 * in_band),
     )
 
 

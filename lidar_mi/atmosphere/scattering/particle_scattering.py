@@ -85,8 +85,8 @@ def make_table(
     scatter = _sphere if sphere else _spheroid
     sizes = particles.sizes
     low, high = math.log(sizes.smallest), math.log(sizes.largest)
-    # Equal steps in ln r: the integrand vanishes at both ends, where the rule is as good as
-    # Gauss's, and it spends no nodes on the largest sizes, which cost most.
+    # Equal steps in ln r: as accurate as Gauss's rule for an integrand that vanishes at both ends,
+    # and with fewer nodes at the largest sizes, which cost most.
     radius = np.exp(low + (high - low) * (np.arange(nodes) + 0.5) / nodes)
     number = sizes(radius) * radius
     number /= number.sum()

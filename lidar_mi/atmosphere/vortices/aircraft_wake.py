@@ -18,9 +18,9 @@ class AircraftType(NamedTuple):
 
     name: str
     span: float
-    """Of the wing, m."""
+    """Wing span, m."""
     landing_mass: float
-    """Maximum at landing, kg."""
+    """Maximum landing mass, kg."""
 
 
 TYPES = {

@@ -49,7 +49,7 @@ class FilamentsAlongPath:
 
     @property
     def wavelength(self) -> float:
-        """m."""
+        """Wavelength, m."""
         return self.pair.crow_wavelength or CROW_WAVELENGTH * self.pair.separation
 
     @cached_property
@@ -84,10 +84,10 @@ class FilamentsAlongPath:
 
     def centre_at(self, time: ArrayLike) -> np.ndarray:
         """Place (3, ...) at a time of the point that is at x_c and ``miss`` at t_c, m."""
-        straight, met = (np.stack(self.pair.centre_at(t)) for t in (time, self.pair.t_c))
-        met = met.reshape(3, *[1] * np.ndim(time))
-        up = self.pair.axes[2].reshape(met.shape)
-        sunk = ((straight - met) * up).sum(0)
+        straight, at_arrival = (np.stack(self.pair.centre_at(t)) for t in (time, self.pair.t_c))
+        at_arrival = at_arrival.reshape(3, *[1] * np.ndim(time))
+        up = self.pair.axes[2].reshape(at_arrival.shape)
+        sunk = ((straight - at_arrival) * up).sum(0)
         return straight + (self._descent - 1) * sunk * up
 
     def wind(self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike) -> Components:

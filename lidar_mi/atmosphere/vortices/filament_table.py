@@ -13,18 +13,18 @@ from lidar_mi.atmosphere.vortices.filaments import Filaments
 from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 
-# The fine grid reaches so many core radii beyond the lines, in l and n: five nodes of the coarse
-# one, in which what its splines miss of the cores falls to 1e-3. The coarse one reaches so many
-# periods.
-_MARGIN = 8.0
-_WIDE = 0.4
+# The fine grid reaches this many core radii beyond the lines, in l and n: five nodes of the coarse
+# grid, over which the error of its splines by the cores falls to 1e-3. The coarse grid reaches this
+# many periods.
+_FINE_REACH = 8.0
+_COARSE_REACH = 0.4
 # Spacing across the axis in core radii, of the fine and the coarse grid; along it twice as much in
-# the fine one, as lines are steep to the axis by less than that, but for rings.
+# the fine one, as lines, except rings, are steep by less than that.
 _FINE, _COARSE = 0.4, 1.6
 # Periods in core radii up to which both grids have at most some million nodes.
 _LONGEST = 400.0
 # Nodes beyond the period's ends that a cubic spline needs.
-_BEYOND = 3
+_SPLINE_MARGIN = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class _Grid:
     def index(self, places: np.ndarray) -> np.ndarray:
         """(3, n) indices of places (3, n), m."""
         index = (places - self.start[:, None]) / self.spacing[:, None]
-        index[0] = np.mod(index[0], self.planes) + _BEYOND
+        index[0] = np.mod(index[0], self.planes) + _SPLINE_MARGIN
         return index
 
     def inside(self, index: np.ndarray) -> np.ndarray:
@@ -82,14 +82,14 @@ class FilamentTable:
         nodes = np.concatenate([curve.places for curve in filaments.curves])
         radius, period = filaments.core_radius, filaments.period
         wide, low, high = np.abs(nodes[:, 1]).max(), nodes[:, 2].min(), nodes[:, 2].max()
-        margin = _MARGIN * radius
+        margin = _FINE_REACH * radius
         along = _FINE if len(filaments.curves) == 1 else 2 * _FINE
         self._fine = self._grid(
             crest,
             (wide + margin, low - margin, high + margin),
             np.array([along, _FINE, _FINE]) * radius,
         )
-        reach = _WIDE * period
+        reach = _COARSE_REACH * period
         self._coarse = self._grid(
             crest, (wide + reach, low - reach, high + reach), np.full(3, _COARSE * radius)
         )
@@ -125,18 +125,23 @@ class FilamentTable:
             low + np.arange(int(np.ceil((high - low) / spacing[2])) + 1) * spacing[2],
         ]
         quarter = self._filaments.velocity(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-        # to the plane between the vortices l is odd; to that of a crest s is odd
+        # about the plane between the vortices l is odd; about that of a crest s is odd
         left = quarter[:, :0:-1] * np.array([1.0, -1.0, 1.0])
-        whole = np.concatenate([left, quarter], axis=1)
-        behind = whole[-2:0:-1] * np.array([-1.0, 1.0, 1.0])
-        whole = np.concatenate([whole, behind], axis=0)
+        period_values = np.concatenate([left, quarter], axis=1)
+        behind = period_values[-2:0:-1] * np.array([-1.0, 1.0, 1.0])
+        period_values = np.concatenate([period_values, behind], axis=0)
         splines = []
         for k in range(3):
-            values = scipy.ndimage.spline_filter1d(whole[..., k], axis=0, mode="grid-wrap")
+            values = scipy.ndimage.spline_filter1d(period_values[..., k], axis=0, mode="grid-wrap")
             for axis in (1, 2):
                 values = scipy.ndimage.spline_filter1d(values, axis=axis, mode="mirror")
             splines.append(
-                np.take(values, range(-_BEYOND, len(values) + _BEYOND), axis=0, mode="wrap")
+                np.take(
+                    values,
+                    range(-_SPLINE_MARGIN, len(values) + _SPLINE_MARGIN),
+                    axis=0,
+                    mode="wrap",
+                )
             )
         start = np.array([crest, -axes[1][-1], axes[2][0]])
         step = np.array([axes[0][1] - axes[0][0], *spacing[1:]])

@@ -88,13 +88,13 @@ class Filaments:
         shifts = [j * self.period for j in range(-self.images, self.images + 1)]
         size = max(1, _CHUNK // len(nodes))
         for first in range(0, len(flat), size):
-            some = flat[first : first + size]
+            chunk = flat[first : first + size]
             # the core matters only near a line; neighbouring points are far from most nodes
-            near = self._within(some, nodes, _FAR * self._sigma)
+            near = self._within(chunk, nodes, _FAR * self._sigma)
             wind[first : first + size] += (
-                self._sum(some, nodes[near], steps[near], [0.0], self._kernel, self._nearby)
-                + self._sum(some, nodes[~near], steps[~near], [0.0], self._far, self._nearby)
-                + self._sum(some, far_nodes, far_steps, shifts, self._far, self._beyond)
+                self._sum(chunk, nodes[near], steps[near], [0.0], self._kernel, self._nearby)
+                + self._sum(chunk, nodes[~near], steps[~near], [0.0], self._far, self._nearby)
+                + self._sum(chunk, far_nodes, far_steps, shifts, self._far, self._beyond)
             )
         return wind.reshape(np.shape(places))
 
@@ -104,7 +104,7 @@ class Filaments:
         return self.core_radius / math.sqrt(2 * LAMB_OSEEN_CONSTANT)
 
     def _within(self, places: np.ndarray, nodes: np.ndarray, reach: float) -> np.ndarray:
-        """Whether nodes are so near to the box that holds the places."""
+        """Whether nodes are within a distance (m) of the box that holds the places."""
         low, high = places.min(0), places.max(0)
         away = np.abs(nodes - (low + high) / 2)
         away[:, 0] = np.abs(away[:, 0] - self.period * np.rint(away[:, 0] / self.period))
@@ -137,16 +137,16 @@ class Filaments:
         return np.stack([u, v, w], axis=1) / (4 * np.pi)
 
     def _nearby(self, s: np.ndarray) -> np.ndarray:
-        """Part of a place at the distance s along the axis that fine nodes have, the nearest.
+        """Weight of the fine nodes at the distance s along the axis.
 
-        1 up to a quarter of a period, 0 from half of it on: a sum that ended there would depend on
-        where its last node is.
+        1 up to a quarter of a period, 0 from half of it on: a sum with a sharp end would depend on
+        the place of its last node.
         """
         ramp = np.clip(4 * np.abs(s) / self.period - 1, 0.0, 1.0)
         return np.cos(np.pi / 2 * ramp) ** 2
 
     def _beyond(self, s: np.ndarray) -> np.ndarray:
-        """Part that coarse nodes have."""
+        """Weight of the coarse nodes."""
         return 1 - self._nearby(s)
 
     def _far(self, r2: np.ndarray) -> np.ndarray:
@@ -154,7 +154,7 @@ class Filaments:
         if self.model == "burnham_hallock":
             r2 = r2 + self.core_radius**2
         else:
-            # nearer ones have no weight: what is finite is enough
+            # nearer ones have no weight: any finite value will do
             r2 = np.maximum(r2, self._sigma**2)
         return 1 / (r2 * np.sqrt(r2))
 

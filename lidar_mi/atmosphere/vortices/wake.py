@@ -12,7 +12,8 @@ from lidar_mi.errors import InputError
 
 MOST_NODES = 10**8
 
-# how far the extent may be from a whole number of cells, in cells: axes of files are even to this
+# largest deviation of the extent from a whole number of cells, in cells: axes of files are even to
+# this
 _UNEVEN = 1e-3
 
 

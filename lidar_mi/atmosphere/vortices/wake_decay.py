@@ -21,7 +21,7 @@ def sarpkaya_time(dissipation: float) -> float:
         return float((0.7475 / dissipation) ** 0.75)
     if dissipation > _MODERATE:
         low, high = 2.0, 8.0
-        # the law falls with T* there; halving the interval leaves rounding
+        # the law is monotone in T*: bisection to rounding
         for _ in range(60):
             middle = (low + high) / 2
             above = middle**0.25 * math.exp(-0.70 * middle) > dissipation

@@ -191,8 +191,8 @@ class PairAlongPath:
             above = speed * (self.t_c - time)
         else:
             ages = (self.age + time, self.age + self.t_c)
-            now, met = (np.exp(-np.asarray(age) / self.decay_time) for age in ages)
-            above = speed * self.decay_time * (now - met)
+            now, at_arrival = (np.exp(-np.asarray(age) / self.decay_time) for age in ages)
+            above = speed * self.decay_time * (now - at_arrival)
         arrival, wind = (self.x_c, *self.miss), (0.0, *self.mean_wind)
         x, y, z = (
             place + speed * (time - self.t_c) + axis * above
@@ -213,12 +213,12 @@ class PairAlongPath:
             if self.crow_amplitude:
                 s = _dot(d, along)
                 offset, slope = self._deformation(s, side)
-                # from where the deformed line is, at the same place along its mean axis
+                # relative to the deformed line at the same place along its mean axis
                 d = [a - s * b - c for a, b, c in zip(d, along, offset, strict=True)]
                 length = np.sqrt(1 + slope[3] ** 2)
                 tangent = tuple((a + b) / length for a, b in zip(along, slope[:3], strict=True))
             axial = _dot(d, tangent)
-            # rounding can make it negative on the axis
+            # rounding can make it negative
             r2 = np.maximum(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - axial**2, 0.0)
             omega = angular_velocity(r2, side * strength, self.core_radius, self.model)
             # omega times the vector product of tangent and distance

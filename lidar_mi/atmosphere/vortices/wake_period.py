@@ -10,10 +10,10 @@ from lidar_mi.errors import InputError
 
 Ends = Literal["mirror", "blend", "refuse"]
 
-# A period is closed where its seam is no rougher than the roughest place within it, by this factor.
-_SEAM = 2.0
+# Largest ratio of the roughness at the seam to that within a period.
+_ROUGHEST_SEAM = 2.0
 # Planes that are equal to this fraction of the largest speed are the same plane.
-_EQUAL = 1e-5
+_SAME_PLANE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def one_period(
         falls to 0 at both mirrors by a raised cosine over ``length``, which makes divergence there.
     blend
         Its last ``length`` is blended into the first one by a raised cosine, and the period is
-        shorter by that. Cores that differ are blurred, and what differs of u makes divergence.
+        shorter by that. Differences of the cores are blurred, and differences of u make divergence.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def one_period(
         )
     values = _winds(flow)
     step = float(flow["x"][1] - flow["x"][0])
-    floor = _EQUAL * np.abs(values).max()
+    floor = _SAME_PLANE * np.abs(values).max()
     if np.ptp(values, axis=1).max() <= floor:
         return flow.isel(x=[0]), Closing("uniform", float("nan"))
     repeated = np.abs(values[:, -1] - values[:, 0]).max() <= floor
@@ -121,7 +121,7 @@ def _winds(flow: xr.Dataset) -> np.ndarray:
 
 
 def _seam(values: np.ndarray, floor: float) -> str:
-    """What is not periodic; empty: nothing."""
+    """The reason why a volume is not periodic; empty: it is."""
     for order in (1, 2):
         # differences about the circle: those of the last `order` places go across the seam
         size = values
@@ -129,7 +129,7 @@ def _seam(values: np.ndarray, floor: float) -> str:
             size = np.roll(size, -1, axis=1) - size
         rms = np.sqrt((size**2).mean((0, 2, 3)))
         inside, seam = rms[:-order].max(), rms[-order:].max()
-        if seam > _SEAM * inside + floor:
+        if seam > _ROUGHEST_SEAM * inside + floor:
             measure = "step" if order == 1 else "curvature"
             return (
                 f"the {measure} from its last plane to its first is {seam / inside:.2g} times the "

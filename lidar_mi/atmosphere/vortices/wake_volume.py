@@ -17,18 +17,17 @@ from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.atmosphere.vortices.wake_path import Components, check_cut, cut_radius, wake_axes
 
 # Nodes beyond the period's ends that a cubic spline needs.
-_BEYOND = 3
+_SPLINE_MARGIN = 3
 
 
 @dataclass(frozen=True, eq=False)
 class VolumeAlongPath:
     """A simulated wake, repeated along an axis that crosses the flight path.
 
-    The state of one instant moves with ``drift`` and does not change: what the vortices do to each
-    other and to themselves in the seconds of an encounter beyond that is neglected. Values are
-    interpolated by cubic splines, periodic along the axis. Outside of the volume the wind is that
-    of two straight vortices at the mean places with the mean circulations, the extinction the
-    background.
+    The state of one instant moves with ``drift`` and does not change: any further induction in the
+    seconds of an encounter is neglected. Values are interpolated by cubic splines, periodic along
+    the axis. Outside of the volume the wind is that of two straight vortices at the mean places
+    with the mean circulations, the extinction the background.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ class VolumeAlongPath:
 
     @property
     def period(self) -> float:
-        """Of the wake along its axis, m."""
+        """Period of the wake along its axis, m."""
         x = self.flow["x"].values
         return float(x[-1] - x[0]) + self._steps[0]
 
@@ -94,7 +93,7 @@ class VolumeAlongPath:
             for axis in (1, 2):
                 values = scipy.ndimage.spline_filter1d(values, axis=axis, mode="mirror")
             coefficients[str(name)] = np.take(
-                values, range(-_BEYOND, len(values) + _BEYOND), axis=0, mode="wrap"
+                values, range(-_SPLINE_MARGIN, len(values) + _SPLINE_MARGIN), axis=0, mode="wrap"
             )
         return coefficients
 
@@ -129,7 +128,7 @@ class VolumeAlongPath:
             place = (places[k] - nodes[0]) / self._steps[k]
             if name == "x":
                 # the coefficients begin so many nodes before the first plane
-                place = np.mod(place, len(nodes)) + _BEYOND
+                place = np.mod(place, len(nodes)) + _SPLINE_MARGIN
             else:
                 # nodes at the rim are inside, whatever the rounding
                 inside &= (place >= -1e-9) & (place <= len(nodes) - 1 + 1e-9)

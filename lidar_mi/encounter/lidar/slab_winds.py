@@ -8,10 +8,10 @@ from concurrent.futures import Future
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import loky
-import numpy as np
 import torch
 import xarray as xr
 
+from lidar_mi.flags import masks_of
 from lidar_mi.retrieval.flow.next_flow import ExpectedFlow, Flow
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.vortices.model import wind as model_wind
@@ -80,9 +80,7 @@ def limits(wind: xr.Dataset) -> tuple[str, ...]:
     flag = wind["flag"]
     return tuple(
         f"wind: {name.replace('_', ' ')}"
-        for name, mask in zip(
-            flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"]), strict=True
-        )
+        for name, mask in masks_of(flag.attrs).items()
         if ((flag.values & mask) != 0).mean() >= _MOST
     )
 

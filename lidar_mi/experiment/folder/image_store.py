@@ -1,4 +1,4 @@
-"""Rendered images in a folder, finished and unfinished, each signed by what it was made from."""
+"""Rendered images in a folder, finished and unfinished, each with a signature of its inputs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from lidar_mi.io import exr
 from lidar_mi.io.arrays import read_arrays, write_arrays
 
 MADE_BY = "run_sha256"
-"""Attribute of an image: the hash of what it was rendered from."""
+"""Attribute of an image: the hash of its inputs."""
 BATCHES = "_batches.npz"
 """Suffix to the name of an unfinished image: its samples so far."""
 
@@ -23,8 +23,7 @@ BATCHES = "_batches.npz"
 class ImageStore:
     """Images of both lidars, by the names of the parts of their stages.
 
-    Rendered images are read back, so that they have the same float32 values whether they were
-    rendered just now or found.
+    Rendered images are read back, so that new and stored ones have the same float32 values.
 
     Attributes
     ----------

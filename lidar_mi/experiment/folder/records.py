@@ -1,4 +1,4 @@
-"""What is written in the folder of a run or of a study, read without what computes it."""
+"""Contents of the folder of a run or of a study, read without the code that computes them."""
 
 import functools
 import hashlib
@@ -56,9 +56,9 @@ def read_metrics(folder: str | Path) -> dict[str, float] | None:
     metrics = read_json(path, "metrics of a run")
     if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
         raise InputError(f"{path}: not written by a run; expected names with numbers")
-    if marker.is_file():  # which a study has not
+    if marker.is_file():  # a study has none
         checksum = read_record(folder).get("metrics", "")
-        if checksum is None:  # of an earlier run; this one is not done
+        if checksum is None:  # of an earlier run; this one is incomplete
             return None
         # older versions wrote no checksum
         if checksum and checksum != file_checksum(path):
@@ -130,7 +130,7 @@ def file_checksum(path: Path) -> str:
 
 @functools.lru_cache(64)
 def _checksum_of(path: Path, size: int, changed: int) -> str:
-    """Of a file as it was then: many runs of one process read the same file."""
+    """Checksum of a file in this state: many runs of one process read the same file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -253,7 +253,7 @@ def write_verdict(
     (folder / METRICS).unlink(missing_ok=True)
     checked = {**record, "metrics": hashlib.sha256(text.encode()).hexdigest()}
     samples = metrics.get(f"{Source.BACKSCATTER}.samples_per_beam")
-    if samples is not None:  # which the experiment may have left to be chosen
+    if samples is not None:  # which the experiment may leave open
         checked["samples_per_beam"] = int(samples)
     write_text(folder / RECORD, to_yaml(checked))
     write_text(folder / REPORT, page)
@@ -292,7 +292,7 @@ def write_result(folder: Path, name: str, value: Any, experiment: str, signature
 
 @contextmanager
 def held(folder: Path, kind: str) -> Iterator[None]:
-    """A folder with a record, made if missing and locked, that holds nothing of others.
+    """Create and lock a folder with a record; one with other contents is refused.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def held(folder: Path, kind: str) -> Iterator[None]:
     refuse_strangers(folder, RECORD, kind)
     make_folder(folder)
     with locked(folder):
-        # the former holder of the lock may have changed its experiment
+        # the former holder of the lock may have written an experiment
         refuse_strangers(folder, RECORD, kind)
         yield
 
@@ -341,7 +341,7 @@ def _versions() -> dict[str, str]:
 
 
 def made_by(record: Mapping[str, Any], keys: Keys | None = None) -> str:
-    """Hash of what a record says of settings, files and versions that rendered images depend on.
+    """Hash of the settings, files and versions in a record on which rendered images depend.
 
     Parameters
     ----------
@@ -374,7 +374,7 @@ def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None
 
 
 def _inputs(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
-    """The files named by an experiment, by key: a changed file makes another experiment."""
+    """The files named by an experiment, by key: an experiment differs if a file changes."""
     if experiment.wake is None:
         return {}
     paths = table_files(experiment.scattering, search_path)

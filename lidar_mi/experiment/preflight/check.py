@@ -47,7 +47,7 @@ from lidar_mi.schema.wake import Wake
 from lidar_mi.units import shown
 
 LEAST_SHOWN = 0.5
-"""Seconds of a part of a run that is shown."""
+"""Least time of a part of a run that is shown, s."""
 
 
 def sections(
@@ -77,7 +77,7 @@ def sections(
     InputError
         Anything that a run would refuse before it starts.
     """
-    # of the processor: other programs do not lengthen it
+    # processor time, which other programs do not affect
     start = time.process_time()
     prepared = prepare(experiment, search_path, without_warnings(notice))
     experiment, results = prepared.experiment, prepared.results
@@ -115,9 +115,9 @@ def sections(
         from lidar_mi.experiment.preflight.cost import with_number
 
         notice("timing a few samples and a retrieval", None)
-        # with the number that is chosen already: choosing it takes pilots
-        whole = with_number(experiment, chosen.number) if chosen else experiment
-        rows = [*_time(whole, results, preparation), _memory(experiment, results)]
+        # with the chosen number: another choice would cost pilots
+        sampled_experiment = with_number(experiment, chosen.number) if chosen else experiment
+        rows = [*_time(sampled_experiment, results, preparation), _memory(experiment, results)]
         yield "cost of the run, to a factor of 2", rows
     else:
         yield "cost of the run", [_memory(experiment, results)]
@@ -135,7 +135,7 @@ def _backscatter(
     if not wake.turbine:
         rows.append(("vortices", sense_of_rotation(wind, find_cores(wind))))
     divergence = relative_divergence(wind)
-    # NaN without vorticity to compare with
+    # NaN without vorticity
     if divergence == divergence:
         rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
     rows.append(("extinction", _span(1e3 * extinction.values, "1/km")))

@@ -1,8 +1,8 @@
 """Time of a run before it is started, calibrated on this machine by a probe of about a second.
 
 Rendering is timed with the experiment's own scene and few samples. All other steps have a cost per
-pixel that was measured on one machine, together with a fixed piece of work, the probe. The time of
-the probe here and now over its time there is the factor between the machines.
+pixel, measured on a reference machine together with a fixed piece of work, the probe. The ratio of
+the times of the probe is the factor between the machines.
 """
 
 import functools
@@ -82,7 +82,7 @@ class Cost(NamedTuple):
 
     @property
     def total(self) -> float:
-        """Of all parts."""
+        """Sum of all parts."""
         return START + sum(self)
 
 
@@ -132,7 +132,7 @@ def slowness() -> float:
     """Time of `probe` here over `PROBE_SECONDS`; once per process."""
     probe()  # loads libraries
     start = time.process_time()
-    # the mean of several: other programs disturb a single one
+    # the mean of several, as other programs disturb a single one
     for _ in range(_PROBES):
         probe()
     return (time.process_time() - start) / (_PROBES * PROBE_SECONDS)
@@ -153,8 +153,8 @@ def probe() -> None:
 def render_seconds(experiment: Experiment, results: Results) -> float:
     """Time of one image, from the first one with few samples and with four times as many.
 
-    Their difference has no part of what is done once, such as compiling. Where the number of
-    samples is to be chosen, with the time of doing so.
+    Their difference excludes work that is done once, such as compiling. If the number of samples is
+    chosen, the time of the choice is included.
     """
     plan, render = results["plans"][0], experiment.render
     inputs = {name: results[name] for name in ("truth", "plans", "air", "flows")}

@@ -141,11 +141,7 @@ def _flagged(found: xr.Dataset, lines: xr.Dataset) -> xr.Dataset:
     spread = np.array([np.quantile(away[sweep == number], _PART) for number in np.unique(sweep)])
     flag = found["flag"]
     masks = np.append(flag.attrs["flag_masks"], _UNEVEN_ECHO).astype(np.uint16)
-    about = {
-        "flag_masks": masks,
-        "flag_values": masks,
-        "flag_meanings": f"{flag.attrs['flag_meanings']} uneven_echo",
-    }
+    about = {"flag_masks": masks, "flag_meanings": f"{flag.attrs['flag_meanings']} uneven_echo"}
     uneven = np.where(spread > math.log(_UNEVEN), _UNEVEN_ECHO, 0).astype(flag.dtype)
     return found.assign(flag=("scan", flag.values | uneven, flag.attrs | about))
 

@@ -50,7 +50,7 @@ class VortexFits:
 
 def combined_vectors(wind3d: xr.Dataset | None) -> xr.Dataset | None:
     """Cross-flow wind of both lidars, with the flags of v and w; None: there is none."""
-    from lidar_mi.retrieval.combined.combine import CombinedFlag
+    from lidar_mi.flags import CombinedFlag
 
     if wind3d is None:
         return None

@@ -19,7 +19,8 @@ def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | Fil
     InputError
         A deformation of more than half of the separation, of filaments that are linked at age 0.
     """
-    path, wake, met = encounter.path, encounter.wake, encounter.path.start / encounter.path.speed
+    path, wake = encounter.path, encounter.wake
+    arrival = path.start / path.speed
     decay_time, crow = _decay_time(pair, wake), wake.crow
     bent = crow.model == "filaments"
     aged = PairAlongPath(
@@ -30,7 +31,7 @@ def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | Fil
         crossing_angle=path.crossing_angle,
         climb_angle=path.climb_angle,
         x_c=path.start,
-        t_c=met,
+        t_c=arrival,
         miss=(path.miss.y, path.miss.z),
         decay_time=decay_time,
         crow_amplitude=0.0 if bent else crow.amplitude,
@@ -46,7 +47,7 @@ def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | Fil
             f"expected below half of the separation, {pair.separation / 2:.4g} m"
         )
     # growth is that of the vortices at age 0, which decay little before they link
-    amplitude = grown(crow.amplitude, wake.age + met, pair.circulation, pair.separation)
+    amplitude = grown(crow.amplitude, wake.age + arrival, pair.circulation, pair.separation)
     return _filaments(aged, amplitude)
 
 

@@ -1,4 +1,4 @@
-"""The molecules of the air at the site: what they take from a beam and send back."""
+"""The molecules of the air at the site: extinction and backscatter."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ from lidar_mi.schema.site import Site
 from lidar_mi.schema.wake import ExtinctionMapping
 
 SHORTEST_WAVELENGTH, LONGEST_WAVELENGTH = 0.2e-6, 2e-6
-"""m, of the refractive index of air; beyond, molecules scatter less than 7e-8 m^-1."""
+"""Wavelengths (m) of the refractive index of air; beyond, molecules scatter less than 7e-8 m^-1."""
 
 
 class ClearAir(NamedTuple):
@@ -76,9 +76,9 @@ def in_air_of_its_site(experiment: Experiment, search_path: Path) -> Experiment:
     """The experiment with its fringe-imaging Doppler lidar in the air of the site.
 
     Altitude, pressure, temperature, backscatter and extinction are those of the site where
-    ``doppler.lidar`` does not state its own. Backscatter is that of molecules and of as much
-    aerosol as ``aerosol_fraction`` says, extinction that of molecules; light of aerosol alone
-    leaves both as they are. Without a site, all is as stated.
+    ``doppler.lidar`` does not state its own. Backscatter is that of molecules plus the
+    ``aerosol_fraction``, extinction that of molecules; neither changes if all light is of aerosol.
+    Without a site nothing changes.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def _air_at(altitude: float, site: Site, search_path: Path) -> tuple[float, floa
     logarithm = np.interp(altitude, sounding.altitude, np.log(sounding.pressure))
     pressure = float(np.exp(logarithm))
     temperature = float(np.interp(altitude, sounding.altitude, sounding.temperature))
-    # half to twice: no weather, but a wrong unit or another planet
+    # a factor of two is no weather, but a wrong unit
     usual = standard_atmosphere(altitude).pressure
     for name, value, least, most in (
         ("pressure", pressure / 100, usual / 200, usual / 50),

@@ -24,7 +24,7 @@ from lidar_mi.schema.wake import ExtinctionMapping
 
 
 class Later(Sequence[xr.DataArray]):
-    """A field at t1 and t2; that at t2 is advected when it is first asked for.
+    """A field at t1 and t2; that at t2 is advected on first use.
 
     Advection of a volume takes seconds, and nothing that is checked before a run needs it.
     """
@@ -112,10 +112,10 @@ def make_truth(
             f"wake: missing in {experiment.name}; expected the section of a wake that a "
             "backscatter lidar observes"
         )
+    search_path = experiment.folder if beside is None else Path(beside)
     if flows is None:
-        flows = flows_of(experiment, None if beside is None else Path(beside))
-    path = experiment.folder if beside is None else Path(beside)
-    clear = call(clear_air, experiment, search_path=path)
+        flows = flows_of(experiment, search_path)
+    clear = call(clear_air, experiment, search_path=search_path)
     return call(true_air, experiment, flows=flows, clear_air=clear, advected=advected)
 
 

@@ -22,7 +22,7 @@ Pairs = tuple[tuple[Vortex, ...], tuple[Vortex, ...]]
 
 
 def refuse_ages(section: str, ages: Mapping[str, float | None]) -> None:
-    """A wake of a file is as old as it is.
+    """Refuse ages and decay times for the wake of a file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The air of an encounter: what flies, what is seen and what is advected is in all of it."""
+"""The air of an encounter, for the aircraft, the images and the advection alike."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -32,7 +32,7 @@ from lidar_mi.schema.section import Section
 from lidar_mi.units import AS_GIVEN
 
 # Planes across the path, in separations from the middle, over which a wake's drift is averaged.
-_AROUND = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_DRIFT_PLANES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 def air_along_path(experiment: Experiment) -> WakeAlongPath:
@@ -55,10 +55,11 @@ def air_along_path(experiment: Experiment) -> WakeAlongPath:
         parts = (volume, *parts)
     if not air.wake:
         return AirAlongPath(None, parts, frame)
-    met = path.start / path.speed
-    # a gust is shorter than the wake: it does not move all of it
-    wide = [part for part in parts if not isinstance(part, Gust)]
-    return AirAlongPath(wake, parts, frame, _drift(wake, wide, frame, path.start, met), met)
+    arrival = path.start / path.speed
+    # no gusts: they are shorter than the wake and do not move it as a whole
+    lasting = [part for part in parts if not isinstance(part, Gust)]
+    drift = _drift(wake, lasting, frame, path.start, arrival)
+    return AirAlongPath(wake, parts, frame, drift, arrival)
 
 
 def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir, ...]:
@@ -96,7 +97,7 @@ def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir
 
 
 def described(air: schema.Air, path: flight.Path) -> list[tuple[str, str]]:
-    """What the air is, for people: names of its parts, and a line for each."""
+    """The air in words: names of its parts, and a line for each."""
     rows = []
     if air.turbulence is not None:
         sigma, length = turbulence_scales(air.turbulence, path.altitude)
@@ -121,7 +122,7 @@ def _keys(part: Section) -> str:
 
 
 def _largest_speed(gust: schema.Gust, altitude: float) -> float:
-    """Of a gust, m/s: its own, or the design speed."""
+    """Speed of a gust, m/s: as given, or the design speed."""
     if gust.speed is not None:
         return gust.speed
     factor = gust.alleviation or 1.0
@@ -134,7 +135,7 @@ def _largest_speed(gust: schema.Gust, altitude: float) -> float:
 
 def _volume(settings: schema.AirVolume, experiment: Experiment) -> AirVolume:
     path = find_file(settings.file, experiment.folder, "encounter.air.volume.file")
-    # its time of change: a file that is written anew is read anew
+    # the modification time: a changed file is read again
     height = encounter_of(experiment).path.altitude
     return _read_volume(path, path.stat().st_mtime_ns, settings.model_dump_json(), height)
 
@@ -175,7 +176,7 @@ def _flow(path: Path, volume: schema.AirVolume) -> xr.Dataset:
             f"encounter.air.volume.series: needs a file of several times and `time`, one of them; "
             f"{path.name} has {listed}"
         )
-    # the state at `time` is chosen as of a single one, whatever its rounding
+    # the state at `time` is chosen as for a single state, whatever its rounding
     first = read_wake(path, volume.time, volume.names, require=["u"])
     chosen = [float(first["time"]), *times[times > float(first["time"])]]
     states = [first, *(read_wake(path, t, volume.names, require=["u"]) for t in chosen[1:])]
@@ -229,7 +230,7 @@ def _drift(
     places = [(x, 0.0, 0.0)]
     if middle:
         separation = abs(middle[0].y - middle[1].y)
-        planes = [x + part * separation for part in _AROUND]
+        planes = [x + part * separation for part in _DRIFT_PLANES]
         places = [
             (plane, vortex.y, vortex.z)
             for plane in planes

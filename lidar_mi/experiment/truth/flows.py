@@ -30,9 +30,9 @@ Flows = tuple[xr.Dataset, xr.Dataset | None]
 Advection = Callable[[xr.DataArray], xr.DataArray]
 
 _LEAST_PLANES = 4
-"""Of a file, along x: a cubic spline needs four."""
+"""Least planes of a file along x: a cubic spline needs four."""
 _EDGE = 2
-"""Nodes at either end along x that air in the gates must not come from.
+"""Nodes at either end along x from which no air of the gates may come.
 
 Beyond the ends a spline has the value at the end.
 """
@@ -52,7 +52,7 @@ def mean_flow(flows: Flows) -> xr.Dataset:
 def advection_by(observation: Observation, flows: Flows) -> Advection:
     """From a field to the field after dt in the frame of the gates; trajectories are followed once.
 
-    They are followed when they are first needed: a field of one value stays.
+    They are computed on first use: a uniform field needs none.
     """
     flow, dt = mean_flow(flows), observation.platform.dt
 
@@ -157,21 +157,10 @@ def _flows(observation: Observation, seed: int, most: int, search_path: Path) ->
 def _air_of_gates(
     wake: Wake, platform: Platform, scan: Scan, flow: xr.Dataset, middle: float, name: str
 ) -> tuple[float, float]:
-    """Ends along x of the air that is in the gates at t1 or at t2, with `_EDGE`, in a file, m.
+    """Ends along x (m, of the file) of the air that is in the gates at t1 or at t2, with `_EDGE`.
 
-    Parameters
-    ----------
-    flow : xr.Dataset
-        As it is in the file.
-    middle : float
-        Place in it that is put in the middle of the gates, m.
-    name : str
-        Of the file.
-
-    Raises
-    ------
-    InputError
-        A file without u, or whose planes do not hold that air.
+    ``middle`` (m) is put into the middle of the gates. A file without u, or whose planes do not
+    hold that air, is refused.
     """
     if "u" not in flow:
         raise InputError(
@@ -212,7 +201,7 @@ def _advected_along(flow: xr.Dataset, platform: Platform, scan: Scan) -> Flows:
 def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
     """Variables that the extinction needs of a wake's file; names of all in the file.
 
-    Tracers of the extinction have our names once they are read.
+    Tracers of the extinction have our names after reading.
     """
     mapping = wake.extinction
     in_file = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}

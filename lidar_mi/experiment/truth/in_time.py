@@ -1,4 +1,4 @@
-"""The truth while a scan lasts: the extinction that beams meet at times of their own."""
+"""The truth during a scan: the extinction at the times of its beams."""
 
 import math
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ from lidar_mi.experiment.truth.flows import Flows, mean_flow
 from lidar_mi.instrument.scan import ScanPlan
 
 LARGEST_STEP = 0.25
-"""Node spacings by which air moves from one state to the next, at most.
+"""Largest motion of the air from one state to the next, node spacings.
 
 Between states the renderer is linear in time. A wave of 4 nodes, the shortest that a grid carries,
 is then displaced by 0.63 * 0.25^3 / 4^2 = 0.0006 nodes at most, and its amplitude is 2 % smaller
 half way between two states.
 """
-MOST_VALUES = 2.5e8  # of all states of a scan: 1 GB in the renderer
+MOST_VALUES = 2.5e8  # values of all states of a scan: 1 GB in the renderer
 
 
 def state_times(observation: Observation, flows: Flows, times: np.ndarray) -> np.ndarray:
@@ -70,9 +70,8 @@ def air_in_time(
 ) -> xr.DataArray:
     """The extinction of scan ``which`` at the times of its beams, m^-1, dims (time, x, y, z).
 
-    The truth of the scan's reference time, advected by the same flow as the air from t1 to t2. Of a
-    wake with a state at t2, between both times, the mean of both states advected to the time, each
-    weighted with its nearness.
+    The truth of the scan's reference time, advected by the same flow as the air from t1 to t2. With
+    a stored state at t2, the mean of both states advected to the time, weighted linearly in time.
 
     Parameters
     ----------
@@ -105,8 +104,8 @@ def air_in_time(
 
     if flows[1] is None:
         return advected(which)
-    nearness = xr.DataArray(np.clip((taus + which * dt) / dt, 0, 1), {"time": taus}, "time")
-    return ((1 - nearness) * advected(0) + nearness * advected(1)).astype(np.float32)
+    weight = xr.DataArray(np.clip((taus + which * dt) / dt, 0, 1), {"time": taus}, "time")
+    return ((1 - weight) * advected(0) + weight * advected(1)).astype(np.float32)
 
 
 def _along(observation: Observation, flow: xr.Dataset) -> xr.DataArray | None:

@@ -42,7 +42,7 @@ class MeanWind:
         return self.along + math.cos(towards) * speed, self.left + math.sin(towards) * speed
 
     def to_the_left(self, height: np.ndarray) -> np.ndarray:
-        """The second alone."""
+        """The component to the left alone."""
         return self.at(height)[1]
 
 
@@ -126,17 +126,17 @@ def passing_wake(
     """
     passage, air = doppler.passage, doppler.air
     mean = _mean(air)
-    met: PairAboveGround | VolumeAlongPath | None = None
+    passing: PairAboveGround | VolumeAlongPath | None = None
     if wake is not None and wake.vortex_pair is not None:
-        met = _pair(wake.vortex_pair, passage, mean, last)
+        passing = _pair(wake.vortex_pair, passage, mean, last)
     elif wake is not None:
-        met = _plane(wake, passage, mean, search_path)
+        passing = _plane(wake, passage, mean, search_path)
     gusts = (
         None
         if air.turbulence is None
         else turbulent_air(air.turbulence, passage.height, seed, "doppler.air")
     )
-    return PassingWake(met, mean, gusts, passage.height, passage.heading, doppler.position)
+    return PassingWake(passing, mean, gusts, passage.height, passage.heading, doppler.position)
 
 
 def echo(doppler: CoherentDoppler, wake: Wake | None, air: PassingWake) -> Signal | None:

@@ -112,7 +112,7 @@ def _period_of(
     wake: Wake, file: str, encounter: Encounter, folder: Path
 ) -> tuple[xr.Dataset, Pairs, tuple[float, float], Closing]:
     path = find_file(file, folder, "wake.file")
-    # its time of change: a file that is written anew is read anew
+    # the modification time: a changed file is read again
     stamp, ends = path.stat().st_mtime_ns, encounter.wake
     return _volume(path, stamp, wake.model_dump_json(), ends.ends, ends.ends_length)
 
@@ -141,7 +141,7 @@ def described_wake(experiment: Experiment) -> list[tuple[str, str]]:
     text = f"{closing.how}: a period of {closing.period:.4g} m, repeated"
     rows.append(("wake along its axis", text))
     if closing.changed:
-        # a mirror leaves the flow in the planes across the axis
+        # a mirror does not change the flow in planes across the axis
         change = "as in the file"
         if closing.how == "blend":
             changed = np.isin(np.arange(len(strength[0])), closing.changed)

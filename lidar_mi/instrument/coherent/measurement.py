@@ -30,11 +30,10 @@ def measured_lines(
 ) -> xr.Dataset:
     """Radial velocities with noise, in the layout of `read_lines_of_sight`.
 
-    Noise is normal with the standard deviation of the Cramér-Rao bound: of weak signals, below
-    some -20 dB, real estimates have false ones in addition, which are not modelled. Where the bound
-    exceeds the spread of velocities that are uniform over the bandwidth, they are that, and
-    flagged. Gates that overlap share their samples: noise at the distance x correlates by
-    1 - x / gate length.
+    Noise is normal with the standard deviation of the Cramér-Rao bound. False estimates of weak
+    signals, below some -20 dB, are not modelled. Where the bound exceeds the standard deviation of
+    velocities uniform over the bandwidth, velocities are uniform, and flagged. Gates that overlap
+    share their samples: noise at the distance x correlates by 1 - x / gate length.
 
     Parameters
     ----------
@@ -74,26 +73,26 @@ def measured_lines(
     shared = np.maximum(1 - np.abs(ranges - ranges[0]) / lidar.gate_length, 0.0)
     factor = np.linalg.cholesky(scipy.linalg.toeplitz(shared) + 1e-9 * np.eye(ranges.size))
     noise = random.standard_normal(true.shape) @ factor.T
-    both = "time", "range"
+    dims = "time", "range"
     lost = stderr > random_velocity(bandwidth)
     stderr = np.where(lost, random_velocity(bandwidth), stderr)
     # normal numbers made uniform
-    found = np.where(lost, bandwidth * (scipy.special.ndtr(noise) - 0.5), true + stderr * noise)
+    measured = np.where(lost, bandwidth * (scipy.special.ndtr(noise) - 0.5), true + stderr * noise)
 
     def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
-        return both, values, {"units": units, "long_name": long_name}
+        return dims, values, {"units": units, "long_name": long_name}
 
     time = START + np.round(scan.time * 1e9).astype("timedelta64[ns]")
     degree = {"units": "degree"}
     return xr.Dataset(
         {
-            "radial_velocity": field(found, "radial velocity, positive away"),
+            "radial_velocity": field(measured, "radial velocity, positive away"),
             "radial_velocity_stderr": field(stderr, "standard error of the radial velocity"),
             "radial_velocity_true": field(true, "radial velocity without noise"),
             "spectral_width": field(width, "width of the Doppler spectrum"),
             "snr": field(ratio, "signal-to-noise ratio of the powers", "1"),
             "flag": (
-                both,
+                dims,
                 lost.astype(np.uint16),
                 {"flag_masks": np.array([1], np.uint16), "flag_meanings": "no_signal"},
             ),

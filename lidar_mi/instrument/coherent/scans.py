@@ -145,9 +145,9 @@ def _swept(
             f"scan: {abs(ends[1] - ends[0]):g} rad are not allowed with {step:g} rad a line; "
             "expected one line or more"
         )
-    one = ends[0] + np.sign(ends[1] - ends[0]) * (np.arange(lines) + 0.5) * step
+    sweep = ends[0] + np.sign(ends[1] - ends[0]) * (np.arange(lines) + 0.5) * step
     number = np.arange(count)
-    angle = [one[::-1] if back and k % 2 else one for k in number]
+    angle = [sweep[::-1] if back and k % 2 else sweep for k in number]
     start = number[:, None] * (lines * accumulation + turn)
     time = start + (np.arange(lines) + 0.5) * accumulation
     return time.ravel(), np.concatenate(angle), np.repeat(number, lines)

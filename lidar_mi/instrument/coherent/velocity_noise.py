@@ -19,10 +19,10 @@ def rye_hardesty(
 ) -> np.ndarray:
     """Standard deviation of the velocity, m/s, by an approximation of the Cramér-Rao bound.
 
-    sigma^2 = sqrt(8) width^2 / (alpha N) (1 + alpha / sqrt(2 pi))^2, alpha = `peak_ratio`,
-    N = SNR samples (Rye & Hardesty, IEEE Trans. Geosci. Remote Sens. 31, 16-27, 1993, as given by
-    O'Connor et al., J. Atmos. Oceanic Technol. 27, 1652-1664, 2010). To 7 % that of `cramer_rao` up
-    to alpha = 5; above it, larger.
+    sigma^2 = sqrt(8) width^2 / (alpha N) (1 + alpha / sqrt(2 pi))^2, alpha = `peak_ratio`, N = SNR
+    samples (Rye & Hardesty, IEEE Trans. Geosci. Remote Sens. 31, 16-27, 1993, as given by O'Connor
+    et al., J. Atmos. Oceanic Technol. 27, 1652-1664, 2010). It agrees with `cramer_rao` to 7 % up
+    to alpha = 5, and is larger above.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def rye_hardesty(
 def cramer_rao(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: float) -> np.ndarray:
     """The least standard deviation of the velocity of a Gaussian spectrum in white noise, m/s.
 
-    Of many samples, B width / (samples J) with J = int (x alpha g / (1 + alpha g))^2 dx and
-    g = exp(-x^2 / 2) (Whittle's likelihood; Levin, IEEE Trans. Inf. Theory 11, 100-107, 1965).
-    Parameters as of `rye_hardesty`.
+    For many samples, its square is B width / (samples J) with J = int (x alpha g / (1 + alpha g))^2
+    dx and g = exp(-x^2 / 2) (Whittle's likelihood; Levin, IEEE Trans. Inf. Theory 11, 100-107,
+    1965). Parameters as of `rye_hardesty`.
     """
     _check(snr, width, bandwidth, samples)
     alpha = np.asarray(peak_ratio(snr, width, bandwidth))
@@ -57,7 +57,7 @@ def cramer_rao(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: fl
 def random_velocity(bandwidth: float) -> float:
     """Standard deviation (m/s) of a velocity that is uniform over the bandwidth.
 
-    An estimate without a signal has it; one with a larger bound has none.
+    An estimate without a signal has this one.
     """
     return bandwidth / np.sqrt(12.0)
 

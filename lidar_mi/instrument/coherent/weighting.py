@@ -1,4 +1,4 @@
-"""What a coherent Doppler lidar measures of the wind: range weighting along a line of sight."""
+"""Range weighting of a coherent Doppler lidar along a line of sight."""
 
 import math
 from collections.abc import Callable
@@ -88,7 +88,7 @@ def range_weight(offset: np.ndarray, lidar: CoherentLidar) -> np.ndarray:
 def echo_shift(ranges: np.ndarray, ratio: np.ndarray, lidar: CoherentLidar) -> np.ndarray:
     """Distance (m) of the middle of a gate's echo from the middle of the gate.
 
-    Where the signal falls with range, the near end of a gate says more: by the variance of
+    Where the signal falls with range, the echo's middle is nearer: by the variance of
     `range_weight` times the slope of the logarithm of the signal, to first order in it.
 
     Parameters

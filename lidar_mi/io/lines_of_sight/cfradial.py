@@ -11,7 +11,7 @@ from lidar_mi.io.netcdf import write_netcdf
 
 _NEEDED = ("radial_velocity", "azimuth", "elevation", "range", "time")
 _MODES = {"rhi": "rhi", "stare": "pointing", "ppi": "azimuth_surveillance"}
-_FULL_CIRCLE = 300.0  # degrees: below, a sector
+_FULL_CIRCLE = 300.0  # degrees: smaller ones are sectors
 _STANDARD = {
     "radial_velocity": "radial_velocity_of_scatterers_away_from_instrument",
     "spectral_width": "doppler_spectrum_width",
@@ -121,7 +121,7 @@ def write_cfradial(lines: xr.Dataset, path: str | Path) -> None:
 
 
 def _mode(sweep: xr.Dataset) -> tuple[str, float]:
-    """The name of its mode, and the angle that it keeps, degrees."""
+    """The name of its mode, and its fixed angle, degrees."""
     azimuth, elevation = sweep["azimuth"].values, sweep["elevation"].values
     kind = scan_kind(azimuth, elevation)
     if kind == "rhi":

@@ -75,8 +75,8 @@ def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
                 )
             continue
         index, theirs_unit = units_of[theirs]
-        columns[ours], more = _values(table.iloc[:, index], ours, theirs_unit, unit, path)
-        remarks += more
+        columns[ours], more_remarks = _values(table.iloc[:, index], ours, theirs_unit, unit, path)
+        remarks += more_remarks
     if not len(table):
         raise InputError(f"{path}: no row below the head; expected one or more")
     sign = names.get("radial_velocity", "")

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.lines_of_sight.flags import LineFlag
+from lidar_mi.flags import LineFlag, flag_attributes
 from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, PLACE, Scan
 
 _SAME_PLACE = 0.01  # degrees: of one lidar, rounded differently from file to file
@@ -54,17 +54,10 @@ def assembled(
             data[name] = ("time", "range"), full[order], _attributes(name, unit, long_name)
     flag = np.full((sum(lines), ranges.size), LineFlag.MISSING.value, np.uint16)
     _fill(flag, [flags for _, _, flags in scans], gates, lines)
-    masks = np.array([member.value for member in LineFlag], np.uint16)
     data["flag"] = (
         ("time", "range"),
         flag[order],
-        {
-            "long_name": "reasons not to use the velocity, 0 = valid",
-            "standard_name": "quality_flag",
-            "flag_masks": masks,
-            "flag_values": masks,
-            "flag_meanings": " ".join(str(member.name).lower() for member in LineFlag),
-        },
+        flag_attributes(LineFlag, "reasons not to use the velocity"),
     )
     coords: dict[str, Any] = {
         "time": ("time", time[order], {"long_name": "time of the line (UTC)", "axis": "T"}),

@@ -1,10 +1,10 @@
 """Why a value of a line of sight is not to be used: blind range, weak signal, hard targets."""
 
-import enum
 import math
 
 import numpy as np
 
+from lidar_mi.flags import LineFlag
 from lidar_mi.io.lines_of_sight.scan import Scan
 
 MIN_CNR = {"WindCube": -27.0, "": -21.0}
@@ -19,7 +19,7 @@ rejects as well.
 BLIND_RANGE = {"Halo Photonics (hpl)": 90.0, "ARM": 90.0, "": 0.0}
 """Range up to which the outgoing pulse is seen, m: three gates of 30 m of Halo Photonics' lidars.
 
-WindCube's gates begin behind it. Of others it is not known.
+WindCube's gates begin behind it. That of others is unknown.
 """
 
 HARD_TARGET_DB = 10.0
@@ -32,36 +32,19 @@ HARD_TARGET_SPEED = 0.3
 HARD_TARGET_ELEVATION = 30.0
 """Largest elevation of hard targets, degrees: above it, bright gates are clouds."""
 
-_BEFORE = 5  # gates whose median is the signal before a target
-# of a reflection of the outgoing pulse: its speed does not depend on direction to this, m/s
-_SAME = 0.1
+_GATES_BEFORE = 5  # gates whose median is the signal before a target
+# a reflection of the outgoing pulse has the same speed in all directions, to this, m/s
+_SAME_SPEED = 0.1
 _LONGEST_PULSES = 4  # gate lengths that a reflection may cover
 
 
-class LineFlag(enum.IntFlag):
-    """Reasons not to use a velocity of a line of sight; 0: valid."""
-
-    MISSING = 1
-    """No value, or no such gate of this line."""
-    BLIND_RANGE = 2
-    """The outgoing pulse, or its reflection in the lidar, is in the gate."""
-    LOW_CNR = 4
-    """The signal is too weak."""
-    HARD_TARGET = 8
-    """A target that stands, such as a building, is in the gate or before it."""
-    REJECTED = 16
-    """The lidar's own software rejects the value."""
-    REPEATED = 32
-    """The same number in all gates of the line, or in many cells: no measurement."""
-
-
 EXCESS = 4.0
-"""Times that a repeated number is more frequent than its neighbours."""
+"""Least frequency of a repeated number over that of its neighbours."""
 LEAST_REPEATED = 40
-"""Cells that a repeated number has at least."""
+"""Least number of cells with a repeated number."""
 
 _LEAST_NOISE = 500  # gates: a tenth of uniform velocities is above 90 % of the largest, to 1.5 %
-_LEAST_GATES = 8  # whose velocities are not equal by chance
+_LEAST_GATES = 8  # whose velocities are not equal by coincidence
 
 
 def flags(
@@ -88,7 +71,7 @@ def flags(
     flag[~np.isfinite(velocity)] |= LineFlag.MISSING.value
     overlap = 1.0
     if snr is not None:
-        # as the total power would be none: never written
+        # no total power: never written
         flag[snr <= -1.0] |= LineFlag.MISSING.value
         overlap = overlapping(scan, snr, limit)[0]
         flag[np.isfinite(velocity) & ~(snr >= 10 ** (limit / 10))] |= LineFlag.LOW_CNR.value
@@ -113,17 +96,17 @@ def flags(
 
 
 def _nyquist_of_noise(scan: Scan, noise: np.ndarray) -> None:
-    """Velocity beyond which those of the file fold: gates without a signal fill what is below."""
+    """Nyquist velocity of the file: velocities of gates without a signal are uniform below it."""
     top = float(np.abs(noise).max()) if noise.size >= _LEAST_NOISE else 0.0
     if top > 0 and 0.05 < np.mean(np.abs(noise) > 0.9 * top) < 0.2:
         scan.about.setdefault("nyquist_velocity", top * (1 + 1 / noise.size))
 
 
 def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
-    """Ranges of gates that the file states to be adjacent although they share their samples.
+    """Correct the ranges of overlapping gates that the file states to be adjacent.
 
-    The noise shows how many; ranges are corrected where it determines their whole number, or agrees
-    with that of the file.
+    The correlation of the noise gives the number that overlap; ranges are corrected where it
+    determines a whole number, or agrees with that of the file.
     """
     snr = scan.fields.get("snr")
     step = float(np.nanmedian(np.diff(scan.range)))
@@ -151,7 +134,7 @@ def correct_steps(scan: Scan, min_cnr: float | None = None) -> None:
 
 
 def overlapping(scan: Scan, snr: np.ndarray, limit: float) -> tuple[float, float]:
-    """How many neighbouring gates share their samples, and its standard error; 1: none.
+    """Number of neighbouring gates with common samples, and its standard error; 1: none overlap.
 
     From the correlation of the noise: gates of n samples that are one sample apart correlate by
     1 - 1/n. The error is that of the lines' own estimates, 0 where the file's number agrees.
@@ -173,7 +156,7 @@ def overlapping(scan: Scan, snr: np.ndarray, limit: float) -> tuple[float, float
     error = np.inf
     if lines > 2:
         error = float(np.std(far - count * first) / first.mean() / math.sqrt(lines))
-    # of as many samples as the file says, if the noise agrees
+    # the number of samples in the file, if the noise agrees
     samples = float(scan.about.get("samples_per_gate", np.nan))
     return (samples, 0.0) if abs(count / samples - 1) < 0.3 else (count, error)
 
@@ -184,7 +167,7 @@ def _limit(scan: Scan, min_cnr: float | None) -> float:
 
 
 def repeated(velocity: np.ndarray) -> np.ndarray:
-    """Cells (lines, gates) that hold a number instead of a measurement, as of a blocked beam.
+    """Cells (lines, gates) that hold a constant instead of a measurement, as with a blocked beam.
 
     Either every gate of a line has the same velocity while other lines vary; or one velocity is
     there `EXCESS` times as often as any of its neighbours. Of a smooth distribution with at most
@@ -230,10 +213,10 @@ def reflection(scan: Scan, overlap: float = 1.0) -> np.ndarray:
         return none
     most = math.ceil(_LONGEST_PULSES * overlap)
     spread = np.nanstd(velocity[slanted][:, : 2 * most], axis=0)
-    same = spread < _SAME
+    same = spread < _SAME_SPEED
     count = int(np.argmin(same)) if not same.all() else 0
     behind = spread[count + math.ceil(overlap) : count + 3 * math.ceil(overlap)]
-    if not (0 < count <= most and behind.size and np.nanmedian(behind) > 5 * _SAME):
+    if not (0 < count <= most and behind.size and np.nanmedian(behind) > 5 * _SAME_SPEED):
         return none
     # the gates in which reflection and air mix
     count += math.ceil(overlap / 2)
@@ -254,14 +237,14 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
     velocity = scan.fields["radial_velocity"]
     blocked = np.zeros(snr.shape, bool)
     low = np.abs(scan.angles["elevation"]) <= HARD_TARGET_ELEVATION
-    if not low.any() or snr.shape[1] <= 2 * _BEFORE:
+    if not low.any() or snr.shape[1] <= 2 * _GATES_BEFORE:
         return blocked
     width = math.ceil(overlap)
     usable = np.where(bad, np.nan, snr)
     for line in np.flatnonzero(low):
         bright = 10 ** (HARD_TARGET_DB / 10) * _median_before(usable[line], width)
-        still = np.abs(velocity[line]) < HARD_TARGET_SPEED
-        (gates,) = np.nonzero(still & (usable[line] > bright))
+        at_rest = np.abs(velocity[line]) < HARD_TARGET_SPEED
+        (gates,) = np.nonzero(at_rest & (usable[line] > bright))
         if gates.size:
             blocked[line, max(gates[0] - width, 0) :] = True
     return blocked
@@ -269,10 +252,10 @@ def hard_targets(scan: Scan, snr: np.ndarray, bad: np.ndarray, overlap: float = 
 
 def _median_before(snr: np.ndarray, width: int) -> np.ndarray:
     """Median of the gates before each, (gates,), but its direct neighbours; NaN: too few."""
-    reach = _BEFORE * width
+    reach = _GATES_BEFORE * width
     padded = np.concatenate([np.full(reach + width, np.nan), snr])
     windows = np.lib.stride_tricks.sliding_window_view(padded, reach)[: snr.size]
-    enough = np.isfinite(windows).sum(1) >= min(3, _BEFORE)
+    enough = np.isfinite(windows).sum(1) >= min(3, _GATES_BEFORE)
     median = np.full(snr.size, np.nan)
     median[enough] = np.nanmedian(windows[enough], axis=1)
     return median

@@ -17,7 +17,7 @@ from lidar_mi.io.lines_of_sight.scan import Scan, seconds
 from lidar_mi.io.text import read_text
 
 LARGEST = 1 << 30
-"""Bytes: an hour of a stare has some ten millions."""
+"""Most bytes of a file: an hour of a stare has some ten million."""
 
 _KIND = "a Halo Photonics file (.hpl)"
 _COLUMNS = ("radial_velocity", "snr", "attenuated_backscatter", "spectral_width")
@@ -25,7 +25,7 @@ _LARGEST_GATES = 100_000
 
 
 def read_halo(path: Path) -> Scan:
-    """The rays of a file, as many as there are, whatever the header promises.
+    """All rays of a file, whatever number the header states.
 
     Gates are adjacent, (gate + 1/2) gate lengths away, but for scans that are called overlapping:
     these begin at every sample, gate length over points apart.
@@ -123,7 +123,7 @@ def _start(head: dict[str, str], path: Path) -> datetime:
 
 
 def _times(hours: np.ndarray, start: datetime) -> np.ndarray:
-    """Times of decimal hours, which begin again at midnight: a step back by half a day is one."""
+    """Times of decimal hours, which restart at midnight: a step back by more than half a day."""
     midnight = datetime(start.year, start.month, start.day)
     first = (start - midnight).total_seconds() / 3600
     days = np.cumsum(np.diff(hours, prepend=first) < -12)
@@ -137,17 +137,17 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
     starts = [k for k, line in enumerate(lines) if not line.split(None, 1)[0].isdigit()]
     if not starts:
         raise InputError(f"{path}: has no ray below its header; expected one or more")
-    lost = starts[0]
-    rays, values, odd = [], [], 0
+    stray = starts[0]
+    rays, values, invalid = [], [], 0
     partial: list[int] = []
     for begin, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         ray = _floats([lines[begin].split()], 5)
         if not np.isfinite(ray[0, :3]).all():
-            lost += end - begin
+            stray += end - begin
             continue
         number, table = _gates(lines[begin + 1 : end])
         inside = number < gates
-        odd += int((~inside).sum()) + int((~np.isfinite(table[:, :2])).any(1).sum())
+        invalid += int((~inside).sum()) + int((~np.isfinite(table[:, :2])).any(1).sum())
         ray_values = np.full((gates, 4), np.nan)
         ray_values[number[inside]] = table[inside]
         rays.append(ray[0])
@@ -162,10 +162,10 @@ def _rays(lines: list[str], gates: int, path: Path) -> tuple[np.ndarray, np.ndar
             f"{len(partial)} of {len(rays)} rays have fewer than {gates} gates, ray {partial[0]} "
             "the first: what is missing is flagged"
         )
-    if odd:
-        remarks.append(f"{odd} gates are no numbers or beyond the {gates} of the header")
-    if lost:
-        remarks.append(f"{lost} lines belong to no ray with a time and two angles")
+    if invalid:
+        remarks.append(f"{invalid} gates are no numbers or beyond the {gates} of the header")
+    if stray:
+        remarks.append(f"{stray} lines belong to no ray with a time and two angles")
     return np.array(rays), np.array(values), remarks
 
 
@@ -188,7 +188,7 @@ def _gates(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
 def _numbers_of(text: str) -> np.ndarray:
     """Numbers of a text, (n,); none if there is a word that is no number."""
     with warnings.catch_warnings():
-        # by the version of numpy, what is no number ends the reading or is an error
+        # by the version of numpy, a word that is no number ends the reading or is an error
         warnings.simplefilter("ignore", DeprecationWarning)
         try:
             return np.fromstring(text, sep=" ")

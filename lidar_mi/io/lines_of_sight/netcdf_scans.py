@@ -54,13 +54,13 @@ NAMES = {
     "longitude": ("longitude", "lon"),
     "altitude": ("altitude", "alt"),
 }
-"""Ours, and those of the makers in lower case, the most telling first."""
+"""Our names, and those of the makers in lower case, the most specific first."""
 
 _UNITS = {name: unit for name, (unit, _) in FIELDS.items()} | {"range": "m", "altitude": "m"}
-_EARTH = 6.371e6  # m, mean radius
-_MOVED = 100.0  # m, within a scan: more than receivers of satellites are off
+_EARTH_RADIUS = 6.371e6  # m, mean radius
+_MOVED = 100.0  # m, within a scan: more than the error of satellite navigation
 _WORDS = ("long_name", "comment", "description", "note", "sign_convention", "positive")
-_NEVER = -9999.0  # ARM's missing value, which not every file declares
+_ARM_MISSING = -9999.0  # ARM's missing value, which not every file declares
 _KINDS = (
     ("datastream", "sgp", "ARM"),
     ("dod_version", "dl", "ARM"),
@@ -121,7 +121,7 @@ def read_netcdf_lines(path: Path, names: Mapping[str, str]) -> list[Scan]:
 
 
 def _sweep_names(root: xr.Dataset, path: Path) -> list[str]:
-    """Groups of the sweeps; none: the variables are in the file itself."""
+    """Groups of the sweeps; empty: the variables are in the root group."""
     present = groups(path)
     if "sweep_group_name" in root.variables:
         listed_names = [
@@ -139,7 +139,7 @@ def _about(root: xr.Dataset, path: Path) -> dict[str, str | float]:
         kind = "CfRadial 2" if groups(path) else "CfRadial 1"
     about: dict[str, str | float] = {"kind": kind or "NetCDF"}
     if texts.get("tilt"):
-        about["tilt"] = texts["tilt"]  # of a data set that was written
+        about["tilt"] = texts["tilt"]  # of a data set written by lidar-mi
     for ours, theirs in (
         ("instrument", "instrument_name"),
         ("instrument", "serial_number"),
@@ -174,7 +174,7 @@ def _word(data: xr.Dataset, name: str) -> str:
 
 
 def _file_names(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
-    """Ours to the file's name of every variable that is there."""
+    """Our name -> the file's, of every variable in the file."""
     lower = {str(name).lower(): str(name) for name in reversed(list(data.variables))}
     standard = {str(v.attrs.get("standard_name", "")): str(n) for n, v in data.variables.items()}
     file_names = {}
@@ -214,14 +214,14 @@ def _moving(data: xr.Dataset, names: Mapping[str, str], time: np.ndarray, path: 
     finite = np.flatnonzero(np.isfinite(latitude) & np.isfinite(longitude))
     if finite.size < 2:
         return []
-    north = _EARTH * (latitude[finite] - latitude[finite[0]])
-    east = _EARTH * np.cos(latitude[finite]) * (longitude[finite] - longitude[finite[0]])
-    way = float(np.hypot(np.ptp(north), np.ptp(east)))
+    north = _EARTH_RADIUS * (latitude[finite] - latitude[finite[0]])
+    east = _EARTH_RADIUS * np.cos(latitude[finite]) * (longitude[finite] - longitude[finite[0]])
+    distance = float(np.hypot(np.ptp(north), np.ptp(east)))
     seconds = float((time[finite[-1]] - time[finite[0]]) / np.timedelta64(1, "s"))
-    if way < _MOVED or seconds <= 0:
+    if distance < _MOVED or seconds <= 0:
         return []
     return [
-        f"the lidar moves by {way:.0f} m ({np.hypot(north[-1], east[-1]) / seconds:.2g} m/s): "
+        f"the lidar moves by {distance:.0f} m ({np.hypot(north[-1], east[-1]) / seconds:.2g} m/s): "
         "winds are off by its velocity unless that was subtracted, and of the place in the middle "
         "of the scan"
     ]
@@ -235,7 +235,7 @@ def _numbers(variable: xr.DataArray, ours: str, path: Path) -> np.ndarray:
     unlimited = variable.copy()
     unlimited.attrs = limits
     values = load_variable(unlimited, path).values.astype(float)
-    values = np.where(values == _NEVER, np.nan, values)
+    values = np.where(values == _ARM_MISSING, np.nan, values)
     unit = str(variable.attrs.get("units", "")).strip()
     if ours == "snr":
         return values
@@ -280,7 +280,7 @@ def _flat(
     path: Path,
     reference: str = "",
 ) -> list[Scan]:
-    """The lines of a file or group, apart by its sweeps."""
+    """The lines of a file or group, a scan for each of its sweeps."""
     file_names = _file_names(data, names)
     for ours in ("time", "azimuth", "elevation", "range", "radial_velocity"):
         if file_names.get(ours) not in data.variables:
@@ -306,8 +306,8 @@ def _flat(
             values = _numbers(data[file_names[name]], name, path)
             if name == "snr":
                 unit = str(data[file_names[name]].attrs.get("units", ""))
-                values, more = ratio_of_powers(values, unit, file_names[name])
-                remarks += more
+                values, more_remarks = ratio_of_powers(values, unit, file_names[name])
+                remarks += more_remarks
             if ragged is not None:
                 fields[name] = ragged.full(values)
             elif velocity.ndim == 2:
@@ -343,7 +343,7 @@ def _flat(
         attributes["gate_length"] = float(
             np.ravel(load_variable(data["range_gate_length"], path))[0]
         )
-    time, more = _times(data, file_names["time"], reference, path)
+    time, more_remarks = _times(data, file_names["time"], reference, path)
     scan = Scan(
         time,
         angles,
@@ -352,7 +352,7 @@ def _flat(
         dict(place),
         _rejected(data, velocity, path),
         attributes,
-        remarks + more + _moving(data, names, time, path),
+        remarks + more_remarks + _moving(data, names, time, path),
     )
     return _sweeps(scan, data, path)
 

@@ -19,7 +19,7 @@ NETCDF = (".nc", ".nc4", ".cdf", ".netcdf")
 """Suffixes of NetCDF files."""
 
 SUFFIXES = (".hpl", *NETCDF, ".csv", ".txt")
-"""Of all kinds of files."""
+"""Suffixes of all kinds of files."""
 
 
 @checked_arguments

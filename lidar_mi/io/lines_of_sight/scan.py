@@ -15,7 +15,7 @@ FIELDS = {
     "spectral_width": ("m s-1", "width of the Doppler spectrum"),
     "attenuated_backscatter": ("m-1 sr-1", "attenuated backscatter coefficient"),
 }
-"""Of a line and a gate: unit and meaning."""
+"""Quantities of a line and a gate: unit and meaning."""
 
 ANGLES = {
     "azimuth": "azimuth of the line of sight, clockwise from north",
@@ -23,14 +23,14 @@ ANGLES = {
     "pitch": "pitch of the platform, as reported: positive with the front up",
     "roll": "roll of the platform, as reported: positive with the right side down",
 }
-"""Of a line, degrees."""
+"""Angles of a line, degrees."""
 
 PLACE = {
     "latitude": ("degrees_north", "latitude of the lidar"),
     "longitude": ("degrees_east", "longitude of the lidar"),
     "altitude": ("m", "altitude of the lidar above mean sea level"),
 }
-"""Of the lidar: unit and meaning."""
+"""Place of the lidar: unit and meaning."""
 
 
 @dataclass(eq=False)
@@ -68,7 +68,7 @@ class Scan:
 
 
 def check(scan: Scan, path: Path) -> Scan:
-    """A scan with angles in range and ranges in metres; what was changed is remarked.
+    """A scan with angles in range and ranges in metres; changes become remarks.
 
     Raises
     ------
@@ -132,11 +132,11 @@ def _level(scan: Scan) -> None:
         front * np.cos(pitch) - up * np.sin(pitch),
         front * np.sin(pitch) + up * np.cos(pitch),
     )
-    over = scan.angles["elevation"] > 90
+    beyond_zenith = scan.angles["elevation"] > 90
     slope = np.arctan2(up, np.hypot(right, front))
-    scan.angles["elevation"] = np.rad2deg(np.where(over, np.pi - slope, slope))
-    turn = np.arctan2(right, front) + np.where(over, np.pi, 0.0)
-    scan.angles["azimuth"] = np.rad2deg(turn)
+    scan.angles["elevation"] = np.rad2deg(np.where(beyond_zenith, np.pi - slope, slope))
+    rotated = np.arctan2(right, front) + np.where(beyond_zenith, np.pi, 0.0)
+    scan.angles["azimuth"] = np.rad2deg(rotated)
     scan.remarks.append(
         f"pitch and roll of up to {tilt:.2f} degrees are applied, with the front of the "
         "platform at azimuth 0"
@@ -158,7 +158,7 @@ def part(scan: Scan, lines: slice | np.ndarray) -> Scan:
 
 
 def _wrap(scan: Scan) -> None:
-    """Azimuths to 0 to 360, elevations to -180 to 180 degrees; 360 itself is not worth a word."""
+    """Azimuths to 0 to 360, elevations to -180 to 180 degrees; no remark on 360 itself."""
     azimuth, elevation = scan.angles["azimuth"], scan.angles["elevation"]
     for name, values, low, high in (
         ("azimuth", azimuth, -180.0, 360.0),
@@ -182,7 +182,7 @@ def _check_ranges(ranges: np.ndarray, path: Path) -> None:
     steps = np.diff(ranges, axis=-1)
     if (steps[np.isfinite(steps)] <= 0).any():
         raise InputError(f"{path}: range: does not increase from gate to gate; expected metres")
-    # the light of a pulse alone is longer
+    # a pulse alone is longer
     if finite.max() < 40:
         raise InputError(
             f"{path}: range: up to {finite.max():g} m, shorter than a pulse; expected metres, or "
@@ -215,14 +215,14 @@ _ENCODINGS = (
     ("Julian days", 86400.0, 2440587.5),
     ("seconds since 1904 (LabVIEW)", 1.0, 2082844800.0),
 )
-"""Of numbers that are no seconds since 1970: name, seconds of a unit, number of 1970-01-01."""
+"""Encodings other than seconds since 1970: name, seconds of a unit, number of 1970-01-01."""
 
 
 def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[str]]:
     """Times of numbers without a unit, and a remark if they are no seconds since 1970.
 
-    They are taken for these, unless they then lie in the future or are closer than lines can be:
-    then for the one other common encoding that gives dates from 1980 to today.
+    They count from 1970, unless they then lie in the future or closer together than lines can: then
+    the only other common encoding with dates from 1980 to today is used.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[s
         since = unit * (finite - zero)
         return bool(((since >= first) & (since <= last)).all()) and unit * step >= _SHORTEST_LINE
 
-    # those that begin with the measurement are seconds, too
+    # seconds may also count from the start of the measurement
     if not finite.size or possible(1.0, 0.0, -86400.0):
         return seconds(values, epoch), []
     encodings = [date for date in _ENCODINGS if possible(date[1], date[2], first)]
@@ -258,7 +258,7 @@ def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[s
 _TOWARD = r"(?:toward|approach|inbound|incoming)"
 _AWAY = r"(?:away|reced|outbound|outgoing|outward)"
 _SIGN = r"(?:positive|negative|(?<!\w)[+-]ve|(?<!\w)[><]\s*0)"
-_SAID = re.compile(
+_SIGN_CONVENTION = re.compile(
     rf"(?P<sign>{_SIGN})[^.;,]*?(?P<way>{_TOWARD}|{_AWAY})"
     rf"|(?P<way2>{_TOWARD}|{_AWAY})[^.;,]*?(?P<sign2>{_SIGN})",
     re.IGNORECASE,
@@ -272,7 +272,7 @@ def toward_in_words(text: str) -> bool | None:
     True
     """
     senses = set()
-    for match in _SAID.finditer(text):
+    for match in _SIGN_CONVENTION.finditer(text):
         sign, way = match["sign"] or match["sign2"], match["way"] or match["way2"]
         positive = sign.lower().startswith(("positive", "+", ">"))
         senses.add((re.match(_TOWARD, way, re.IGNORECASE) is not None) == positive)

@@ -59,7 +59,7 @@ def read_fits(path: Path, layer: str | None) -> Frames:
 
 
 def _chosen(path: Path, images: dict[int, Any], layer: str | None) -> Any:
-    """The part that is meant."""
+    """The part named by ``layer``, or the only one."""
     names = {str(number): part for number, part in images.items()}
     names |= {part.name: part for part in images.values() if part.name}
     listed = ", ".join(part.name or str(number) for number, part in images.items())
@@ -75,7 +75,7 @@ def _chosen(path: Path, images: dict[int, Any], layer: str | None) -> Any:
 
 
 def _values(part: Any) -> np.ndarray:
-    """What the stored numbers stand for."""
+    """Physical values of the stored numbers."""
     header = part.header
     scale, zero, blank = (header.get(key) for key in ("BSCALE", "BZERO", "BLANK"))
     stored = np.asarray(part.data)

@@ -1,4 +1,4 @@
-"""What every reader of pixels gives: the images of a file, one number a pixel."""
+"""The result of every reader of pixels: the images of a file, one number a pixel."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from lidar_mi.errors import InputError
 
 _EXACT = 2**53
-"""Whole numbers up to this one are exact as float64."""
+"""Largest whole number up to which all are exact in float64."""
 _ALPHA = 1
 
 
@@ -95,6 +95,6 @@ def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> n
 
 
 def damaged(path: str | Path, kind: str, error: object) -> InputError:
-    """What is said of a file that its library does not read."""
+    """The error for a file that its library cannot read."""
     reason = " ".join(str(error).split())[:120]
     return InputError(f"{path}: no readable image, as {kind} ({reason})")

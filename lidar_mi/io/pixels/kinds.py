@@ -12,7 +12,7 @@ KINDS = (
     "image (EXR, PNG, TIFF, BMP, JPEG, FITS, npy, npz, mat, HDF5, JPEG 2000, GIF, WebP, PGM, PPM, "
     "PAM, PFM, im7)"
 )
-"""What is read, for messages."""
+"""Readable kinds, for messages."""
 
 _STARTS = (
     (b"\x76\x2f\x31\x01", "exr"),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 _COLOURS = 4
-"""The last axis of so few may be colours."""
+"""Largest last axis that may be colours."""
 _PACKED = ("scale_factor", "add_offset")
 
 

@@ -16,7 +16,7 @@ _GAP = rb"(?:\s|#[^\n\r]*[\n\r])"
 _WORD = re.compile(_GAP + rb"*([^\s#]+)")
 _COLOURS = {b"P2": 1, b"P3": 3, b"P5": 1, b"P6": 3, b"Pf": 1, b"PF": 3}
 _LONGEST = 4096
-"""Bytes of a header, at most."""
+"""Most bytes of a header."""
 _KIND = "PGM, PPM, PAM or PFM"
 
 

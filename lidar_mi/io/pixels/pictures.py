@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _FORMATS = ("JPEG", "BMP", "GIF", "WEBP")
 """Reading others may execute programs."""
 _GREY = {"1": 0, "L": 0, "LA": 1}
-"""Modes of one channel, and how many of transparency follow."""
+"""Modes of one channel, with the number of transparency channels."""
 
 
 def read_picture(path: Path) -> Frames:

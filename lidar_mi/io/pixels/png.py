@@ -13,7 +13,7 @@ from lidar_mi.io.pixels.frames import Frames, damaged, frames_of, grey
 from lidar_mi.io.size import check_size
 
 _CHANNELS = {0: 1, 2: 3, 3: 4, 4: 2, 6: 4}
-"""By the format's type of colour, with transparency where there may be some."""
+"""Channels by the format's colour type, including transparency."""
 
 
 def read_png(path: Path) -> Frames:
@@ -52,7 +52,7 @@ def _silent() -> Iterator[None]:
     """Without what libpng writes to the process's standard error: a remark on interlaced files."""
     try:
         former = os.dup(2)
-    except OSError:  # there is none
+    except OSError:  # no descriptor of standard error
         yield
         return
     nothing = os.open(os.devnull, os.O_WRONLY)

@@ -17,16 +17,16 @@ from lidar_mi.io.size import check_size
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
-# what the library only logs, and goes on with part of the file
+# faults that the library only logs before it reads part of the file
 _LOSSES = re.compile(
     r"invalid (page )?offset|invalid next page|corrupted (tag list|file)|circular|"
     r"missing (\d+ )?(frames|pages|files|data|ByteCounts)|series metadata|failed to read|"
     r"out of range|discontiguous|OME series|TiffTag (2[5-9]|3[0-4])\d .*invalid"
 )
 _IN_ORDER = "TZIQ"
-"""Axes along which images follow each other: time, depth, a sequence, one of no name."""
+"""Axes of a sequence of images: time, depth, a sequence, an unnamed one."""
 _ORDINARY = ("shaped", "uniform", "generic", "page")
-"""Series without metadata of their own about axes."""
+"""Series without metadata about axes."""
 _MINISWHITE, _MINISBLACK, _RGB, _PALETTE, _YCBCR, _RAW = 0, 1, 2, 3, 6, 34892
 _JPEG = (6, 7, 33007)
 _PHOTOMETRIC, _EXTRA, _ORIENTATION, _NODATA = 262, 338, 274, 42113
@@ -73,7 +73,7 @@ def read_tiff(path: Path) -> Frames:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The file; what the library says or raises becomes one line."""
+    """The file; messages and exceptions of the library become one line."""
     import tifffile
 
     logger, lost = logging.getLogger("tifffile"), _Lost()
@@ -159,17 +159,17 @@ def _contiguous(path: Path, file: "TiffFile", count: int) -> np.ndarray:
 
 def _pixels(path: Path, page: "TiffPage") -> np.ndarray:
     """One number a pixel of a page."""
-    more = _check(path, page)
+    extra = _check(path, page)
     axes, image = page.axes, page.asarray()
     if set(axes) - set("YXS"):
         raise InputError(f"{path}: a page with the axes {axes}; expected height and width")
     image = np.moveaxis(image, axes.index("S"), -1) if "S" in axes else image[..., None]
-    image = grey(path, image, page.samplesperpixel - more, more)
+    image = grey(path, image, page.samplesperpixel - extra, extra)
     return _without_gaps(page, _upright(image, page.tags.valueof(_ORIENTATION, 1)))
 
 
 def _check(path: Path, page: "TiffPage", count: int = 1) -> int:
-    """Refuse what is no light, or not there; the number of channels of transparency."""
+    """Refuse pixels that are no light or are missing; the number of transparency channels."""
     import tifffile
 
     samples, photometric = page.samplesperpixel, int(page.photometric)
@@ -221,7 +221,7 @@ def _is_ramp(colours: np.ndarray | None) -> bool:
         return False
     first = np.asarray(colours[0], float)
     ideal = np.linspace(0, first[-1], len(first))
-    # of 8 bits in 16: within one step of them
+    # 8 bits scaled to 16: equal within one step
     return bool((colours == colours[0]).all() and first[-1] and abs(first - ideal).max() <= 256)
 
 

@@ -24,13 +24,13 @@ from lidar_mi.retrieval.along_path.von_karman import (
     mean_of,
 )
 
-# Principal components of less variance than this, over the largest, are not known.
+# Least variance of a principal component, over the largest.
 _LEAST = 1e-6
 # Variance of vectors without error, m^2/s^2.
 _ROUNDING = 1e-12
-# Fraction of slabs in turbulence whose innovations are taken for something else.
+# Fraction of turbulent slabs whose innovations are inflated by chance.
 _CHANCE = 1e-3
-# Times from slab to arrival are taken alike within such steps, s.
+# Times from slab to arrival are rounded to such steps, s.
 _TIME_STEP = 0.5
 
 
@@ -73,8 +73,8 @@ class Basis:
 
     def _with_nodes(self, places: np.ndarray, mean: Mean, swept: float) -> np.ndarray:
         y, z = (place[:, None] - axis for place, axis in zip(places.T, self.axes, strict=True))
-        found = lattice_covariance(self.component, y, z, self.length, mean, swept)
-        return found.reshape(len(places), -1) @ self.weights
+        covariances = lattice_covariance(self.component, y, z, self.length, mean, swept)
+        return covariances.reshape(len(places), -1) @ self.weights
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Lattice:
         for half, start in ((self.half_width, self.y), (self.half_height, self.z)):
             count = np.ceil((half + abs(start)) / self.spacing)
             nodes = start + self.spacing * np.arange(-count, count + 1)
-            # one node beyond the reach on either side: those farther are not needed
+            # one node beyond the reach on either side
             axes.append(nodes[np.abs(nodes) < half + self.spacing])
         return axes[0], axes[1]
 
@@ -120,18 +120,18 @@ def basis(
     axes = lattice.axes
     y, z = (np.subtract.outer(a.ravel(), a.ravel()) for a in np.meshgrid(*axes))
     twice = mean_of(resolution, shape, 2)
-    here, there = (covariance(component, lag, y, z, length, twice) for lag in (0.0, stride))
-    variance, vectors = np.linalg.eigh(here)
-    some = variance > _LEAST * variance[-1]
-    variance, vectors = variance[some], vectors[:, some]
-    decay = np.einsum("nm,nk,km->m", vectors, there, vectors) / variance
+    now, lagged = (covariance(component, lag, y, z, length, twice) for lag in (0.0, stride))
+    variance, vectors = np.linalg.eigh(now)
+    known = variance > _LEAST * variance[-1]
+    variance, vectors = variance[known], vectors[:, known]
+    decay = np.einsum("nm,nk,km->m", vectors, lagged, vectors) / variance
     reach = -stride / np.log(np.clip(decay, 1e-3, 1 - 1e-9))
     return Basis(component, length, resolution, shape, axes, vectors / variance, variance, reach)
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """How the vectors of a slab depend on the state, and what they say of it.
+    """How the vectors of a slab depend on the state, and their information on it.
 
     Attributes
     ----------
@@ -155,39 +155,39 @@ class Observation:
 
 
 def observation(
-    one: Basis, statistics: Statistics, vectors: SlabVectors, extra: np.ndarray | float = 0.0
+    basis: Basis, statistics: Statistics, vectors: SlabVectors, extra: np.ndarray | float = 0.0
 ) -> Observation:
-    """Of the vectors over the lattice, their variances larger by ``extra`` (nz, ny), m^2/s^2."""
-    number = ACROSS.index(one.component)
+    """Observation by the vectors over the lattice, with `extra` variance (nz, ny), m^2/s^2."""
+    number = ACROSS.index(basis.component)
     y, z = np.meshgrid(vectors.y, vectors.z)
-    reach = [np.abs(axis).max() + vectors.window / 4 for axis in one.axes]
+    reach = [np.abs(axis).max() + vectors.window / 4 for axis in basis.axes]
     used = vectors.valid & (np.abs(y) <= reach[0]) & (np.abs(z) <= reach[1])
     if not used.any():
-        states = len(one.variance)
+        states = len(basis.variance)
         none = np.zeros((states, 0))
         return Observation(used, none, np.zeros((states, states)), none.T, np.zeros((0, 0)))
     places = np.stack([y[used], z[used]], -1)
-    forward = _forward(one, places.tobytes())
+    forward = _forward(basis, places.tobytes())
     stderr = statistics.scale * vectors.stderr[number][used]
     errors = stderr[:, None] * error_correlation(places, statistics.mean(2)) * stderr
     errors += vectors.common[number] ** 2
     arm = places[:, 1 - number] - vectors.centre[1 - number]
     errors += vectors.rotation**2 * np.outer(arm, arm)
-    # what the states do not describe
-    whole = float(covariance(one.component, 0.0, 0.0, 0.0, one.length, statistics.mean(2)))
-    missing = np.maximum(whole - forward**2 @ one.variance, 0.0)
-    own = statistics.sigma**2 * missing + np.broadcast_to(extra, used.shape)[used]
-    # of errors of 0 the covariance would be singular
-    errors[np.diag_indices(len(errors))] += own + _ROUNDING
+    # variance that the states do not describe
+    whole = float(covariance(basis.component, 0.0, 0.0, 0.0, basis.length, statistics.mean(2)))
+    missing = np.maximum(whole - forward**2 @ basis.variance, 0.0)
+    uncorrelated = statistics.sigma**2 * missing + np.broadcast_to(extra, used.shape)[used]
+    # errors of 0 would make the covariance singular
+    errors[np.diag_indices(len(errors))] += uncorrelated + _ROUNDING
     precision = cho_solve(cho_factor(errors), np.eye(len(errors)))
     gain = forward.T @ precision
     return Observation(used, gain, gain @ forward, forward, precision)
 
 
-# slabs seen from a straight path have their vectors at the same places
+# on a straight path all slabs have their vectors at the same places
 @lru_cache(maxsize=128)
-def _forward(one: Basis, places: bytes) -> np.ndarray:
-    return one.mean(np.frombuffer(places).reshape(-1, 2))
+def _forward(basis: Basis, places: bytes) -> np.ndarray:
+    return basis.mean(np.frombuffer(places).reshape(-1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,48 +230,52 @@ class PathField:
         left = right - 1 if len(self.x) > 1 else np.zeros_like(right)
         right = np.minimum(right, len(self.x) - 1)
         to_left, to_right = x - self.x[left], self.x[right] - x
-        one, other = self._weights(to_left, to_right, right > left)
-        state = one * self.mean[left] + other * self.mean[right]
+        weight_left, weight_right = self._weights(to_left, to_right, right > left)
+        state = weight_left * self.mean[left] + weight_right * self.mean[right]
         span = np.where(right > left, self.x[right] - self.x[left], 1.0)
         fraction = np.clip(to_left / span, 0.0, 1.0)
-        seen = (1 - fraction) * self.time[left] + fraction * self.time[right]
-        steps = np.rint(np.abs(time - seen) / _TIME_STEP).astype(int)
-        # complex numbers: rows are sorted a tenth as fast
-        unlike, back = np.unique(y + 1j * z, return_inverse=True)
-        places = np.stack([unlike.real, unlike.imag], -1)
-        found, stderr = np.zeros_like(x), np.zeros_like(x)
+        slab_time = (1 - fraction) * self.time[left] + fraction * self.time[right]
+        steps = np.rint(np.abs(time - slab_time) / _TIME_STEP).astype(int)
+        # complex numbers are sorted ten times as fast as rows
+        distinct, index = np.unique(y + 1j * z, return_inverse=True)
+        places = np.stack([distinct.real, distinct.imag], -1)
+        wind, stderr = np.zeros_like(x), np.zeros_like(x)
         for step in np.unique(steps):
-            here = steps == step
+            chosen = steps == step
             swept = (self.swept_speed * step * _TIME_STEP) ** 2
-            value = self.basis.point(places, swept)[back[here]]
-            found[here] = (value * state[here]).sum(-1)
+            value = self.basis.point(places, swept)[index[chosen]]
+            wind[chosen] = (value * state[chosen]).sum(-1)
             if error:
-                stderr[here] = self._stderr(
-                    value, one[here], other[here], left[here], right[here],
-                    to_left[here], to_right[here],
+                stderr[chosen] = self._stderr(
+                    value, weight_left[chosen], weight_right[chosen], left[chosen], right[chosen],
+                    to_left[chosen], to_right[chosen],
                 )  # fmt: skip
-        return found, stderr
+        return wind, stderr
 
     def _weights(
         self, to_left: np.ndarray, to_right: np.ndarray, two: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of the states of two slabs, (n, states): simple kriging with an exponential."""
+        """Weights of two slabs' states, (n, states): simple kriging, exponential correlation."""
         reach = self.basis.reach
         a, b = to_left[:, None] / reach, to_right[:, None] / reach
         inside = (two & (to_left > 0) & (to_right > 0))[:, None]
-        # one slab alone, or beyond both: the nearest
+        # with one slab, or beyond both, the nearest counts
         nearer = np.where(two, to_left > 0, False)[:, None]
         with np.errstate(over="ignore", invalid="ignore"):
-            both = np.sinh(np.where(inside, a + b, 1.0))
-            one = np.where(inside, np.sinh(b) / both, np.where(nearer, 0.0, np.exp(-np.abs(a))))
-            other = np.where(inside, np.sinh(a) / both, np.where(nearer, np.exp(-np.abs(b)), 0.0))
-        return one, other
+            scale = np.sinh(np.where(inside, a + b, 1.0))
+            weight_left = np.where(
+                inside, np.sinh(b) / scale, np.where(nearer, 0.0, np.exp(-np.abs(a)))
+            )
+            weight_right = np.where(
+                inside, np.sinh(a) / scale, np.where(nearer, np.exp(-np.abs(b)), 0.0)
+            )
+        return weight_left, weight_right
 
     def _stderr(
         self,
         value: np.ndarray,
-        one: np.ndarray,
-        other: np.ndarray,
+        weight_left: np.ndarray,
+        weight_right: np.ndarray,
         left: np.ndarray,
         right: np.ndarray,
         to_left: np.ndarray,
@@ -279,23 +283,23 @@ class PathField:
     ) -> np.ndarray:
         reach, sigma = self.basis.reach, self.statistics.sigma
         a, b = (np.exp(-np.abs(d)[:, None] / reach) for d in (to_left, to_right))
-        # of the state, given the states of the slabs without error
-        bridge = np.maximum(1 - one * a - other * b, 0.0) * self.basis.variance
+        # variance of the state given exact states of both slabs
+        bridge = np.maximum(1 - weight_left * a - weight_right * b, 0.0) * self.basis.variance
         prior = (value**2 * self.basis.variance).sum(-1)
         variance = sigma**2 * (np.maximum(1 - prior, 0.0) + (value**2 * bridge).sum(-1))
-        from_left, from_right = value * one, value * other
+        from_left, from_right = value * weight_left, value * weight_right
         pairs = ((from_left, left, from_left), (from_right, right, from_right))
         for first, slab, second in pairs:
             variance += np.einsum("nm,nmk,nk->n", first, self.covariance[slab], second)
         if len(self.cross):
-            both = self.cross[np.minimum(left, len(self.cross) - 1)]
-            variance += 2 * np.einsum("nm,nmk,nk->n", from_left, both, from_right)
+            cross = self.cross[np.minimum(left, len(self.cross) - 1)]
+            variance += 2 * np.einsum("nm,nmk,nk->n", from_left, cross, from_right)
         larger = np.maximum(self.inflation[left], self.inflation[right])
         return np.sqrt(larger * variance)
 
 
 def smoothed(
-    one: Basis,
+    basis: Basis,
     statistics: Statistics,
     x: Sequence[float],
     time: Sequence[float],
@@ -310,26 +314,26 @@ def smoothed(
 
     Notes
     -----
-    Where the vectors of a slab and its neighbours depart from what the slabs before let expect by
-    more than 1 in 1000 turbulent slabs do, variances there are multiplied by the mean square of the
-    normalised innovations (Birge 1932): the air is not what the statistics say, as in a vortex.
+    Where the innovations of a slab and its neighbours are larger than in all but 1 of 1000
+    turbulent slabs, variances there are multiplied by the mean square of the normalised
+    innovations (Birge 1932): the air does not have these statistics, as in a vortex.
     """
-    prior = statistics.sigma**2 * one.variance
-    decays = [np.exp(-step / one.reach) for step in np.diff(x)]
+    prior = statistics.sigma**2 * basis.variance
+    decays = [np.exp(-step / basis.reach) for step in np.diff(x)]
     filtered, spreads, precisions = [], [], []
     state, spread = np.zeros(len(prior)), np.diag(prior)
     squares = np.zeros((2, len(observations)))  # of innovations, and how many
-    for number, (seen, wind) in enumerate(zip(observations, winds, strict=True)):
+    for number, (observed, wind) in enumerate(zip(observations, winds, strict=True)):
         if number:
             decay = decays[number - 1]
             state = decay * state
             spread = decay[:, None] * spread * decay + np.diag(prior * (1 - decay**2))
         precision = np.linalg.inv(spread)
-        spread = np.linalg.inv(precision + seen.information)
-        innovation = wind[seen.used] - seen.forward @ state
-        change = seen.gain @ innovation
+        spread = np.linalg.inv(precision + observed.information)
+        innovation = wind[observed.used] - observed.forward @ state
+        change = observed.gain @ innovation
         # i' (H P H' + R)^-1 i
-        square = innovation @ seen.precision @ innovation - change @ spread @ change
+        square = innovation @ observed.precision @ innovation - change @ spread @ change
         squares[:, number] = square, len(innovation)
         state = state + spread @ change
         filtered.append(state)
@@ -345,7 +349,7 @@ def smoothed(
         # P + G (P_s - P_p) G', with the predicted covariance P_p and the gain G = P D P_p^-1
         after[number] += cross[number] @ gain.T - gain @ (decay[:, None] * spreads[number])
     return PathField(
-        one,
+        basis,
         statistics,
         np.asarray(x, float),
         np.asarray(time, float),

@@ -26,20 +26,20 @@ RATIOS = np.geomspace(0.01, 100.0, 36)
 """True errors of the vectors over the rms of turbulence, in units of stated errors of 1 m/s."""
 
 _SHAPE = (len(LENGTHS), len(MEANS), len(RATIOS))
-# Stated errors are known to a factor of 2 before the vectors are compared with each other.
+# Prior: stated errors are known to a factor of 2.
 _KNOWN_TO = np.log(2.0)
 # Slabs over which statistics are remembered: turbulence changes with height.
 _MEMORY = 80
 _BANDS = 10
 # Least rms of turbulence, m/s.
 _LEAST = 1e-3
-# Part of an error that is not correlated with its neighbours'.
-_OWN = 0.03
+# Fraction of an error's variance that is not correlated with the neighbours'.
+_WHITE = 0.03
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """What is known of the air and of the vectors before a slab is seen.
+    """Statistics of the air and of the vectors before a slab is observed.
 
     Attributes
     ----------
@@ -60,12 +60,12 @@ class Statistics:
     shape: Shape = "gaussian"
 
     def mean(self, times: int) -> Mean:
-        """Of the vectors, once or twice."""
+        """The mean that a vector is, taken once or twice."""
         return mean_of(self.resolution, self.shape, times)
 
 
 def noise_correlation(square: np.ndarray, twice: Mean) -> np.ndarray:
-    """Of white noise after a mean, at the squares of distances, m^2; `twice` is the mean's square.
+    """Correlation of averaged white noise at squared distances, m^2; `twice` is the mean's square.
 
     A Gaussian mean of standard deviation s makes it exp(-r^2/(4 s^2)).
     """
@@ -76,7 +76,7 @@ def noise_correlation(square: np.ndarray, twice: Mean) -> np.ndarray:
 def error_correlation(places: np.ndarray, twice: Mean) -> np.ndarray:
     """Correlation of the errors of vectors at places (n, 2), in m: (n, n)."""
     smooth = noise_correlation(((places[:, None] - places) ** 2).sum(-1), twice)
-    return (1 - _OWN) * smooth + _OWN * np.eye(len(places))
+    return (1 - _WHITE) * smooth + _WHITE * np.eye(len(places))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class _Expected:
 def _expected(shape: tuple[int, int], window: float, stride: float) -> _Expected:
     nz, ny = shape
     waves = np.hypot(*np.meshgrid(np.arange(nz) / nz, np.arange(ny) / ny, indexing="ij"))
-    # equally many cosines in each band, but the mean by itself
+    # bands of equally many cosines; the mean has one of its own
     order = waves.ravel().argsort().argsort().reshape(shape)
     size = max(1.0, (nz * ny - 1) / (_BANDS - 1))
     band = np.where(order == 0, 0, 1 + ((order - 1) / size).astype(int))
@@ -109,8 +109,8 @@ def _expected(shape: tuple[int, int], window: float, stride: float) -> _Expected
         """Mean squares by band of a field with covariances at all lags."""
         full = of_lags[index[0][:, None, :, None], index[1][None, :, None, :]]
         once = dctn(full, axes=(0, 1), norm="ortho")
-        both = dctn(once, axes=(2, 3), norm="ortho")
-        variance = np.einsum("zyzy->zy", both)
+        twice = dctn(once, axes=(2, 3), norm="ortho")
+        variance = np.einsum("zyzy->zy", twice)
         return np.bincount(band.ravel(), variance.ravel()) / counts
 
     now, lagged = np.zeros((2, len(LENGTHS), len(MEANS), len(ACROSS), len(counts)))
@@ -132,8 +132,8 @@ class StatisticsEstimator:
     Cosines of a slab are nearly independent (Whittle 1954), and each depends on the same cosine of
     the slab before (Vecchia 1988, J. R. Stat. Soc. B 50): the likelihood is that of the Gaussian
     conditional distributions, for every combination of `LENGTHS`, `MEANS` and `RATIOS`, each with
-    the variance that is most likely. The prior probability of all is the same but for the scale of
-    the errors; the most probable combination is taken.
+    the variance that is most likely. All have the same prior, except for the scale of the errors;
+    the most probable one is taken.
     """
 
     stride: float
@@ -143,7 +143,7 @@ class StatisticsEstimator:
     _sigma: np.ndarray = field(default_factory=lambda: np.ones(_SHAPE))
 
     def add(self, x: float, vectors: SlabVectors) -> None:
-        """Take in a slab at x (m); a slab with many rejected vectors is not used."""
+        """Add a slab at x (m); one with many rejected vectors is not used."""
         valid = vectors.valid
         last, self._last = self._last, None
         if min(valid.shape) < 3 or valid.mean() < 0.7:
@@ -154,25 +154,25 @@ class StatisticsEstimator:
         band = self._expected(valid.shape).band.ravel()
         error = np.mean(vectors.stderr[:, valid] ** 2, 1)
         common = vectors.common**2 * valid.size
-        # what is finer than this does not count: a mean is a Gaussian only nearly
-        own = _OWN * error[:, None, None]
+        # a floor of white noise, as a vector is only nearly a Gaussian mean
+        white = _WHITE * error[:, None, None]
         self._last = x, waves
         for sums in self._sums.values():
             sums *= 1 - 1 / _MEMORY
         follows = last is not None and abs(x - last[0] - self.stride) < 0.3 * self.stride
         if last is not None and follows and last[1].shape == waves.shape:
-            products = (waves**2 + own, waves * last[1], last[1] ** 2 + own)
+            products = (waves**2 + white, waves * last[1], last[1] ** 2 + white)
         else:
-            # the first one: by itself
-            products = (waves**2 + own, np.zeros_like(waves), np.zeros_like(waves))
+            # no slab before it
+            products = (waves**2 + white, np.zeros_like(waves), np.zeros_like(waves))
             follows = False
         sums = self._sums.setdefault(valid.shape, np.zeros((2, 6, len(ACROSS), band.max() + 1)))
         part = sums[int(follows)]
-        for n, one in enumerate(products):
-            part[n] += [np.bincount(band, a.ravel()) for a in one]
+        for n, square in enumerate(products):
+            part[n] += [np.bincount(band, a.ravel()) for a in square]
         part[3] += np.bincount(band)
         part[4] += error[:, None] * np.bincount(band)
-        # pointing moves the mean of all vectors
+        # errors of pointing shift the mean of all vectors
         part[5, :, 0] += common
 
     def _expected(self, shape: tuple[int, int]) -> _Expected:
@@ -180,7 +180,7 @@ class StatisticsEstimator:
 
     @property
     def statistics(self) -> Statistics | None:
-        """The most probable ones; None before a slab."""
+        """The most probable statistics; None before the first slab."""
         if not self._sums:
             return None
         number, logarithm, square = 0.0, np.zeros(_SHAPE), np.zeros(_SHAPE)
@@ -192,7 +192,7 @@ class StatisticsEstimator:
                     number += float(part[3].sum())
                     logarithm += more[0]
                     square += more[1]
-        # of a variance common to all the most probable value is known: the mean square
+        # the most probable common variance is the mean square
         sigma = np.sqrt(np.maximum(square / number, _LEAST**2))
         self._sigma = sigma
         cost = logarithm + 2 * number * np.log(sigma) + square / sigma**2
@@ -214,12 +214,12 @@ def _likelihood(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Logarithms of the variances, and squares over them, of turbulence of variance 1.
 
-    Dims as of `_SHAPE`. Errors that are known are over the `sigma` estimated last (m/s).
+    Dims of `_SHAPE`. Known errors are divided by the last estimate of `sigma` (m/s).
     """
     now, product, before, count, error, common = sums
     number = np.maximum(count, 1e-9)
     noise = RATIOS[:, None, None] ** 2 * expected.errors[:, None, None, :] * (error / number)
-    known = (common + _OWN * error) / number / sigma[..., None, None] ** 2
+    known = (common + _WHITE * error) / number / sigma[..., None, None] ** 2
     variance = expected.turbulence[:, :, None] + noise + known
     if not follows:
         return (count * np.log(variance)).sum((-2, -1)), (now / variance).sum((-2, -1))

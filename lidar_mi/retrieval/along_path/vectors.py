@@ -1,4 +1,4 @@
-"""The vectors of a slab of air that count: those whose windows do not overlap."""
+"""The independent vectors of a slab of air: those whose windows do not overlap."""
 
 from dataclasses import dataclass
 
@@ -6,15 +6,16 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import masks_of
 from lidar_mi.retrieval.common_error import common_rotation, common_stderr
 
 ACROSS = ("v", "w")
 """Components that every slab has."""
 
-# Meaning of the flag of vectors whose u alone is not to be used.
+# Flag of vectors of which only u is rejected.
 _ONLY_U = "beyond_lines"
-# Least fraction of a stated error that is the vector's own.
-_LEAST_OWN = 1e-3
+# Least fraction of a stated error that is independent of the other vectors'.
+_LEAST_INDEPENDENT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,7 @@ class SlabVectors:
     y, z : ndarray, shapes (ny,) and (nz,)
         m.
     wind, stderr : ndarray, shape (2, nz, ny)
-        v and w, and their own standard errors, m/s; NaN where the vector is rejected.
+        v and w, and the independent part of their standard errors, m/s; NaN where rejected.
     window : float
         Size of the windows, m: errors are correlated over it.
     common : ndarray, shape (2,)
@@ -53,11 +54,10 @@ class SlabVectors:
 
 
 def counting(wind: xr.Dataset) -> xr.Dataset:
-    """The vectors of an estimate that count, as a data set of the same variables.
+    """The vectors whose windows do not overlap, as a data set of the same variables.
 
-    Windows that lie side by side see all pixels once: vectors between them have nearly no
-    information of their own, and errors that are not independent. The estimate is of
-    `retrieve_wind` or `combine`; the result has an attribute `window` (m).
+    Vectors between them add nearly no information, and their errors are not independent. `wind` is
+    of `retrieve_wind` or `combine`; the result has an attribute `window` (m).
 
     Raises
     ------
@@ -68,28 +68,28 @@ def counting(wind: xr.Dataset) -> xr.Dataset:
         if name not in wind:
             raise InputError(f"wind.{name}: missing; expected v, w, their errors and flag")
     window = _window(wind)
-    some = {name: _apart(wind.variables[name].values, window) for name in ("z", "y")}
-    return wind.isel(some).assign_attrs(window=window)
+    separate = {name: _separate(wind.variables[name].values, window) for name in ("z", "y")}
+    return wind.isel(separate).assign_attrs(window=window)
 
 
 def slab_vectors(wind: xr.Dataset) -> SlabVectors:
-    """Those of `counting`, without what their errors have in common."""
+    """Vectors of `counting`, with the common part of their errors stated separately."""
     y, z = (wind.variables[axis].values.astype(float) for axis in ("y", "z"))
 
     def values(name: str) -> np.ndarray:
         return wind.variables[name].transpose("z", "y").values.astype(float)
 
-    found = np.stack([values(name) for name in ACROSS])
+    components = np.stack([values(name) for name in ACROSS])
     stderr = np.stack([values(f"{name}_stderr") for name in ACROSS])
     common = common_stderr(wind)
     rotation, centre = common_rotation(wind)
     arms = np.stack(np.broadcast_arrays(z[:, None] - centre[1], y - centre[0]))
     shared = np.hypot(rotation * arms, np.reshape(common, (2, 1, 1)))
-    own = np.sqrt(np.maximum(stderr**2 - shared**2, (_LEAST_OWN * stderr) ** 2))
-    flag = values("flag").astype(int) & ~_mask_of(wind["flag"], _ONLY_U)
-    good = (flag == 0) & (np.isfinite(found) & (stderr > 0) & np.isfinite(stderr)).all(0)
-    found, own = np.where(good, found, np.nan), np.where(good, own, np.nan)
-    return SlabVectors(y, z, found, own, wind.attrs["window"], common, rotation, centre)
+    independent = np.sqrt(np.maximum(stderr**2 - shared**2, (_LEAST_INDEPENDENT * stderr) ** 2))
+    flag = values("flag").astype(int) & ~masks_of(wind["flag"].attrs).get(_ONLY_U, 0)
+    good = (flag == 0) & (np.isfinite(components) & (stderr > 0) & np.isfinite(stderr)).all(0)
+    known, errors = (np.where(good, array, np.nan) for array in (components, independent))
+    return SlabVectors(y, z, known, errors, wind.attrs["window"], common, rotation, centre)
 
 
 def _window(wind: xr.Dataset) -> float:
@@ -106,14 +106,7 @@ def _window(wind: xr.Dataset) -> float:
     return float(pixels * (y[-1] - y[0]) / (len(y) - 1))
 
 
-def _apart(axis: np.ndarray, window: float) -> np.ndarray:
+def _separate(axis: np.ndarray, window: float) -> np.ndarray:
     """Indices of nodes a window apart, one of them the nearest to the path."""
     step = max(1, round(window / (axis[1] - axis[0])))
     return np.arange(int(np.abs(axis).argmin()) % step, len(axis), step)
-
-
-def _mask_of(flag: xr.DataArray, meaning: str) -> int:
-    """The bit of a meaning; 0 where the flag does not have it."""
-    names = str(flag.attrs.get("flag_meanings", "")).split()
-    masks = np.ravel(flag.attrs.get("flag_masks", []))
-    return int(dict(zip(names, masks, strict=True)).get(meaning, 0)) if len(masks) else 0

@@ -81,10 +81,10 @@ def _averaged(length: float, mean: Mean, swept: float) -> tuple[np.ndarray, ...]
     Without those that the mean removes.
     """
     sizes, weights = _eddies(length)
-    some = sizes >= min(_LEAST * (mean.variance.min() + swept), sizes[-1])
-    along = np.repeat(sizes[some] + swept, len(mean.weight))
-    plane = np.add.outer(sizes[some] + swept, mean.variance).ravel()
-    weights = np.outer(weights[some], mean.weight).ravel() / (np.sqrt(along) * plane)
+    large = sizes >= min(_LEAST * (mean.variance.min() + swept), sizes[-1])
+    along = np.repeat(sizes[large] + swept, len(mean.weight))
+    plane = np.add.outer(sizes[large] + swept, mean.variance).ravel()
+    weights = np.outer(weights[large], mean.weight).ravel() / (np.sqrt(along) * plane)
     return along, plane, weights
 
 

@@ -1,4 +1,4 @@
-"""Errors of the speed by what is assumed of the line and is wrong."""
+"""Errors of the speed by wrong assumptions on the line."""
 
 import math
 from collections.abc import Sequence

@@ -93,7 +93,7 @@ def cramer_rao(
     vector = parameter_vector(model, v_los, level, temperature, aerosol)
     mean, jacobian = mean_and_jacobian(model, vector)
     weight = 1 / variance(model, noise or PixelNoise(), mean)
-    found = standard_deviations(fisher_matrix(jacobian, weight, indices) + known)[0]
-    if not torch.isfinite(found).all():
+    bounds = standard_deviations(fisher_matrix(jacobian, weight, indices) + known)[0]
+    if not torch.isfinite(bounds).all():
         raise InputError(f"free: the channels do not determine {', '.join(free)} all together")
-    return {PARAMETERS[i]: float(value) for i, value in zip(indices, found, strict=True)}
+    return {PARAMETERS[i]: float(value) for i, value in zip(indices, bounds, strict=True)}

@@ -147,8 +147,8 @@ def _start(
     norm = weight @ (shape**2).T
     level = (weight * signal) @ shape.T / norm
     best = (level * ((weight * signal) @ shape.T)).argmax(1)
-    found = level.gather(1, best[:, None])[:, 0]
-    significant = found * norm.gather(1, best[:, None])[:, 0].sqrt()
+    best_level = level.gather(1, best[:, None])[:, 0]
+    significant = best_level * norm.gather(1, best[:, None])[:, 0].sqrt()
     for k in range(len(counts)):
         if not significant[k] > SIGNIFICANT:
             raise InputError(
@@ -156,7 +156,7 @@ def _start(
                 f"expected more than {SIGNIFICANT:g}"
             )
     parameters = tried[best]
-    parameters[:, 1] = found
+    parameters[:, 1] = best_level
     return parameters
 
 

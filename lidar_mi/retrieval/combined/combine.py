@@ -5,7 +5,6 @@ estimate from both (generalised least squares, also called optimal interpolation
 components on the images' grid, with their covariance.
 """
 
-import enum
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ import scipy
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import REJECTED, CombinedFlag, flag_attributes
 from lidar_mi.retrieval.combined.common_time import at_common_time
 from lidar_mi.retrieval.combined.crossflow import (
     Crossflow,
@@ -38,21 +38,12 @@ from lidar_mi.retrieval.combined.u_prior import (
     probable_statistics,
     relative_std,
 )
-from lidar_mi.retrieval.combined.vectors import COMPONENTS, error_variables, flag_attributes
+from lidar_mi.retrieval.combined.vectors import COMPONENTS, error_variables
 from lidar_mi.retrieval.common_error import ROTATION
 from lidar_mi.retrieval.threads import threads_for
 
 # Prior standard deviation of the mean of u, m/s.
 _MEAN_STD = 100.0
-
-
-class CombinedFlag(enum.IntFlag):
-    """Why a vector is rejected, one bit per reason; 0: valid."""
-
-    NO_CROSSFLOW = 1
-    """The images gave no valid vector here: u alone."""
-    BEYOND_LINES = 2
-    """Outside the lines of sight: u is extrapolated from the nearest."""
 
 
 @threads_for(0)
@@ -157,7 +148,7 @@ def combine(
     jets, 80 to 90 and 97 %.
     """
     if time is None and "time" in crossflow:
-        # variables: with their coordinates this takes ten times as long
+        # variables, as with coordinates this takes ten times as long
         times, flags = (crossflow.variables[name] for name in ("time", "flag"))
         time = float(times.where(flags == 0).mean())
     crossflow, scan = at_common_time(
@@ -192,7 +183,7 @@ def combine(
     spacing = line_spacing(lines, z, y)
     relative_stds = relative_std(field, lines, z, y, spacing, u_power)
     known = u_std, u_length, u_exponent
-    found, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, known)
+    drawn, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, known)
     valid = field.valid
     wind = np.zeros((*valid.shape, 3))
     covariance = np.zeros((*valid.shape, 3, 3))
@@ -201,7 +192,7 @@ def combine(
     for start in range(0, len(z), rows):
         chunk = slice(start, start + rows)
         wind[chunk], covariance[chunk] = _posterior(
-            chunk, field, lines, overlap, found, relative_stds, residual, shared, z, y
+            chunk, field, lines, overlap, drawn, relative_stds, residual, shared, z, y
         )
     wind[..., 1:] += slope * wind[..., :1]
     shear = np.zeros((*valid.shape, 3, 3)) + np.eye(3)
@@ -228,7 +219,7 @@ def combine(
     if ROTATION in crossflow:
         combined[ROTATION] = crossflow[ROTATION]
     if field.common.any():
-        combined = _with_common(combined, field, *_common(field, found, residual, shared))
+        combined = _with_common(combined, field, *_common(field, drawn, residual, shared))
     return combined
 
 
@@ -360,7 +351,7 @@ def _dataset(
                 for index, name in enumerate(COMPONENTS)
             },
             **error_variables(dims, covariance),
-            "flag": (dims, flag.astype(np.uint8), flag_attributes(CombinedFlag)),
+            "flag": (dims, flag.astype(np.uint16), flag_attributes(CombinedFlag, REJECTED)),
             **at,
         },
         coords={axis: crossflow.variables[axis] for axis in dims},

@@ -36,10 +36,10 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
 
         c = sum omega^2 (v, w) / sum omega^2 ,   omega = dw/dy - dv/dz .
 
-    The swirl of a vortex itself cancels. The mean wind and the induction by the others remain.
-    Exact for round vortices of equal strength far from each other and from the edge; of a pair 20
-    to 47 m apart with cores of 3 m on nodes of 1 to 2 m the descent is right to 1 %. Where vortices
-    drift by different velocities it is their mean.
+    The swirl of a vortex itself cancels. The mean wind and the induction by the others remain. It
+    is exact for round vortices of equal strength far from each other and from the edge; for a pair
+    20 to 47 m apart with cores of 3 m on nodes of 1 to 2 m the descent is right to 1 %. Of vortices
+    that drift at different velocities it is the mean.
 
     The standard errors are the larger of two: the propagated errors of the vectors, correlated as
     their windows overlap; and the scatter of the drift within the pattern,
@@ -76,7 +76,7 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
     drift = [float((vorticity**2 * part).sum()) / total for part in (v, w)]
     by_z, by_y = (np.asarray(np.gradient(np.eye(len(axis)), axis, axis=0)) for axis in (z, y))
     errors = _errors(crossflow, crossflow_std)
-    # of the vorticity by errors of the vectors, which makes it count everywhere
+    # variance of the vorticity by errors of the vectors
     noise = known * (
         _of_differences(by_y, errors.along_y) * errors.w**2
         + _of_differences(by_z, errors.along_z)[:, None] * errors.v**2
@@ -85,13 +85,13 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
     for part, mean, (of_v, of_w) in zip((v, w), drift, ((1, 0), (0, 1)), strict=True):
         # derivatives of the drift by the vorticity, and by v and w of every vector
         by_vorticity = 2 * vorticity * (part - mean) / total
-        own = vorticity**2 / total
-        by_v, by_w = own * of_v - by_z.T @ by_vorticity, own * of_w + by_vorticity @ by_y
+        direct = vorticity**2 / total
+        by_v, by_w = direct * of_v - by_z.T @ by_vorticity, direct * of_w + by_vorticity @ by_y
         by_noise = _of_vectors(errors, by_v, by_w)
         bias = float((noise * (part - mean)).sum()) / total
         variances.append(max(by_noise, _between_signs(vorticity, part)) + bias**2)
-    found = [float(np.sqrt(part)) for part in variances]
-    return Drift((drift[0], drift[1]), (found[0], found[1]))
+    stderr = [float(np.sqrt(part)) for part in variances]
+    return Drift((drift[0], drift[1]), (stderr[0], stderr[1]))
 
 
 def _between_signs(vorticity: np.ndarray, part: np.ndarray) -> float:
@@ -109,7 +109,7 @@ def _between_signs(vorticity: np.ndarray, part: np.ndarray) -> float:
 
 
 class _Errors(NamedTuple):
-    """Of v and w (z, y), m/s, their correlation, and that along both axes, (n, n)."""
+    """Errors of v and w (z, y), m/s, their correlation, and that along both axes, (n, n)."""
 
     v: np.ndarray
     w: np.ndarray
@@ -135,15 +135,15 @@ def _errors(crossflow: xr.Dataset, std: float | None) -> _Errors:
 
 
 def _of_differences(slope: np.ndarray, overlap: np.ndarray) -> np.ndarray:
-    """Variance (n,) of a derivative along an axis, of errors of variance 1."""
+    """Variance (n,) of a derivative along an axis by errors of variance 1."""
     return (slope * (slope @ overlap)).sum(1)
 
 
 def _of_vectors(errors: _Errors, by_v: np.ndarray, by_w: np.ndarray) -> float:
     """Variance of a sum of vectors with the factors by_v and by_w, dims (z, y)."""
-    # two independent errors make those of v and w
-    own = np.sqrt(np.clip(1 - errors.together**2, 0, 1))
-    parts = (by_v * errors.v + by_w * errors.w * errors.together, by_w * errors.w * own)
+    # Cholesky factors of the errors of v and w
+    independent = np.sqrt(np.clip(1 - errors.together**2, 0, 1))
+    parts = (by_v * errors.v + by_w * errors.w * errors.together, by_w * errors.w * independent)
     return float(sum((part * (errors.along_z @ part @ errors.along_y)).sum() for part in parts))
 
 
@@ -246,7 +246,7 @@ def _vectors(crossflow: xr.Dataset, time: float, drift: tuple[float, float]) -> 
     speed = np.array([drift[1] / steps[0], drift[0] / steps[1]])
     when = nearest_filled(flow["time"].values.astype(float))
     nodes = np.indices(when.shape).astype(float)
-    # times vary slowly over what the pattern moves: twice is enough
+    # times vary slowly over the displacement: two iterations are enough
     source = nodes - speed[:, None, None] * (time - when)
     source = nodes - speed[:, None, None] * (
         time - scipy.ndimage.map_coordinates(when, source, order=1, mode="nearest")
@@ -256,13 +256,13 @@ def _vectors(crossflow: xr.Dataset, time: float, drift: tuple[float, float]) -> 
     inside = ((source > -_ROUNDING) & (source < ends + _ROUNDING)).all(0)
     around = scipy.ndimage.map_coordinates(valid.astype(float), source, order=1, mode="nearest")
     known = inside & (around > 1 - _ROUNDING)
-    found = {}
+    fields = {}
     for name in (name for name in _FIELDS if name in flow):
         filled = nearest_filled(np.where(valid, flow[name].values.astype(float), np.nan))
         order = 3 if name in ("v", "w") else 1
         moved = scipy.ndimage.map_coordinates(filled, source, order=order, mode="nearest")
-        found[name] = flow[name].copy(data=np.where(known, moved, np.nan))
+        fields[name] = flow[name].copy(data=np.where(known, moved, np.nan))
     flag = flow["flag"]
-    found["flag"] = flag.copy(data=np.where(known, 0, np.maximum(flag.values, 1)))
-    found["time"] = flow["time"].copy(data=np.full(when.shape, float(time)))
-    return flow.assign(found)
+    fields["flag"] = flag.copy(data=np.where(known, 0, np.maximum(flag.values, 1)))
+    fields["time"] = flow["time"].copy(data=np.full(when.shape, float(time)))
+    return flow.assign(fields)

@@ -6,9 +6,9 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.checks import checked_image
 from lidar_mi.retrieval.common_error import common_stderr, own_errors
-from lidar_mi.retrieval.images.quality import Flag
 
 # Standard deviation of v and w where the images gave no vector, over that of the valid ones:
 # vectors are rejected where the wind varies most.
@@ -46,7 +46,7 @@ def apparent_slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.
 def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
     """v and w of a data set with the covariance of their errors, or with errors of ``std`` (m/s).
 
-    Vectors that are flagged for nothing but an unknown error are valid with ``std``.
+    With ``std``, vectors whose only flag is an unknown error are valid.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
         *stderr, correlation = (_values(wind, name) for name in names)
         (first, second), correlation = own_errors(np.stack(stderr), correlation, common)
     flag = _values(wind, "flag").astype(int)
-    # an error that is given need not be known
+    # with a given crossflow_std, vectors of unknown error are valid
     allowed = 0 if std is None else Flag.ERROR_UNKNOWN.value
     valid = (flag & ~allowed == 0) & np.isfinite(value).all(-1)
     valid &= (first > 0) & (second > 0) & (abs(correlation) < 1)
@@ -92,7 +92,7 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
 
 
 def _values(wind: xr.Dataset, name: str) -> np.ndarray:
-    """Of a variable (z, y); without its coordinates, which take longer to attach than all else."""
+    """Values of a variable (z, y), without coordinates, which take longest to attach."""
     return wind.variables[name].transpose("z", "y").values.astype(float)
 
 

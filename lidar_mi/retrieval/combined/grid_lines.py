@@ -139,8 +139,8 @@ def covariance_of_lines(
     lines: GridLines, weight: np.ndarray, over_z: np.ndarray, over_y: np.ndarray
 ) -> np.ndarray:
     """As `covariances_of_lines`, for one correlation."""
-    (found,) = covariances_of_lines(lines, weight, [(over_z, over_y)])
-    return found
+    (covariance,) = covariances_of_lines(lines, weight, [(over_z, over_y)])
+    return covariance
 
 
 def covariance_with_nodes(

@@ -60,12 +60,12 @@ def relative_std(
     square, known = np.zeros(field.valid.shape), np.zeros(field.valid.shape)
     for axis, nodes in enumerate((z, y)):
         step = np.diff(nodes).mean()
-        both = np.roll(field.valid, 1, axis) & np.roll(field.valid, -1, axis)
+        neighbours = np.roll(field.valid, 1, axis) & np.roll(field.valid, -1, axis)
         edge = np.arange(len(nodes))[[0, -1]]
-        both[(slice(None),) * axis + (edge,)] = False
+        neighbours[(slice(None),) * axis + (edge,)] = False
         change = np.roll(field.value, -1, axis) - np.roll(field.value, 1, axis)
-        square += np.where(both, ((change / (2 * step)) ** 2).sum(-1), 0)
-        known += both
+        square += np.where(neighbours, ((change / (2 * step)) ** 2).sum(-1), 0)
+        known += neighbours
     # over the lines' spacing: finer variations of u are not observed
     width = [spacing / np.diff(nodes).mean() for nodes in (z, y)]
     square, known = (
@@ -79,13 +79,13 @@ def relative_std(
     shear = np.where(known_here, shear, shear[known_here].mean())
     # u may vary where v and w are uniform
     shear = np.maximum(shear, 1e-3 * shear.max())
-    found = {}
-    for one in _POWERS if power is None else (power,):
-        relative = shear**one
-        found[one] = relative / np.sqrt(
+    relative_stds = {}
+    for exponent in _POWERS if power is None else (power,):
+        relative = shear**exponent
+        relative_stds[exponent] = relative / np.sqrt(
             (relative[lines.z, lines.y] ** 2 * lines.weight).sum(1).mean()
         )
-    return found
+    return relative_stds
 
 
 def probable_statistics(
@@ -131,16 +131,18 @@ def probable_statistics(
     variance = stds[of_std, None, None] ** 2
     white = np.linalg.inv(np.linalg.cholesky(fixed + variance * shapes[of_shape]))
     kinds = list(itertools.product(pairs, relative_stds))
-    # the one of largest evidence is there once more than it was drawn
+    # the best was appended, not drawn
     best = int(np.searchsorted(drawn, np.argmax(evidence)))
     times[best] -= 1
     choices = []
-    for k, s, often, one in zip(of_shape, of_std, times, white, strict=True):
+    for k, s, often, whitening in zip(of_shape, of_std, times, white, strict=True):
         (a, size), power = kinds[k]
         misfit = float(square[k, s]) / len(residual)
         probability_of = float(often) / _DRAWN
         choices.append(
-            Statistics(float(stds[s]), float(size), float(power), a, probability_of, one, misfit)
+            Statistics(
+                float(stds[s]), float(size), float(power), a, probability_of, whitening, misfit
+            )
         )
     return [choice for choice in choices if choice.probability], choices[best]
 
@@ -150,9 +152,9 @@ def evidence_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Evidence of standard deviations of u for several shapes of its covariance.
 
-    Where ``fixed`` is white, one rotation makes S = fixed + std^2 shape tridiagonal for all
+    After whitening by ``fixed``, one rotation makes S = fixed + std^2 shape tridiagonal for all
     standard deviations. ``fixed`` (lines, lines) is the covariance of the lines' velocities without
-    u's, positive definite; the ``residual`` (lines,) is theirs from what is expected.
+    u's, positive definite; ``residual`` (lines,) are observed less expected velocities.
 
     Returns
     -------
@@ -165,14 +167,14 @@ def evidence_of(
     middle, side, data = _tridiagonal(white @ shapes @ white.T, data)
     # factors L D L^T of 1 + std^2 T, one line after the other, of all shapes and deviations
     variance = stds**2
-    pivot, rest = 1 + variance * middle[:, :1], data[:, :1] + 0 * variance
-    logarithm, square = np.log(pivot), rest**2 / pivot
+    pivot, reduced = 1 + variance * middle[:, :1], data[:, :1] + 0 * variance
+    logarithm, square = np.log(pivot), reduced**2 / pivot
     for k in range(1, len(residual)):
         below = variance * side[:, k - 1 : k]
-        rest = data[:, k : k + 1] - below / pivot * rest
+        reduced = data[:, k : k + 1] - below / pivot * reduced
         pivot = 1 + variance * middle[:, k : k + 1] - below**2 / pivot
         logarithm += np.log(pivot)
-        square += rest**2 / pivot
+        square += reduced**2 / pivot
     return -logarithm / 2 - square / 2, square
 
 
@@ -181,8 +183,8 @@ def _tridiagonal(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Diagonals T of symmetric matrices A = Q T Q^T, by Householder's reflections, and Q^T vectors.
 
-    It takes a third of the time of eigenvectors, which the evidence does not need. Of matrices
-    (number, n, n) and vectors (number, n): the diagonal, the one beside it, and Q^T vectors.
+    For matrices (number, n, n) and vectors (number, n): the diagonal, the off-diagonal, and Q^T
+    vectors. It takes a third of the time of eigenvectors, which the evidence does not need.
     """
     if matrices.shape[1] == 1:
         return matrices[:, 0], matrices[:, 0, :0], vectors

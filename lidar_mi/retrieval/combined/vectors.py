@@ -1,12 +1,11 @@
 """Wind vectors from line-of-sight velocities: triples of neighbours, and larger neighbourhoods."""
 
-import enum
-
 import numpy as np
 import scipy
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import REJECTED, VectorFlag, flag_attributes
 
 COMPONENTS = ("u", "v", "w")
 _NAMES = ("v_los", "v_los_std", "direction", "range", "platform_velocity")
@@ -15,15 +14,6 @@ _NAMES = ("v_los", "v_los_std", "direction", "range", "platform_velocity")
 _COPLANAR = 1e-8
 # Altitude over longest side of a triangle of lines, over that of the median one.
 _THINNEST = 0.1
-
-
-class LineFlag(enum.IntFlag):
-    """Why a vector is rejected, one bit per reason; 0: valid."""
-
-    COPLANAR = 1
-    """The lines lie in one plane: the wind across it is undetermined. No vector."""
-    NO_VELOCITY = 2
-    """A line has no velocity. No vector."""
 
 
 def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
@@ -41,15 +31,15 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
     for name in _NAMES:
         if name not in scan:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
-    # variables: their coordinates take longer to attach than all checks
+    # variables, as attaching coordinates takes longer than all checks
     variables = scan.variables
-    own = {"line"} & set(variables["platform_velocity"].dims)
+    each_line = {"line"} & set(variables["platform_velocity"].dims)
     for name, dims in (
         ("v_los", {"line"}),
         ("v_los_std", {"line"}),
         ("range", {"line"}),
         ("direction", {"line", "axis"}),
-        ("platform_velocity", {"axis"} | own),
+        ("platform_velocity", {"axis"} | each_line),
         ("origin", {"line", "axis"}),
     ):
         if name in variables and set(variables[name].dims) != dims:
@@ -127,7 +117,7 @@ def solve_lines(
     """
     matrix = directions / std[..., None]
     left, values, right = np.linalg.svd(matrix, full_matrices=False)
-    # of the directions themselves: errors may differ by orders of magnitude
+    # unweighted, as errors may differ by orders of magnitude
     unweighted = np.linalg.svd(directions, compute_uv=False)
     flat = unweighted[:, -1] <= _COPLANAR * unweighted[:, 0]
     inverse = 1 / np.where(flat[:, None], np.nan, values)
@@ -163,7 +153,7 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     -------
     xr.Dataset, dim vector
         `u`, `v`, `w` (m s-1), their standard errors and correlations, `x`, `y`, `z` (m), `lines`
-        (vector, corner), `flag` (bits of `LineFlag`).
+        (vector, corner), `flag` (bits of `VectorFlag`).
 
     Raises
     ------
@@ -238,7 +228,7 @@ def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str
     shared = shared_covariance(scan)
     if shared is not None:
         shared = np.nan_to_num(shared[lines[:, :, None], lines[:, None]])
-    # any number will do: the results are replaced by NaN below
+    # a placeholder: these results become NaN below
     wind, covariance, chi_square = solve_lines(
         directions,
         np.where(missing[:, None], 0.0, values),
@@ -247,7 +237,7 @@ def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str
     )
     flat = np.isinf(covariance[:, 0, 0])
     wind[missing], covariance[missing | flat] = np.nan, np.nan
-    flag = LineFlag.COPLANAR * flat + LineFlag.NO_VELOCITY * missing
+    flag = VectorFlag.COPLANAR * flat + VectorFlag.NO_VELOCITY * missing
     freedom = lines.shape[1] - 3
     misfit = {}
     if freedom:
@@ -263,7 +253,7 @@ def _vectors(scan: xr.Dataset, along: np.ndarray, lines: np.ndarray, method: str
             },
             **misfit,
             "lines": (("vector", "corner"), lines, {"long_name": "lines of sight, as counted"}),
-            "flag": ("vector", flag.astype(np.uint8), flag_attributes(LineFlag)),
+            "flag": ("vector", flag.astype(np.uint16), flag_attributes(VectorFlag, REJECTED)),
         },
         coords={
             name: ("vector", centre[:, index], {"units": "m", "long_name": f"{name} of the vector"})
@@ -285,7 +275,7 @@ def error_variables(
 ) -> dict[str, tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]]:
     """Standard errors and correlations of u, v, w from covariances (..., 3, 3), as variables."""
     stderr = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    found = {
+    variables = {
         f"{name}_stderr": (
             dims,
             stderr[..., index],
@@ -294,22 +284,12 @@ def error_variables(
         for index, name in enumerate(COMPONENTS)
     }
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        both = stderr[..., i] * stderr[..., j]
+        product = stderr[..., i] * stderr[..., j]
         correlation = np.divide(
-            covariance[..., i, j], both, out=np.zeros_like(both), where=both > 0
+            covariance[..., i, j], product, out=np.zeros_like(product), where=product > 0
         )
-        correlation[np.isnan(both)] = np.nan
+        correlation[np.isnan(product)] = np.nan
         first, second = COMPONENTS[i], COMPONENTS[j]
         text = {"units": "1", "long_name": f"correlation of the errors of {first} and {second}"}
-        found[f"{first}{second}_correlation"] = (dims, correlation, text)
-    return found
-
-
-def flag_attributes(flags: type[enum.IntFlag]) -> dict[str, str | np.ndarray]:
-    """CF attributes of a variable that holds bits of ``flags``."""
-    return {
-        "long_name": "reasons to reject the vector, 0 = valid",
-        "standard_name": "quality_flag",
-        "flag_masks": np.array([bit.value for bit in flags], dtype=np.uint8),
-        "flag_meanings": " ".join(str(bit.name).lower() for bit in flags),
-    }
+        variables[f"{first}{second}_correlation"] = (dims, correlation, text)
+    return variables

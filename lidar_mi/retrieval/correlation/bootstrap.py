@@ -15,6 +15,7 @@ from functools import reduce
 
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.known_motion import (
     advected,
     at_mid_time,
@@ -29,7 +30,6 @@ from lidar_mi.retrieval.correlation.unresolved_motion import Motion, Residuals, 
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.intensity import normalised
 from lidar_mi.retrieval.images.noise_map import known_and_weight, variance_of_residual
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.images.spline import band_limited, likeliest
 from lidar_mi.retrieval.images.windows import (
@@ -44,7 +44,7 @@ from lidar_mi.retrieval.images.windows import (
 # Standard deviation of all Gaussian means over the template, and of those that decide whether
 # errors are known at all.
 _WIDTH, _AROUND = 1.5, 4.5
-# Templates by which the residual is moved along z and y, away from the texture that it is of.
+# Templates by which the residual is shifted along z and y, away from its own texture.
 _SEPARATION = 2
 # Independent windows of known error within a mean that a variance needs: of the two components of
 # five windows, it is known to 45 %.
@@ -62,7 +62,7 @@ _FILTERS = {2: FilterSettings(), 3: VOLUME_FILTER}
 
 def bootstrap_covariance(
     images: Sequence[torch.Tensor],
-    found: Displacement,
+    displacement: Displacement,
     windows: Windows,
     retrieve: Callable[..., Displacement],
     centred: bool,
@@ -88,9 +88,9 @@ def bootstrap_covariance(
       texture.
 
     The vectors retrieved from this pair are d - h (1 - G) d + e, with the mean G over a window, the
-    fraction h of least squares, and the random errors e. A vector lacks h (1 - G) of the wind and
-    all that is finer: that is the `unresolved_motion.unresolved` U. As the residual is less than
-    the images' differences by what the vectors follow, e is as well, by the leverage L. So
+    fraction h of least squares, and the random errors e. Vectors lack h (1 - G) d and all finer
+    motion, whose covariance is U (`unresolved_motion.unresolved`). The vectors follow part of the
+    images' differences, so that the residual, and with it e, is too small by the leverage L. So
 
         C = L s^2 <e e / s^2> f / (f - 2) + U,
 
@@ -98,15 +98,15 @@ def bootstrap_covariance(
     variance s^2 of the noise where that is known of each pixel. With f errors in a mean, normalised
     errors have Student's distribution, of the variance f / (f - 2).
 
-    Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
-    that are passed the tests of texture by chance, and their errors are no evidence.
-    Where the known motion is recovered in less than half of them, nor are the errors of these.
+    Errors are unknown where most textured windows around (Gaussian of 4.5 templates) are not
+    `clear`, as windows then pass the tests of texture by chance, and where the known motion is
+    recovered in less than half of them.
 
     Parameters
     ----------
     images : sequence of torch.Tensor, shape (z, y), or (x, z, y) of volumes
         The two images.
-    found : Displacement
+    displacement : Displacement
         Retrieved from them.
     retrieve : callable
         (image1, image2, stride=...) -> Displacement, the method with its options.
@@ -114,8 +114,8 @@ def bootstrap_covariance(
         Windows are deformed, and vectors belong to their centres, not half their displacement
         further on.
     textured : torch.Tensor of bool, shape windows.count, optional
-        Windows whose errors count; default: all. Errors of windows that hold nothing say nothing
-        of their neighbours.
+        Windows whose errors count, as those of windows without texture say nothing of their
+        neighbours; default: all.
     clear : torch.Tensor of bool, shape windows.count, optional
         Windows that pass thresholds of texture half as high again; default: all.
     noise : float or torch.Tensor, optional
@@ -138,7 +138,7 @@ def bootstrap_covariance(
         return reduce(lambda part, axis: strided(part, every, axis), range(-windows.dims, 0), field)
 
     neighbour = max(1, round(windows.template / coarse.stride / 2))
-    flow, replaced = validated(some(working(found.d)), neighbour)
+    flow, replaced = validated(some(working(displacement.d)), neighbour)
     everywhere = torch.ones_like(replaced)
     textured = everywhere if textured is None else some(textured)
     wind = at_mid_time(flow, coarse, centred)
@@ -149,11 +149,11 @@ def bootstrap_covariance(
     # the Wiener filter smears rims, which would be taken for motion
     spline, sharper = likeliest(first, settings), band_limited([first], settings=settings)[0]
     came_from = origin(wind)
-    moved, sharp = (advected(one, came_from) for one in (spline, sharper))
-    # of air that came in nothing is known
+    moved, sharp = (advected(air, came_from) for air in (spline, sharper))
+    # air that enters the image is unknown
     compared = second.isfinite() & moved.inside
     residual = torch.where(compared, second - moved.image, 0.0)
-    # smoothed, as a noise from few samples is itself noisy; 1 where none is known
+    # smoothed, as the variance of few samples is uncertain
     _, weight = known_and_weight(images, noise)
     weight = 1 / variance_of_residual(residual, 1 / weight.to(residual), compared, noise)
     level = averaged(residual.square() * weight, compared, _WIDTH * windows.template) / weight
@@ -163,7 +163,7 @@ def bootstrap_covariance(
     again = retrieve(first, image, stride=coarse.stride)
     use = _unflagged(again) & ~median_outliers(again.d, 3, neighbour) & textured
     if not bool(use.any()):
-        return torch.full_like(torch.stack([found.d] * windows.dims), torch.nan)
+        return torch.full_like(torch.stack([displacement.d] * windows.dims), torch.nan)
 
     vectors, wrong = validated(again.d, neighbour)
     at = places(vectors, coarse, centred)
@@ -182,7 +182,7 @@ def bootstrap_covariance(
             image.nan_to_num() - again_moved.image,
             level,
             moved.slopes,
-            compared & _between(valid, coarse),
+            compared & _among_valid(valid, coarse),
         ),
         Motion(wind - mean, float(response), on - of_windows(on, windows, centred)),
         coarse,
@@ -195,9 +195,9 @@ def bootstrap_covariance(
     width = _WIDTH * windows.template / coarse.stride
     noise_variance = coarse.of_templates(1 / weight)
     scaled = error / noise_variance.sqrt()
-    rows = [[averaged(one * other, use, width) for other in scaled] for one in scaled]
+    rows = [[averaged(a * b, use, width) for b in scaled] for a in scaled]
     covariance = finer.leverage * torch.stack([torch.stack(row) for row in rows]) * noise_variance
-    number = _in_a_mean(windows) * averaged(use.to(error), everywhere, width)
+    number = _windows_per_mean(windows) * averaged(use.to(error), everywhere, width)
     recovered = averaged(use.to(error), textured, _AROUND / _WIDTH * width)
     number = torch.where(recovered < _FOUND, 0.0, number)
     if clear is not None:
@@ -211,19 +211,19 @@ def bootstrap_covariance(
         separable(part, weights) for part in (covariance, finer.covariance)
     )
     number = separable(number, weights)
-    covariance = covariance * _widened(number, windows.dims) + covariance_finer
+    covariance = covariance * _student_factor(number, windows.dims) + covariance_finer
     covariance[:, :, number < _FEWEST] = torch.nan
     least = _LEAST**2 * torch.eye(windows.dims).to(error)
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
 
 
-def _unflagged(found: Displacement) -> torch.Tensor:
-    """Vectors that are valid, be it from what is finite in their windows."""
-    flag = found.flag & ~Flag.NON_FINITE_INPUT.value
-    return (flag == 0) & found.d.isfinite().all(0)
+def _unflagged(displacement: Displacement) -> torch.Tensor:
+    """Valid vectors, also of windows with some masked pixels."""
+    flag = displacement.flag & ~Flag.NON_FINITE_INPUT.value
+    return (flag == 0) & displacement.d.isfinite().all(0)
 
 
-def _between(valid: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _among_valid(valid: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Pixels all of whose nearest vectors are valid."""
     weights = []
     for axis, n in enumerate(windows.shape):
@@ -233,8 +233,8 @@ def _between(valid: torch.Tensor, windows: Windows) -> torch.Tensor:
     return separable(valid.to(weights[0]), weights) > 1 - 1e-6
 
 
-def _in_a_mean(windows: Windows) -> float:
-    """Windows that do not overlap within a local mean, or in all."""
+def _windows_per_mean(windows: Windows) -> float:
+    """Number of separate windows in a local mean, at most those of the image."""
     inside = math.prod(1 + (n - 1) * windows.stride / windows.template for n in windows.count)
     return min(_of_a_mean(windows.dims), inside)
 
@@ -243,8 +243,8 @@ def _of_a_mean(dims: int) -> float:
     return (2 * math.pi) ** (dims / 2) * _WIDTH**dims
 
 
-def _widened(number: torch.Tensor, dims: int) -> torch.Tensor:
-    """Variance of errors over the square of a standard error from so many windows."""
+def _student_factor(number: torch.Tensor, dims: int) -> torch.Tensor:
+    """Variance of errors over the squared standard error estimated from so many windows."""
     degrees = dims * number.clamp(min=_FEWEST / 2)
     return degrees / (degrees - 2)
 

@@ -17,8 +17,9 @@ import torch
 from kornia.contrib import extract_tensor_patches
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, check_between, filled, non_finite
+from lidar_mi.retrieval.images.quality import check_between, filled, non_finite
 from lidar_mi.retrieval.images.windows import (
     Windows,
     box_sum,
@@ -64,13 +65,13 @@ def cross_correlation(
     # before the conversion to the working precision, which hides how the numbers were rounded
     floors = [_rounding(image) for image in (image1, image2)]
     image1, image2 = working(filled(image1)), working(filled(image2))
-    found = Displacement.empty(windows, image1)
+    displacement = Displacement.empty(windows, image1)
     for tile in windows.tiles(_bytes_per_window(windows, chosen)):
         coefficient = _correlate(image1[tile.pixels], image2[tile.pixels], windows, chosen, floors)
-        found.fill(_peak(coefficient, windows, min_correlation), tile.vectors)
-    found.d[:, bad] = torch.nan
-    found.flag[bad] |= Flag.NON_FINITE_INPUT.value
-    return found
+        displacement.fill(_peak(coefficient, windows, min_correlation), tile.vectors)
+    displacement.d[:, bad] = torch.nan
+    displacement.flag[bad] |= Flag.NON_FINITE_INPUT.value
+    return displacement
 
 
 def correlate(

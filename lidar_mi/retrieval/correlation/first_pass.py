@@ -1,4 +1,4 @@
-"""The first displacement of a coarse-to-fine retrieval: correlation of large windows."""
+"""The first displacement of a coarse-to-fine retrieval, by correlation of large windows."""
 
 import math
 from collections.abc import Sequence
@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import avg_pool3d, pad
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.cross_correlation import cross_correlation
 from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.images.inpainting import filled_in
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.spline import Spline
 from lidar_mi.retrieval.images.windows import Windows, averaged, separable, working
 from lidar_mi.retrieval.symmetric import largest_eigenvalue
@@ -79,27 +79,27 @@ def first_pass(
     """Displacement (components, *grid.shape) by large windows, and where it was replaced.
 
     Windows without a vector (`whole_pixels`), or that their neighbours contradict, take the
-    neighbours' median.
-    Images are also correlated by windows of half and of a quarter of the size. These count where
-    the images, warped by what they find, correlate better by 0.1: in a rotation of 0.3 px per px
-    the texture at the rim of a window of 32 px moves 5 px away from that in the middle. Of the
-    first two images, whose spline is band-limited; the windows are those of the last pass.
+    neighbours' median. Images are also correlated by windows of half and of a quarter of the size.
+    They are used where the images, warped by their displacement, correlate better by 0.1: in a
+    rotation of 0.3 px per px the texture at the rim of a window of 32 px moves 5 px away from that
+    in the middle. It uses the first two images; ``spline`` is band-limited, ``windows`` are those
+    of the last pass.
     """
     if windows.dims > 2:
         d, centres = _of_volumes(images, spline, windows)
-        return _on(grid, d, centres, continued=True)
+        return _on_grid(grid, d, centres, continued=True)
     coarse, *smaller = window_sizes(windows)
-    d, replaced = _on(grid, *_of_images(images, coarse))
+    d, replaced = _on_grid(grid, *_of_images(images, coarse))
     width = windows.template / 2
     # sheared texture decorrelates in large windows: smaller ones compete with them
     score = _correlation(spline, grid, d, width)
     for size in smaller:
-        other, filled = _on(grid, *_of_images(images, size))
-        found = _correlation(spline, grid, other, width)
-        better = found > score + _BETTER
+        smaller_d, filled = _on_grid(grid, *_of_images(images, size))
+        new_score = _correlation(spline, grid, smaller_d, width)
+        better = new_score > score + _BETTER
         d, replaced, score = (
             torch.where(better, new, old)
-            for new, old in ((other, d), (filled, replaced), (found, score))
+            for new, old in ((smaller_d, d), (filled, replaced), (new_score, score))
         )
     return d, replaced
 
@@ -114,7 +114,7 @@ def window_sizes(windows: Windows) -> list[Windows]:
     return sizes
 
 
-def _on(
+def _on_grid(
     grid: Grid, d: torch.Tensor, centres: list[torch.Tensor], continued: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Vectors at some centres, validated, on the whole grid, and where they were replaced."""
@@ -130,9 +130,10 @@ def _correlation(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> t
         torch.stack([p - part / 2, p + part / 2]) for p, part in zip(grid.places(), d, strict=True)
     ]
     inside = spline.holds(*places).all(0)
-    one, two = spline._replace(coefficients=spline.coefficients[:2]).sample(*places)[0]
+    first, second = spline._replace(coefficients=spline.coefficients[:2]).sample(*places)[0]
     mean1, mean2, square1, square2, cross = (
-        averaged(field, inside, width) for field in (one, two, one**2, two**2, one * two)
+        averaged(field, inside, width)
+        for field in (first, second, first**2, second**2, first * second)
     )
     contrast = (square1 - mean1**2) * (square2 - mean2**2)
     # without texture rounding may leave a negative variance
@@ -161,12 +162,12 @@ def whole_pixels(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -
     correlation is flagged, and where more than half of a template of image 1 or of a search region
     of image 2 is not finite.
     """
-    one, two = (working(torch.isfinite(image)) for image in (image1, image2))
+    known1, known2 = (working(torch.isfinite(image)) for image in (image1, image2))
     sizes = windows.template, windows.search, windows.stride
-    found = cross_correlation(filled_in(image1), filled_in(image2), *sizes)
-    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
-    usable &= (windows.of_templates(one) >= 0.5) & (windows.of_regions(two) >= 0.5)
-    return torch.where(usable, found.d, torch.nan)
+    displacement = cross_correlation(filled_in(image1), filled_in(image2), *sizes)
+    usable = (displacement.flag == 0) | (displacement.flag == Flag.NO_SUBPIXEL_FIT.value)
+    usable &= (windows.of_templates(known1) >= 0.5) & (windows.of_regions(known2) >= 0.5)
+    return torch.where(usable, displacement.d, torch.nan)
 
 
 def _of_volumes(
@@ -196,7 +197,7 @@ def volume_scores(
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Correlation (shifts, ...) of windows of averaged volumes, and their centres in voxels.
 
-    NaN where volume 1 has no contrast, -1 where too little is left to compare.
+    NaN where volume 1 has no contrast, -1 where too little overlaps.
     """
     shape = tuple(values.shape[1:])
     reach = max(1, round(windows.reach / 2))
@@ -213,15 +214,15 @@ def volume_scores(
     contrast1 = (sums((first**2)[None]) - sums(first[None]) ** 2)[0]
     shifts = torch.cartesian_prod(*[torch.arange(2 * reach + 1)] * 3)
     scores = []
-    for some in shifts.split(max(1, _AT_ONCE // first.numel())):
-        moved = fields[:, *some.T]
+    for chunk in shifts.split(max(1, _AT_ONCE // first.numel())):
+        moved = fields[:, *chunk.T]
         inside = sums(moved[2])
-        # of image 1 the part that is compared
+        # the part of image 1 that is compared
         parts = [moved[0], moved[1], first * moved[0], first * moved[2], first**2 * moved[2]]
         mean2, square2, cross, mean1, square1 = (sums(part) / inside for part in parts)
         contrast = (square1 - mean1**2) * (square2 - mean2**2)
         score = (cross - mean1 * mean2) / contrast.clamp(min=1e-12).sqrt()
-        # half of a window must have a partner
+        # at least half of a window must overlap
         scores.append(torch.where(inside > 0.5, score, -1.0))
     whole = torch.where(contrast1 > 1e-10, torch.cat(scores), torch.nan)
     centres = [
@@ -252,7 +253,7 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     for (a, b), term in zip(pairs, terms[4:], strict=True):
         curvature[:, a, b] = curvature[:, b, a] = term
     peaked = largest_eigenvalue(curvature) < 0
-    # a saddle has no top: it is replaced by what can be solved, and its offset by 0
+    # a saddle has no maximum: its offset is 0
     curvature = torch.where(peaked[:, None, None], curvature, -torch.eye(3).to(curvature))
     offset = -torch.linalg.solve(curvature, slope[..., None])[..., 0]
     # the quadratic holds between neighbours only
@@ -272,7 +273,7 @@ def _cubic_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
         inner = (1.25 * x - 2.25) * x * x + 1
         outer = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
         weight = torch.where(x <= 1, inner, outer)
-        # beyond the ends the last value goes on
+        # constant beyond the ends
         column = (low.long() + shift).clamp(0, len(known) - 1)
         matrix.scatter_add_(1, column[:, None], weight[:, None])
     return matrix

@@ -1,4 +1,4 @@
-"""Images of air that moves as vectors say, and what windows make of that motion."""
+"""Images of air that moves by given vectors, and that motion averaged over windows."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -97,7 +97,7 @@ def of_windows(field: torch.Tensor, windows: Windows, centred: bool) -> torch.Te
 
 
 def places(d: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:
-    """Of vectors at mid-time, px (axes, ...)."""
+    """Places of vectors at mid-time, px (axes, ...)."""
     centres = [windows.centres(axis).to(d) for axis in range(windows.dims)]
     along = torch.stack(torch.meshgrid(*centres, indexing="ij"))
     return along + (0.0 if centred else 0.5) * d.nan_to_num(0.0)

@@ -14,13 +14,14 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import pad
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.correlation.outliers import validated
 from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS, MultipassSettings
 from lidar_mi.retrieval.images import windows as geometry
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
-from lidar_mi.retrieval.images.quality import Flag, check_between, informative, non_finite
+from lidar_mi.retrieval.images.quality import check_between, informative, non_finite
 from lidar_mi.retrieval.images.spline import Spline, band_limited, nearest
 from lidar_mi.retrieval.images.windows import Windows, averaged, image_pair, window_sums, working
 
@@ -109,18 +110,18 @@ def multipass(
     )
     flow, replaced = first_pass([image1, image2], spline, windows, grid)
     for width in settings.widths[:-1]:
-        # windows average over their width: vectors much closer than that say the same
+        # vectors much closer than a window's width are redundant
         step = max(1, round(settings.spacing * width * sigma))
         places = [torch.arange(0, n, step, device=image1.device) for n in grid.shape]
         fit = _fit(pair, flow, grid, places, width * sigma)
-        found, wrong = validated(
+        predictor, wrong = validated(
             fit.displacement,
             max(1, round(width * sigma / step)),
             settings.median_threshold,
             settings.median_epsilon,
             settings.continued,
         )
-        flow = grid.interpolated(found, places)
+        flow = grid.interpolated(predictor, places)
         replaced = grid.interpolated(wrong[None], places)[0] > 0.5
     places = grid.windows(windows)
     fit = _fit(pair, flow, grid, places, settings.widths[-1] * sigma)
@@ -130,7 +131,7 @@ def multipass(
     curved = torch.diag_embed(curved.movedim(0, -1)).movedim((-2, -1), (0, 1))
     matched = (fit.score > 0) & (fit.fraction_valid > 0.5)
     at = torch.meshgrid(*places, indexing="ij")
-    # linearised about a displacement, the fit does not hold that far from it
+    # the linearisation does not hold that far from its displacement
     off = (d - torch.stack([part[at] for part in flow])).norm(dim=0) > max(settings.jump, sigma)
     bad = non_finite([image1, image2], windows)
     flag = (
@@ -173,8 +174,8 @@ def travelled(d: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
 def _curved(fit: "_Fit", sigma: float, stride: int, reach: int) -> torch.Tensor:
     """Variance (components, ...) by the displacement's curvature over Gaussian windows.
 
-    Without what the noise of the gradients adds: of white noise a gradient has 1 / (2 sigma^2) of
-    the displacement's variance.
+    The part by noise is subtracted: for white noise a gradient has 1 / (2 sigma^2) of the
+    displacement's variance.
     """
     laplacian, by_noise = curvature(fit.gradient, reach)
     variance = fit.covariance.diagonal().movedim(-1, 0)
@@ -229,12 +230,12 @@ def _relative_variance(noise: torch.Tensor | None, grid: Grid) -> torch.Tensor:
 
     Half a pixel from the grid's places at most.
     """
-    one = torch.ones(grid.shape).to(grid.like)
+    uniform = torch.ones(grid.shape).to(grid.like)
     if noise is None:
-        return one
-    square = noise[tuple(map(slice, grid.shape))].to(one).square()
+        return uniform
+    square = noise[tuple(map(slice, grid.shape))].to(uniform).square()
     mean = square[square.isfinite()].mean()
-    return torch.where(square.isfinite() & (mean > 0), square / mean, one)
+    return torch.where(square.isfinite() & (mean > 0), square / mean, uniform)
 
 
 class _Fit(NamedTuple):
@@ -328,15 +329,15 @@ def _moments(
 
     Up to `order` of them together; beyond the rims the fields are zero.
     """
-    found: dict[tuple[int, ...], torch.Tensor] = {(): fields}
+    moments: dict[tuple[int, ...], torch.Tensor] = {(): fields}
     for axis, (step, rim) in enumerate(zip(steps, rims, strict=True)):
         after: dict[tuple[int, ...], torch.Tensor] = {}
-        for powers, sums in found.items():
+        for powers, sums in moments.items():
             sums = pad(sums, (0, 0) * (sums.ndim - 2 - axis) + rim)
             parts = window_sums(sums, kernels[: order + 1 - sum(powers)], step, axis + 1)
             after |= {(*powers, p): part for p, part in enumerate(parts)}
-        found = after
-    return {powers: working(sums) for powers, sums in found.items()}
+        moments = after
+    return {powers: working(sums) for powers, sums in moments.items()}
 
 
 def _pairs(dims: int) -> list[tuple[int, int]]:

@@ -1,8 +1,8 @@
 """Motion that windows do not resolve, from the residuals that it leaves in the images.
 
-A window gives the mean of the displacement over itself. What that mean lacks displaces the texture
-within the window, so that images matched by the vectors differ: by u, where the slopes are g, by
-g u. Noise differs as well, but not more where slopes are steep.
+A window gives its mean displacement. The displacement u about that mean moves the texture within
+the window, so that images matched by the vectors differ by g u, with the slopes g. Noise differs as
+well, but not more where slopes are steep.
 """
 
 from typing import NamedTuple
@@ -43,7 +43,7 @@ class Residuals(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The known motion on pixels, and what windows make of it.
+    """The known motion on pixels, and its averages over windows.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Motion(NamedTuple):
 
 
 class Unresolved(NamedTuple):
-    """Displacement that the vectors lack, and what they absorb of differences of the images.
+    """Displacement that the vectors lack, and the leverage of the images' differences.
 
     Attributes
     ----------
@@ -86,17 +86,17 @@ def unresolved(
 ) -> Unresolved:
     """Covariance of the displacement that vectors lack.
 
-    It has two parts. Near the scale of a window it varies as the vectors do: they are low-pass
-    filtered by their windows, and M is the covariance of the part h (1 - G) d of the displacements
-    d that another window takes away, less that of random errors, over a Gaussian of `width`. What
-    is finer has the same variance everywhere. With the residual r of the given pair, r' that of the
-    known motion less the known part, and L the leverage, the mean of
+    It has two parts. Near the scale of a window it varies as the vectors do: windows are low-pass
+    filters, and M is the covariance of the part h (1 - G) d of the displacements d that a second
+    window would remove, less that of random errors, over a Gaussian of `width`. Finer motion has
+    the same variance everywhere. With the residual r of the given pair, r' that of the known motion
+    less the known part, and L the leverage, the mean of
 
         r^2 - L r'^2 = a s^2 + k (b g M g + c g g),    b >= 1, c >= 0
 
-    gives b M + c 1 by least squares, weighted by the level s^-4. The term a takes up what does not
-    vary as the slopes do. b = 1 is the least: what a second window takes away the first has taken
-    away too. k is the visible fraction, see `_visible`.
+    gives b M + c 1 by least squares, weighted by the level s^-4. The term a is the part that does
+    not vary with the slopes. b >= 1, as the first window has removed what a second would remove. k
+    is the visible fraction, see `_visible`.
 
     Parameters
     ----------
@@ -117,29 +117,29 @@ def unresolved(
         for part in (lost, motion.response * motion.by_errors)
     )
     if int(use.sum()) < fewest * windows.template**windows.dims:
-        return Unresolved(_less(total, by_errors), 1.0)
+        return Unresolved(_without_errors(total, by_errors), 1.0)
     linear, visible = _visible(residuals, motion.within, windows, valid, width, centred)
     weight = residuals.level[use].square().reciprocal()
-    # of the known motion the windows leave a known part
+    # the residual of the known motion contains a part that is known
     known = (residuals.known + linear * (slopes * lost).sum(0))[use].square()
     added = residuals.added[use].square()
     leverage = max(1.0, float((added * weight).sum() / _positive((known * weight).sum())))
-    resolved = _less(total, leverage * by_errors)
+    resolved = _without_errors(total, leverage * by_errors)
     same = torch.eye(windows.dims).to(total)
     same = same.reshape(*same.shape, *[1] * windows.dims).expand_as(total)
     square = (residuals.given[use].square() - leverage * known) * weight
-    seen = [_seen(slopes, m, windows)[use] * weight for m in (resolved, same)]
-    terms = torch.stack([torch.ones_like(weight), *seen])
+    by_motion = [_variance_by_motion(slopes, m, windows)[use] * weight for m in (resolved, same)]
+    terms = torch.stack([torch.ones_like(weight), *by_motion])
     b, c = _significant(terms, square, visible) / visible
     return Unresolved(b * resolved + c * same, leverage)
 
 
 def _significant(terms: torch.Tensor, square: torch.Tensor, visible: float) -> np.ndarray:
-    """Factors (2,) of the last two terms by least squares, as far as they are not by chance.
+    """Factors (2,) of the last two terms by least squares, as far as they are significant.
 
-    With the least values, k and 0, the sum of squares is larger by F variances. By chance F is 2 in
-    the mean, as two factors are fitted: of the difference from the least values the fraction
-    1 - 2 / F is taken (Efron & Morris 1973, J. Am. Stat. Assoc. 68, 117-130).
+    The least values, k and 0, increase the sum of squares by F variances, of which 2 are expected
+    by chance, as two factors are fitted: the difference from the least values is multiplied by 1 -
+    2 / F (Efron & Morris 1973, J. Am. Stat. Assoc. 68, 117-130).
     """
     least = np.array([visible, 0.0])
     fit = _least_squares(terms, square, [-np.inf, *least])
@@ -163,55 +163,57 @@ def _visible(
 ) -> tuple[float, float]:
     """Fractions of motion finer than windows that show in the residual: of it, of its variance.
 
-    Windows see g u and follow it by J^-1 <g g u>, J = <g g>, < > being means over the window: by
-    chance not by the mean <u>. So the residual is less than g u, most where slopes are steep. u is
-    the motion within windows, of one local variance everywhere; the fraction of its variance is
-    that of the coefficients of g g in the squares of the residual and of g u.
+    Windows measure g u and follow it by J^-1 <g g u>, J = <g g>, < > being means over the window:
+    this differs by chance from the mean <u>. So the residual is less than g u, most where slopes
+    are steep. u is the motion within windows, of one local variance everywhere; the fraction of its
+    variance is that of the coefficients of g g in the squares of the residual and of g u.
     """
     slopes, use = residuals.slopes, residuals.use
     square = _products(windows.of_centres(within), valid, width / windows.stride)
-    level = _between(_trace(square), windows) / windows.dims
+    level = _on_pixels(_trace(square), windows) / windows.dims
     fine = within / _positive(level).sqrt()
     weight = residuals.level.square().reciprocal() * use
     difference = (slopes * fine).sum(0)
     matrix = of_windows((slopes[:, None] * slopes * weight).flatten(0, 1), windows, centred)
     matrix = matrix.unflatten(0, (windows.dims,) * 2).movedim((0, 1), (-2, -1))
-    # windows with nothing in them follow nothing
+    # windows without texture follow no motion
     least = 1e-3 * matrix.diagonal(dim1=-2, dim2=-1).mean()
     matrix = matrix + _positive(least) * torch.eye(windows.dims).to(matrix)
     means = of_windows(slopes * difference * weight, windows, centred).movedim(0, -1)
     followed = torch.linalg.solve(matrix, means[..., None])[..., 0].movedim(-1, 0)
     followed = followed - of_windows(fine, windows, centred)
-    left = difference - (slopes * followed).sum(0)
-    part = difference[use], left[use]
+    remaining = difference - (slopes * followed).sum(0)
+    part = difference[use], remaining[use]
     weight = weight[use]
     linear = float((part[0] * part[1] * weight).sum() / _positive((part[0] ** 2 * weight).sum()))
     steep = slopes.square().sum(0)[use] * weight
     terms = torch.stack([torch.ones_like(steep), steep])
-    whole, seen = (_least_squares(terms, p.square() * weight, -np.inf)[1] for p in part)
-    if not 0 < seen <= whole:
+    whole, visible = (_least_squares(terms, p.square() * weight, -np.inf)[1] for p in part)
+    if not 0 < visible <= whole:
         return 1.0, 1.0
-    return linear, float(seen / whole)
+    return linear, float(visible / whole)
 
 
 def _products(field: torch.Tensor, valid: torch.Tensor, width: float) -> torch.Tensor:
     """Local means (axes, axes, ...) of the products of a field's components, where valid."""
-    rows = [[averaged(one * other, valid, width) for other in field] for one in field]
+    rows = [[averaged(a * b, valid, width) for b in field] for a in field]
     return torch.stack([torch.stack(row) for row in rows])
 
 
-def _less(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
-    """A covariance by the fraction of its trace that is not by errors."""
+def _without_errors(total: torch.Tensor, by_errors: torch.Tensor) -> torch.Tensor:
+    """A covariance times the fraction of its trace that is not due to errors."""
     part = 1 - _trace(by_errors) / _positive(_trace(total))
     return total * part.clamp(min=0.0)
 
 
-def _seen(slopes: torch.Tensor, covariance: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _variance_by_motion(
+    slopes: torch.Tensor, covariance: torch.Tensor, windows: Windows
+) -> torch.Tensor:
     """Variance of the images' difference by motion of some covariance at the vectors."""
-    return torch.einsum("i...,j...,ij...->...", slopes, slopes, _between(covariance, windows))
+    return torch.einsum("i...,j...,ij...->...", slopes, slopes, _on_pixels(covariance, windows))
 
 
-def _between(field: torch.Tensor, windows: Windows) -> torch.Tensor:
+def _on_pixels(field: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Values (..., *windows.count) of windows on pixels, linearly."""
     weights = [
         linear_weights(windows.centres(axis).to(field), torch.arange(n).to(field))

@@ -2,8 +2,9 @@
 
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, filled, non_finite
+from lidar_mi.retrieval.images.quality import filled, non_finite
 from lidar_mi.retrieval.images.windows import Windows, candidates, image_pair, strided, working
 
 
@@ -49,13 +50,13 @@ def weight_shift(
         (torch.finfo(i.dtype).eps for i in (image1, image2) if i.is_floating_point()), default=0.0
     )
     image1, image2 = working(filled(image1)), working(filled(image2))
-    found = Displacement.empty(windows, image1)
+    displacement = Displacement.empty(windows, image1)
     for tile in windows.tiles(8 * 8 * windows.shifts**2 + 64 * (template + 4) * stride**2):
         part = _best_match(image1[tile.pixels], image2[tile.pixels], windows, rounding)
-        found.fill(part, tile.vectors)
-    found.d[:, bad] = torch.nan
-    found.flag[bad] |= Flag.NON_FINITE_INPUT.value
-    return found
+        displacement.fill(part, tile.vectors)
+    displacement.d[:, bad] = torch.nan
+    displacement.flag[bad] |= Flag.NON_FINITE_INPUT.value
+    return displacement
 
 
 def mass(image: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

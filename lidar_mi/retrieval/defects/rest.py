@@ -9,6 +9,7 @@ import torch
 from scipy import ndimage
 from torch.nn.functional import pad
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.first_pass import window_sizes
 from lidar_mi.retrieval.correlation.motion import motion_around, moved
 from lidar_mi.retrieval.defects import impulses
@@ -16,7 +17,7 @@ from lidar_mi.retrieval.defects.fixed_pattern import FixedPattern, fixed_pattern
 from lidar_mi.retrieval.defects.saturation import saturated, saturated_areas
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.inpainting import filled_in
-from lidar_mi.retrieval.images.quality import Flag, non_finite, thick
+from lidar_mi.retrieval.images.quality import non_finite, thick
 from lidar_mi.retrieval.images.windows import Windows, averaged, box_sum, working
 
 # Fraction of a template at the largest value that leaves too little to see.

@@ -78,14 +78,14 @@ def fernald(
             f"molecular_backscatter: {molecular.min():g} is not allowed; expected 0 or more"
         )
     ratio = positive_number("lidar_ratio", lidar_ratio, "sr")
-    other = positive_number("molecular_lidar_ratio", molecular_lidar_ratio, "sr")
+    molecular_ratio = positive_number("molecular_lidar_ratio", molecular_lidar_ratio, "sr")
     check_index(reference, ranges)
     known = positive_number(
         "reference_backscatter", reference_backscatter + molecular[reference], "m^-1 sr^-1"
     )
     between = cumulative_trapezoid(molecular, ranges, initial=0)
     corrected = signal * ranges**2 / (signal[reference] * ranges[reference] ** 2)
-    corrected = corrected * np.exp(2 * (ratio - other) * (between[reference] - between))
+    corrected = corrected * np.exp(2 * (ratio - molecular_ratio) * (between[reference] - between))
     before = cumulative_trapezoid(corrected, ranges, initial=0)
     backscatter = over(corrected, 1 / known + 2 * ratio * (before[reference] - before))
     return ratio * (backscatter - molecular)

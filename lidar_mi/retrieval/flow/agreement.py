@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.flow.likelihood import Linear
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, no_skill, non_finite, worst_variance
+from lidar_mi.retrieval.images.quality import no_skill, non_finite, worst_variance
 from lidar_mi.retrieval.images.windows import Windows, window_sums, working
 
 

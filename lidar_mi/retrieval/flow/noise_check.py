@@ -9,6 +9,7 @@ import torch
 from lidar_mi.retrieval.flow.components import Response, normal_fields
 from lidar_mi.retrieval.flow.flow_spline import Mesh
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
+from lidar_mi.retrieval.images.band_limit import even_fast_len
 from lidar_mi.retrieval.images.windows import Windows, averaged, working
 
 # Random fields of noise that are sent through the fit.
@@ -50,9 +51,9 @@ def variance_by_coloured_noise(
     level = (square / share.clamp(min=1e-6)).clamp(min=1e-30).sqrt()
     density, lines = _density((residual / level).clamp(-_CLIPPED, _CLIPPED), use)
     rows, columns = residual.shape
-    shape = (_DRAWS, *density.shape)
-    white = torch.fft.fft2(normal_fields(shape, residual, 11))
-    coloured = torch.fft.ifft2(white * density.sqrt()).real[:, :rows, :columns]
+    sizes = _periods(residual)
+    white = torch.fft.rfft2(normal_fields((_DRAWS, *sizes), residual, 11))
+    coloured = torch.fft.irfft2(white * density.sqrt(), s=sizes)[:, :rows, :columns]
     # of the likelihood itself: the variance of a pixel's difference is that of its information
     own = normal_fields((_DRAWS, rows, columns), residual, 12) / weight.clamp(min=1e-30).sqrt()
     places = [windows.centres(axis).to(residual) for axis in range(windows.dims)]
@@ -68,12 +69,20 @@ def variance_by_coloured_noise(
     return torch.where(found > _LEAST * expected, found - expected, 0.0), lines
 
 
+def _periods(field: torch.Tensor) -> list[int]:
+    """Sizes of a period that holds a field and its lags."""
+    return [even_fast_len(2 * n) for n in field.shape]
+
+
 def _density(field: torch.Tensor, use: torch.Tensor) -> tuple[torch.Tensor, str]:
-    """Spectral density of a field that is known in part, of mean its variance, and its lines."""
-    sizes = [2 * n for n in field.shape]
+    """Spectral density of a field that is known in part, of mean its variance, and its lines.
+
+    As `torch.fft.rfft2` has the wavenumbers of its periods.
+    """
+    sizes = _periods(field)
 
     def correlated(values: torch.Tensor) -> torch.Tensor:
-        return torch.fft.ifft2(torch.fft.fft2(values, s=sizes).abs().square()).real
+        return torch.fft.irfft2(torch.fft.rfft2(values, s=sizes).abs().square(), s=sizes)
 
     pairs = correlated(use)
     lag = [torch.fft.fftfreq(n, 1 / n).to(field) for n in sizes]
@@ -97,4 +106,4 @@ def _density(field: torch.Tensor, use: torch.Tensor) -> tuple[torch.Tensor, str]
         # correlated along all of the line
         excess = line[None] * (1 - taper[axis])[:, None]
         total = total + excess.movedim(0, axis)
-    return torch.fft.fft2(total).real.clamp(min=0.0), " and ".join(said)
+    return torch.fft.rfft2(total).real.clamp(min=0.0), " and ".join(said)

@@ -11,6 +11,7 @@ from typing import Protocol
 
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.flow import direct, iterative, strips
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
@@ -25,7 +26,7 @@ from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
 from lidar_mi.retrieval.flow.prior_check import Fit, prior_check
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, check_between
+from lidar_mi.retrieval.images.quality import check_between
 from lidar_mi.retrieval.images.windows import Windows, image_pair, working
 
 

@@ -1,6 +1,5 @@
 """Vortices of scans as a CF data set."""
 
-import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.atmosphere.vortices.vortex import Model
+from lidar_mi.flags import VortexFlag, flag_attributes
 from lidar_mi.retrieval.ground_vortices.detection import Detection
 from lidar_mi.retrieval.ground_vortices.fit import Fit
 from lidar_mi.retrieval.ground_vortices.scan_plane import PlaneScan
@@ -25,31 +25,12 @@ _ABOUT = {
 }
 
 
-class VortexFlag(enum.IntFlag):
-    """Reasons not to use the vortices of a scan; 0: valid."""
-
-    NO_WAKE = 1
-    """Turbulence alone gives such a scan more often than the limit of false alarms."""
-    NO_FIT = 2
-    """The fit did not converge."""
-    OUTSIDE = 4
-    """A vortex is outside of the scan."""
-    NOT_IDENTIFIED = 8
-    """The error is half of the circulation, or half a gate in place."""
-    MISFIT = 16
-    """The residuals are larger than noise and turbulence explain."""
-    AMBIGUOUS = 32
-    """Vortices elsewhere are nearly as likely."""
-    SAME_SENSE = 64
-    """Both vortices turn the same way."""
-
-
 @dataclass(frozen=True, eq=False)
 class ScanVortices:
-    """What one scan shows; no fit where there is no wake."""
+    """Detection and fit of one scan; no fit where there is no wake."""
 
     scan: PlaneScan
-    seen: Detection
+    detection: Detection
     fit: Fit | None
     flag: int
     vortices: int
@@ -58,7 +39,7 @@ class ScanVortices:
 def ordered(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (vortices, 4), cores in m, the smaller y first, and their covariance.
 
-    That has the fraction of the other profile as its last row and column.
+    The last row and column of the covariance are of the fraction of the other profile.
     """
     vortices = fit.state.vortices
     order = np.argsort(vortices[:, 0], kind="stable")
@@ -66,7 +47,7 @@ def ordered(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     values = vortices[order].copy()
     scale = np.ones_like(values)
     values[:, 3] = np.exp(values[:, 3])
-    # the fit has the logarithm
+    # derivative by the logarithm, which the fit has
     scale[:, 3] = values[:, 3]
     index = np.append(index, vortices.size + fit.state.departures.size)
     size = np.append(scale.ravel(), 1.0)
@@ -74,48 +55,48 @@ def ordered(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _inner(
-    values: np.ndarray, covariance: np.ndarray, other: np.ndarray, profile: Model
+    values: np.ndarray, covariance: np.ndarray, fraction: np.ndarray, profile: Model
 ) -> tuple[np.ndarray, np.ndarray]:
     """Circulation (scans, vortices) from 5 to 15 m of each vortex alone, and its standard error."""
     circulation, core = values[..., 2], values[..., 3]
-    mixture, step = np.broadcast_to(other[:, None], core.shape), 1e-4
+    mixture, step = np.broadcast_to(fraction[:, None], core.shape), 1e-4
     part = circulation_5_15(core, mixture, profile)
     by_core = (circulation_5_15(core + step, mixture, profile) - part) / step
-    by_other = (circulation_5_15(core, mixture + step, profile) - part) / step
+    by_fraction = (circulation_5_15(core, mixture + step, profile) - part) / step
     variance = np.empty(circulation.shape)
     for k in range(values.shape[1]):
         used = [OF_VORTEX * k + 2, OF_VORTEX * k + 3, -1]
-        slope = np.stack([by_core[:, k], by_other[:, k]], -1) * circulation[:, k, None]
+        slope = np.stack([by_core[:, k], by_fraction[:, k]], -1) * circulation[:, k, None]
         by = np.column_stack([part[:, k], slope])
-        both = covariance[:, used][:, :, used]
-        variance[:, k] = np.einsum("sa,sab,sb->s", by, both, by)
+        used_covariance = covariance[:, used][:, :, used]
+        variance[:, k] = np.einsum("sa,sab,sb->s", by, used_covariance, by)
     return circulation * part, np.sqrt(variance)
 
 
-def vortex_dataset(found: Sequence[ScanVortices], about: Mapping[str, Any]) -> xr.Dataset:
+def vortex_dataset(scans: Sequence[ScanVortices], about: Mapping[str, Any]) -> xr.Dataset:
     """All scans in the order of time."""
-    found = sorted(found, key=lambda one: one.scan.start)
-    count, number = len(found), max(one.vortices for one in found)
+    scans = sorted(scans, key=lambda s: s.scan.start)
+    count, number = len(scans), max(s.vortices for s in scans)
     values = np.full((count, number, OF_VORTEX), np.nan)
     covariance = np.full((count, number * OF_VORTEX + 1, number * OF_VORTEX + 1), np.nan)
-    other = np.full(count, np.nan)
+    fraction = np.full(count, np.nan)
     wind, wind_stderr = np.full(count, np.nan), np.full(count, np.nan)
     sigma, length, misfit = (np.full(count, np.nan) for _ in range(3))
     time = np.empty(count, "datetime64[ns]")
-    for k, one in enumerate(found):
-        time[k] = one.scan.at(float(np.mean(one.scan.time)))
-        if one.fit is not None:
-            values[k], covariance[k] = ordered(one.fit)
-            other[k] = one.fit.state.other_profile[0]
-            time[k] = one.scan.at(one.fit.time)
-            at = len(one.fit.state.vector) - len(one.fit.state.wind)
-            wind[k] = one.fit.state.wind[0]
-            wind_stderr[k] = np.sqrt(one.fit.covariance[at, at])
-            sigma[k], length[k] = one.fit.air.sigma, one.fit.air.length
-            misfit[k] = one.fit.misfit / one.fit.dof
+    for k, (scan, fit) in enumerate((s.scan, s.fit) for s in scans):
+        time[k] = scan.at(float(np.mean(scan.time)))
+        if fit is not None:
+            values[k], covariance[k] = ordered(fit)
+            fraction[k] = fit.state.other_profile[0]
+            time[k] = scan.at(fit.time)
+            at = len(fit.state.vector) - len(fit.state.wind)
+            wind[k] = fit.state.wind[0]
+            wind_stderr[k] = np.sqrt(fit.covariance[at, at])
+            sigma[k], length[k] = fit.air.sigma, fit.air.length
+            misfit[k] = fit.misfit / fit.dof
     stderr = np.sqrt(np.einsum("saa->sa", covariance))
-    other_stderr, stderr = stderr[:, -1], stderr[:, :-1].reshape(values.shape)
-    inner, inner_stderr = _inner(values, covariance, other, about["profile"])
+    fraction_stderr, stderr = stderr[:, -1], stderr[:, :-1].reshape(values.shape)
+    inner, inner_stderr = _inner(values, covariance, fraction, about["profile"])
     data: dict[str, Any] = {}
     for k, name in enumerate(NUMBERS):
         units, text = _ABOUT[name]
@@ -128,57 +109,50 @@ def vortex_dataset(found: Sequence[ScanVortices], about: Mapping[str, Any]) -> x
     data["circulation_5_15_stderr"] = _variable(
         ("scan", "vortex"), inner_stderr, "m2 s-1", f"standard error: {text}"
     )
-    both = "scan", "number", "other_number"
+    dims = "scan", "number", "other_number"
     data["covariance"] = (
-        both,
+        dims,
         covariance[:, :-1, :-1],
         {"long_name": "covariance of the vortices' numbers"},
     )
     for name, series, units, text in (
         ("wind", wind, "m s-1", "mean wind along y at the height of the vortices"),
         ("wind_stderr", wind_stderr, "m s-1", "its standard error"),
-        ("other_profile", other, "1", "fraction of the other profile in the swirl"),
-        ("other_profile_stderr", other_stderr, "1", "its standard error"),
+        ("other_profile", fraction, "1", "fraction of the other profile in the swirl"),
+        ("other_profile_stderr", fraction_stderr, "1", "its standard error"),
         ("turbulence", sigma, "m s-1", "likeliest standard deviation of a component of the wind"),
         ("turbulence_length", length, "m", "likeliest length scale of the turbulence"),
         ("misfit", misfit, "1", "mean normalised square of the residuals"),
-        ("probability", [one.seen.probability for one in found], "1", "probability of a wake"),
+        ("probability", [s.detection.probability for s in scans], "1", "probability of a wake"),
         (
             "false_alarm",
-            [one.seen.false_alarm for one in found],
+            [s.detection.false_alarm for s in scans],
             "1",
             "probability of the score in a scan without a wake",
         ),
-        ("score", [one.seen.score for one in found], "1", "largest of the matched filters"),
+        ("score", [s.detection.score for s in scans], "1", "largest of the matched filters"),
     ):
         data[name] = _variable(("scan",), np.asarray(series, float), units, text)
-    masks = np.array([one.value for one in VortexFlag], np.uint16)
     data["flag"] = (
         ("scan",),
-        np.array([one.flag for one in found], np.uint16),
-        {
-            "long_name": "reasons not to use the vortices, 0 = valid",
-            "standard_name": "quality_flag",
-            "flag_masks": masks,
-            "flag_values": masks,
-            "flag_meanings": " ".join(str(one.name).lower() for one in VortexFlag),
-        },
+        np.array([s.flag for s in scans], np.uint16),
+        flag_attributes(VortexFlag, "reasons not to use the vortices"),
     )
     names = [f"{name}_{k}" for k in range(number) for name in NUMBERS]
     coords = {
         "time": ("scan", time, {"long_name": "time at which the vortices are there (UTC)"}),
         "azimuth": _variable(
-            ("scan",), np.array([one.scan.azimuth for one in found]), "degree", "azimuth of y"
+            ("scan",), np.array([s.scan.azimuth for s in scans]), "degree", "azimuth of y"
         ),
         "sweep": (
             "scan",
-            np.array([one.scan.sweep for one in found]),
+            np.array([s.scan.sweep for s in scans]),
             {"long_name": "number of the scan in its data set"},
         ),
-        "start": ("scan", np.array([one.scan.start for one in found]), {"long_name": "first line"}),
+        "start": ("scan", np.array([s.scan.start for s in scans]), {"long_name": "first line"}),
         "end": (
             "scan",
-            np.array([one.scan.at(float(one.scan.time.max())) for one in found]),
+            np.array([s.scan.at(float(s.scan.time.max())) for s in scans]),
             {"long_name": "last line"},
         ),
         "scan": np.arange(count),

@@ -9,7 +9,7 @@ import scipy
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.retrieval.ground_vortices.fit import Air, Assumptions
 from lidar_mi.retrieval.ground_vortices.scan_plane import PlaneScan
-from lidar_mi.retrieval.ground_vortices.swirl import lines_of, seen
+from lidar_mi.retrieval.ground_vortices.swirl import lines_of, radial_velocity
 from lidar_mi.retrieval.ground_vortices.turbulence import of_gates, overlap
 
 SEPARATIONS = (22.0, 32.0, 46.0, 64.0)
@@ -34,7 +34,7 @@ _APART, _NEAR = 10.0, 50.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Vortices (n, 4) that a filter likes, and how much: the normalised amplitude."""
+    """Vortices (n, 4) at a maximum of a filter, and its normalised amplitude."""
 
     vortices: np.ndarray
     score: float
@@ -42,7 +42,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What matched filters say of a scan.
+    """Result of the matched filters of a scan.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class _Windows:
 def detect(
     scan: PlaneScan,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     *,
     separations: tuple[float, ...] = SEPARATIONS,
     single: bool = False,
@@ -106,7 +106,7 @@ def detect(
     if windows is None:
         return Detection(-np.inf, 1.0, 0.0, [], Air(0.3, LENGTHS[0]))
     air = _air(windows, lidar)
-    z, information = _scores(windows, air, lidar, given, separations, single)
+    z, information = _scores(windows, air, lidar, assumed, separations, single)
     signs = np.abs(z) if single else z
     # turbulence that is stronger than in most windows, or of another length, spreads all scores
     spread = np.maximum(1.0, 1.4826 * np.median(np.abs(z), axis=1, keepdims=True))
@@ -123,7 +123,7 @@ def detect(
         score,
         _chance(windows, level, score, 2 if single else 1),
         float(scipy.special.expit(total)),
-        _candidates(windows, signs, z, information, separations, single, given),
+        _candidates(windows, signs, z, information, separations, single, assumed),
         air,
     )
 
@@ -135,7 +135,7 @@ def _windows(scan: PlaneScan, lidar: CoherentLidar) -> _Windows | None:
     half = max(1, round(_WIDTH / (step * thin)))
     usable = np.isfinite(scan.velocity)
     parts = np.where(usable, scan.velocity, 0.0), np.where(usable, scan.variance, 0.0), usable
-    found: list[tuple[np.ndarray, ...]] = []
+    windows: list[tuple[np.ndarray, ...]] = []
     for middle in range(half // 2, len(gates) - half // 2):
         index = np.arange(middle - half, middle + half + 1)
         inside = (index >= 0) & (index < len(gates))
@@ -146,20 +146,20 @@ def _windows(scan: PlaneScan, lidar: CoherentLidar) -> _Windows | None:
         rows, pad = int(bins[-1]) + 1, _ROWS // 2
         total = np.zeros((3, rows + 2 * pad, index.size))
         at = np.ix_(np.arange(3), bins[starts] + pad, np.flatnonzero(inside))
-        total[at] = [np.add.reduceat(one[:, columns], starts, axis=0) for one in parts]
+        total[at] = [np.add.reduceat(part[:, columns], starts, axis=0) for part in parts]
         count = np.maximum(total[2], 1)
         cells = np.stack([total[0] / count, total[1] / count**2, total[2] > 0])
         view = np.lib.stride_tricks.sliding_window_view(cells, _ROWS, 1)
-        values, noise, there = view.transpose(0, 1, 3, 2).reshape(3, rows, -1)
-        kept = there.mean(1) >= _LEAST
+        values, noise, known = view.transpose(0, 1, 3, 2).reshape(3, rows, -1)
+        enough = known.mean(1) >= _LEAST
         angle = scan.angle[0] + (np.arange(rows) + 0.5) * (_CELL / centre)
-        mean = noise.sum(1) / np.maximum(there.sum(1), 1)
-        one = values, there > 0, np.full(rows, centre), angle, mean
-        found.append(tuple(part[kept] for part in one))
-    if not sum(len(one[0]) for one in found):
+        mean = noise.sum(1) / np.maximum(known.sum(1), 1)
+        arrays = values, known > 0, np.full(rows, centre), angle, mean
+        windows.append(tuple(array[enough] for array in arrays))
+    if not any(values.size for values, *_ in windows):
         return None
     offsets = np.arange(-half, half + 1) * step * thin
-    return _Windows(offsets, *(np.concatenate(part) for part in zip(*found, strict=True)))
+    return _Windows(offsets, *(np.concatenate(part) for part in zip(*windows, strict=True)))
 
 
 def _geometry(windows: _Windows) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +171,7 @@ def _geometry(windows: _Windows) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Contrasts:
-    """Numbers that a mean wind leaves at zero, independent whatever turbulence and noise are.
+    """Contrasts that a mean wind does not change, independent in any turbulence and noise.
 
     ``basis`` (cells, numbers) makes them of the cells; turbulence of unit variance gives them the
     variances ``turbulent``, noise of unit variance 1 each.
@@ -182,40 +182,43 @@ class _Contrasts:
 
 
 def _contrasts(
-    windows: _Windows, lidar: CoherentLidar, length: float, there: np.ndarray
+    windows: _Windows, lidar: CoherentLidar, length: float, known: np.ndarray
 ) -> _Contrasts:
     along, height = _geometry(windows)
-    along, height = along[there], height[there]
+    along, height = along[known], height[known]
     full = of_gates(along[:, None] - along, height[:, None] - height, lidar, (length,), _CELL)[0]
     shared = overlap(along, lidar.gate_length) * (np.abs(height[:, None] - height) < _CELL / 2)
     scaled = height / (_ROWS * _CELL / 2)
     mean = np.stack([np.ones_like(scaled), scaled, scaled**2], -1)
-    rest = scipy.linalg.qr(mean)[0][:, 3:]
-    variances, vectors = scipy.linalg.eigh(rest.T @ full @ rest, rest.T @ shared @ rest)
-    return _Contrasts(rest @ vectors, np.maximum(variances, 0.0))
+    contrast = scipy.linalg.qr(mean)[0][:, 3:]
+    variances, vectors = scipy.linalg.eigh(
+        contrast.T @ full @ contrast, contrast.T @ shared @ contrast
+    )
+    return _Contrasts(contrast @ vectors, np.maximum(variances, 0.0))
 
 
 def _air(windows: _Windows, lidar: CoherentLidar) -> Air:
-    """Turbulence of most windows that do not overlap: a wake is in few of them."""
+    """Turbulence of most separate windows, of which a wake is in few."""
     whole = np.flatnonzero(windows.usable.all(1))
-    chosen = _apart(windows, whole)
+    chosen = _separate(windows, whole)
     if not chosen.size:
         return Air(0.3, LENGTHS[0])
     likelihood = []
     for length in LENGTHS:
-        some = _contrasts(windows, lidar, length, np.ones(windows.values.shape[1], bool))
-        numbers = windows.values[chosen] @ some.basis
+        contrasts = _contrasts(windows, lidar, length, np.ones(windows.values.shape[1], bool))
+        numbers = windows.values[chosen] @ contrasts.basis
         noise = windows.noise[chosen][:, None]
-        variance = _SIGMAS[:, None, None] ** 2 * some.turbulent + noise
+        variance = _SIGMAS[:, None, None] ** 2 * contrasts.turbulent + noise
         likelihood.append(-(np.log(variance) + numbers**2 / variance).sum(-1) / 2)
-        # the contrasts of another length are of other sizes: their determinant
-        likelihood[-1] = likelihood[-1] + np.linalg.slogdet(some.basis.T @ some.basis)[1] / 2
+        # the determinant, as contrasts of other lengths differ in scale
+        determinant = np.linalg.slogdet(contrasts.basis.T @ contrasts.basis)[1]
+        likelihood[-1] = likelihood[-1] + determinant / 2
     each = np.stack(likelihood)
     kind = int(np.median(each.max(1), axis=1).argmax())
     return Air(float(np.median(_SIGMAS[each[kind].argmax(0)])), LENGTHS[kind])
 
 
-def _apart(windows: _Windows, among: np.ndarray) -> np.ndarray:
+def _separate(windows: _Windows, among: np.ndarray) -> np.ndarray:
     """Of these windows, those whose middles are in cells as large as a window."""
     size = np.array([windows.offsets[-1] - windows.offsets[0], _ROWS * _CELL])
     place = np.stack([windows.centre, windows.centre * windows.angle], -1)[among]
@@ -227,7 +230,7 @@ def _scores(
     windows: _Windows,
     air: Air,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     separations: tuple[float, ...],
     single: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -237,37 +240,37 @@ def _scores(
     information = np.zeros_like(z)
     kinds = np.round(windows.angle / _ANGLES).astype(int)
     templates = {
-        kind: _templates(windows, kind * _ANGLES, lidar, given, separations, single)
+        kind: _templates(windows, kind * _ANGLES, lidar, assumed, separations, single)
         for kind in np.unique(kinds)
     }
     packed = np.packbits(windows.usable, axis=1)
     _, which = np.unique(packed, axis=0, return_inverse=True)
-    which = _few(which.ravel(), windows.usable)
+    which = _merged_patterns(which.ravel(), windows.usable)
     for p in np.unique(which[which >= 0]):
         at = np.flatnonzero(which == p)
-        there = np.asarray(windows.usable[at].all(0))
-        some = _contrasts(windows, lidar, air.length, there)
+        known_cells = np.asarray(windows.usable[at].all(0))
+        contrasts = _contrasts(windows, lidar, air.length, known_cells)
         for kind in np.unique(kinds[at]):
             rows = at[kinds[at] == kind]
-            wanted = templates[kind][:, there] @ some.basis
-            numbers = windows.values[rows][:, there] @ some.basis
-            variance = air.sigma**2 * some.turbulent + windows.noise[rows][:, None]
+            wanted = templates[kind][:, known_cells] @ contrasts.basis
+            numbers = windows.values[rows][:, known_cells] @ contrasts.basis
+            variance = air.sigma**2 * contrasts.turbulent + windows.noise[rows][:, None]
             information[:, rows] = wanted**2 @ (1 / variance).T
             z[:, rows] = wanted @ (numbers / variance).T
     known = information > 0
     return np.where(known, z / np.sqrt(np.where(known, information, 1)), 0.0), information
 
 
-def _few(which: np.ndarray, usable: np.ndarray) -> np.ndarray:
+def _merged_patterns(which: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Numbers of patterns of usable cells, of which there are at most `_MOST_PATTERNS`.
 
-    Of rarer ones, those that lack the same rows or columns have one pattern: what all of them have.
+    Rarer patterns that lack the same rows or columns are replaced by their common part.
     """
     number = np.bincount(which)
     if len(number) <= _MOST_PATTERNS:
         return which
     by_edge = usable.reshape(len(usable), _ROWS, -1)
-    # of a window within the scan: every row and column has some value
+    # which rows and columns have values
     edges = np.concatenate([by_edge.mean(2) > 0.5, by_edge.mean(1) > 0.5], axis=1)
     return np.unique(edges, axis=0, return_inverse=True)[1].ravel()
 
@@ -276,7 +279,7 @@ def _templates(
     windows: _Windows,
     elevation: float,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     separations: tuple[float, ...],
     single: bool,
 ) -> np.ndarray:
@@ -286,8 +289,8 @@ def _templates(
     angle = elevation + (np.arange(_ROWS) - _ROWS // 2) * _CELL / far
     same = np.full(_ROWS, _CELL / far)
     lines = lines_of(np.zeros(_ROWS), angle, same, np.zeros(_ROWS), far + windows.offsets, lidar)
-    found = []
-    core = math.log(max(given.core_radius, 2.0))
+    templates = []
+    core = math.log(max(assumed.core_radius, 2.0))
     for separation in (0.0,) if single else separations:
         total = np.zeros((_ROWS, windows.offsets.size))
         for side in (1,) if single else (1, -1):
@@ -295,9 +298,9 @@ def _templates(
             place = np.array([y, far * math.sin(elevation)])
             places = np.broadcast_to(place, (_ROWS, 2, 2))
             strength = np.array([float(side), core])
-            total += seen(lines, places, strength, None, given.model)[0]
-        found.append(total.ravel())
-    return np.stack(found)
+            total += radial_velocity(lines, places, strength, None, assumed.model)[0]
+        templates.append(total.ravel())
+    return np.stack(templates)
 
 
 def _chance(windows: _Windows, z: np.ndarray, score: float, signs: int) -> float:
@@ -312,18 +315,18 @@ def _chance(windows: _Windows, z: np.ndarray, score: float, signs: int) -> float
     step = float(np.median(np.diff(centres))) if len(centres) > 1 else math.inf
     across = np.flatnonzero(np.diff(windows.centre) == 0)
     # neighbours in range, at about the same angle
-    along, other = [], []
+    along, neighbour = [], []
     for k in range(len(centres) - 1):
-        here = np.arange(first[k], first[k] + counts[k])
-        there = first[k + 1] + np.arange(counts[k + 1])
-        nearest = np.searchsorted(windows.angle[there], windows.angle[here])
-        along.append(here)
-        other.append(there[np.minimum(nearest, len(there) - 1)])
+        ring = np.arange(first[k], first[k] + counts[k])
+        next_ring = first[k + 1] + np.arange(counts[k + 1])
+        nearest = np.searchsorted(windows.angle[next_ring], windows.angle[ring])
+        along.append(ring)
+        neighbour.append(next_ring[np.minimum(nearest, len(next_ring) - 1)])
     total = 0.0
     for field in z:
         slope_s = _slope(field[across + 1] - field[across], _CELL)
         slope_r = (
-            _slope(field[np.concatenate(along)] - field[np.concatenate(other)], step)
+            _slope(field[np.concatenate(along)] - field[np.concatenate(neighbour)], step)
             if along
             else 0.0
         )
@@ -352,21 +355,21 @@ def _candidates(
     information: np.ndarray,
     separations: tuple[float, ...],
     single: bool,
-    given: Assumptions,
+    assumed: Assumptions,
 ) -> list[Candidate]:
     """The best places near the best of all, each some metres from the better ones."""
     places = windows.centre * np.stack([np.cos(windows.angle), np.sin(windows.angle)])
     best = np.unravel_index(int(signs.argmax()), signs.shape)
     near = np.hypot(*(places - places[:, best[1], None])) < _NEAR
-    found: list[Candidate] = []
+    candidates: list[Candidate] = []
     taken: list[np.ndarray] = []
-    core = math.log(given.core_radius)
+    core = math.log(assumed.core_radius)
     order = np.argsort(np.where(near, signs, -np.inf), axis=None)[::-1]
     for k in order[: int(near.sum()) * len(signs)]:
         template, place = np.unravel_index(int(k), signs.shape)
-        # as the fit sees it: y and z of both vortices
+        # y and z of both vortices, as in the fit
         mark = np.append(places[:, place], 0.0 if single else separations[template] / 2)
-        if any(np.abs(mark - other).max() < _APART for other in taken):
+        if any(np.abs(mark - better).max() < _APART for better in taken):
             continue
         taken.append(mark)
         gamma = float(z[template, place] / math.sqrt(information[template, place]))
@@ -376,7 +379,7 @@ def _candidates(
             vortices = np.array(
                 [[mark[0] + side * mark[2], mark[1], side * gamma, core] for side in (-1.0, 1.0)]
             )
-        found.append(Candidate(vortices, float(signs[template, place])))
-        if len(found) == _STARTS:
+        candidates.append(Candidate(vortices, float(signs[template, place])))
+        if len(candidates) == _STARTS:
             break
-    return found
+    return candidates

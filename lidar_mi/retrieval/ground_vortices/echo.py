@@ -8,12 +8,12 @@ from lidar_mi.instrument.coherent.weighting import CoherentLidar, echo_shift
 
 
 def at_the_echo(lines: xr.Dataset, lidar: CoherentLidar) -> xr.Dataset:
-    """Lines whose ranges are the middles of the echoes, as their signal tells them.
+    """Lines whose ranges are the middles of the echoes, estimated from their signal.
 
-    Where the signal falls with range, the near end of a gate says more: by 0.7 m at 700 m for
-    pulses and gates of 30 m and a signal that falls with the square of the range. The slope is that
-    of the logarithm of the median of ``snr`` over the lines, averaged over two gate lengths. Lines
-    without ``snr`` stay as they are.
+    Where the signal falls with range, the middle of the echo is nearer than that of the gate: by
+    0.7 m at 700 m for pulses and gates of 30 m and a signal that falls with the square of the
+    range. The slope is that of the logarithm of the median of ``snr`` over the lines, averaged over
+    two gate lengths. Lines without ``snr`` stay as they are.
     """
     if "snr" not in lines.variables or lines.sizes["range"] < 3:
         return lines

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from lidar_mi.atmosphere.vortices.vortex import Model
-from lidar_mi.retrieval.ground_vortices.swirl import OF_VORTEX, motion, node_angles, seen
+from lidar_mi.retrieval.ground_vortices.swirl import OF_VORTEX, motion, node_angles, radial_velocity
 from lidar_mi.retrieval.ground_vortices.turbulence import LENGTHS
 from lidar_mi.retrieval.ground_vortices.window import Window
 
@@ -39,7 +39,7 @@ _LEAST_TURBULENCE, _MOST_TURBULENCE = 0.01, 5.0  # m/s
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What a fit takes for given.
+    """What a fit assumes.
 
     Attributes
     ----------
@@ -147,21 +147,23 @@ def start_state(window: Window, vortices: np.ndarray) -> State:
 
 
 def fitted(
-    window: Window, starts: Sequence[np.ndarray], air: Air, given: Assumptions
+    window: Window, starts: Sequence[np.ndarray], air: Air, assumed: Assumptions
 ) -> tuple[Fit, list[np.ndarray]]:
     """The likeliest fit from several starts (vortices, 4); the vortices of those as likely.
 
     Turbulence is estimated from the residuals; ``air`` is the first guess.
     """
-    first = Problem(window, given, crossing_time(window, starts[0]), float(starts[0][:, 1].mean()))
+    first = Problem(
+        window, assumed, crossing_time(window, starts[0]), float(starts[0][:, 1].mean())
+    )
     factor = first.factor(air)
     ends = []
     for start in starts:
         state, _ = first.minimised(start_state(window, start), factor, air, _FIRST_ROUNDS)
         ends.append((first.normal(state, factor, air)[0], state))
-    ends.sort(key=lambda one: one[0])
+    ends.sort(key=lambda end: end[0])
     best = ends[0][1]
-    # times and heights about those of the vortices that were found
+    # times and heights relative to the fitted vortices
     vortices = best.vortices
     problem = replace(
         first, time=crossing_time(window, vortices), reference=float(vortices[:, 1].mean())
@@ -176,9 +178,9 @@ def fitted(
     return problem.averaged(state, air, models, converged), others
 
 
-def residuals(window: Window, fit: Fit, given: Assumptions) -> np.ndarray:
+def residuals(window: Window, fit: Fit, assumed: Assumptions) -> np.ndarray:
     """Velocities of the cells less those of a fit (n,), m/s."""
-    problem = Problem(window, given, fit.time, fit.reference)
+    problem = Problem(window, assumed, fit.time, fit.reference)
     return window.velocity - problem.predicted(fit.state)[0]
 
 
@@ -195,16 +197,16 @@ class Problem:
     """
 
     window: Window
-    given: Assumptions
+    assumed: Assumptions
     time: float
     reference: float
     uneven: np.ndarray | float = 0.0
 
     def with_uneven_swirl(self, state: State) -> "Problem":
-        """The same with the covariance of what real vortices differ from round ones by.
+        """The same with the covariance of the difference of real vortices from round ones.
 
-        In the cells, in proportion to the velocities of each vortex there, correlated over its core
-        across the lines and over a gate along them.
+        It is in proportion to the velocities of each vortex in the cells, and correlated over its
+        core across the lines and over a gate along them.
         """
         lines = self.window.lines
         ranges, angle = lines.ranges[self.window.gate], lines.angle[self.window.line]
@@ -214,13 +216,15 @@ class Problem:
         total = np.zeros(across.shape)
         for vortex in state.vortices:
             places = np.broadcast_to(vortex[:2], (*time.shape, 2))
-            value, _ = seen(lines, places, vortex[2:], self.given.ground, self.given.model)
+            value, _ = radial_velocity(
+                lines, places, vortex[2:], self.assumed.ground, self.assumed.model
+            )
             size = UNEVEN_SWIRL * value[self.window.line, self.window.gate]
             near = np.exp(-((across * np.exp(-vortex[3])) ** 2 + along**2) / 2)
             total += np.outer(size, size) * near
-        found = replace(self, uneven=total)
-        found.__dict__["turbulence"] = self.turbulence
-        return found
+        uneven = replace(self, uneven=total)
+        uneven.__dict__["turbulence"] = self.turbulence
+        return uneven
 
     @cached_property
     def turbulence(self) -> np.ndarray:
@@ -239,7 +243,7 @@ class Problem:
     def predicted(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Velocities (n,) of the cells and their derivatives (n, numbers)."""
         lines, number = self.window.lines, len(state.vortices)
-        ground, model = self.given.ground, self.given.model
+        ground, model = self.assumed.ground, self.assumed.model
         speed, speed_by = self._speeds(state)
         _, time = node_angles(lines)
         later = time - self.time
@@ -248,11 +252,13 @@ class Problem:
         since = (lines.time - self.time)[:, None]
         for k in range(number):
             places = state.vortices[k, :2] + later[..., None] * speed[k]
-            other = float(state.other_profile[0])
-            one, by = seen(lines, places, state.vortices[k, 2:], ground, model, other)
-            value += one
+            fraction = float(state.other_profile[0])
+            swirl, by = radial_velocity(
+                lines, places, state.vortices[k, 2:], ground, model, fraction
+            )
+            value += swirl
             slope[OF_VORTEX * k : OF_VORTEX * (k + 1)] += by[:4]
-            # every number moves the vortices
+            # every parameter changes the vortices' motion
             slope[-len(state.wind) - 1] += by[4]
             moved = by[5:] + by[:2] * since
             slope += np.tensordot(speed_by[k].T, moved, 1)
@@ -269,15 +275,15 @@ class Problem:
         """Speeds (vortices, 2) and their derivatives (vortices, 2, numbers)."""
         vector = state.vector
         step = 1e-5 * np.maximum(np.abs(vector), 1.0)
-        many = vector + np.concatenate([[np.zeros_like(step)], np.diag(step), -np.diag(step)])
+        shifted = vector + np.concatenate([[np.zeros_like(step)], np.diag(step), -np.diag(step)])
         first, second = state.vortices.size, state.departures.size
         speed = motion(
-            many[:, :first].reshape(len(many), -1, OF_VORTEX),
-            many[:, first + second + 1 :],
+            shifted[:, :first].reshape(len(shifted), -1, OF_VORTEX),
+            shifted[:, first + second + 1 :],
             self.reference,
-            self.given.ground,
-            self.given.model,
-        ) + many[:, first : first + second].reshape(len(many), -1, 2)
+            self.assumed.ground,
+            self.assumed.model,
+        ) + shifted[:, first : first + second].reshape(len(shifted), -1, 2)
         ahead, behind = speed[1 : 1 + len(step)], speed[1 + len(step) :]
         slope = (ahead - behind) / (2 * step)[:, None, None]
         return speed[0], np.moveaxis(slope, 0, -1)
@@ -287,7 +293,7 @@ class Problem:
         vector = state.vector
         likely, weight = np.zeros_like(vector), np.zeros_like(vector)
         cores = slice(3, state.vortices.size, OF_VORTEX)
-        likely[cores], weight[cores] = np.log(self.given.core_radius), CORE_SPREAD**-2
+        likely[cores], weight[cores] = np.log(self.assumed.core_radius), CORE_SPREAD**-2
         moves = slice(state.vortices.size, state.vortices.size + state.departures.size)
         weight[moves] = max(air.sigma, _LEAST_TURBULENCE) ** -2
         weight[moves.stop] = OTHER_PROFILE**-2
@@ -303,15 +309,15 @@ class Problem:
             scale = np.diag(matrix) + 1e-12
             step = np.linalg.solve(matrix + damping * np.diag(scale), gradient)
             tried = self._limited(state, state.of(state.vector + step))
-            found = self.normal(tried, factor, air)
-            if found[0] < misfit:
-                gain = misfit - found[0]
-                state, (misfit, gradient, matrix) = tried, found
+            trial = self.normal(tried, factor, air)
+            if trial[0] < misfit:
+                gain = misfit - trial[0]
+                state, (misfit, gradient, matrix) = tried, trial
                 damping = max(damping / 10, 1e-9)
                 if gain < _ENOUGH:
                     return state, True
             else:
-                # a step of no promise from the end of the search
+                # at the minimum steps do not gain
                 if step @ gradient < _ENOUGH:
                     return state, True
                 damping *= 10
@@ -320,7 +326,7 @@ class Problem:
         return state, False
 
     def _limited(self, state: State, tried: State) -> State:
-        """A step of at most half a gate and a factor of 2 in the core, of any number."""
+        """A step limited to half a gate, and to a factor of 2 in the core."""
         move = tried.vortices - state.vortices
         limit = np.array([15.0, 15.0, np.inf, 0.7])
         vortices = state.vortices + np.clip(move, -limit, limit)
@@ -339,8 +345,8 @@ class Problem:
 
     def _white(self, state: State, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         value, slope = self.predicted(state)
-        both = np.column_stack([self.window.velocity - value, slope])
-        white = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
+        columns = np.column_stack([self.window.velocity - value, slope])
+        white = scipy.linalg.solve_triangular(factor, columns, lower=True, check_finite=False)
         return white[:, 0], white[:, 1:]
 
     def evaluated(
@@ -348,19 +354,19 @@ class Problem:
     ) -> "_Model":
         """Restricted likelihood, covariance and step of a state under some turbulence."""
         factor = self.factor(air)
-        both = np.column_stack([residual, slope])
-        white = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
+        columns = np.column_stack([residual, slope])
+        white = scipy.linalg.solve_triangular(factor, columns, lower=True, check_finite=False)
         away, weight = self.prior(state, air)
         matrix = white[:, 1:].T @ white[:, 1:] + np.diag(weight)
         gradient = white[:, 1:].T @ white[:, 0] - weight * away
         root = scipy.linalg.cho_factor(matrix)
         step = scipy.linalg.cho_solve(root, gradient)
         misfit = float(white[:, 0] @ white[:, 0] + away @ (weight * away))
-        held = weight[weight > 0]
+        known = weight[weight > 0]
         likelihood = (
             -np.log(np.diag(factor)).sum()
             - np.log(np.diag(root[0])).sum()
-            + np.log(held).sum() / 2
+            + np.log(known).sum() / 2
             - (misfit - gradient @ step) / 2
         )
         covariance = scipy.linalg.cho_solve(root, np.eye(len(matrix)))
@@ -397,26 +403,26 @@ class Problem:
                 best = next_
             first = best
             models += list(tried.values())
-        return max(models, key=lambda one: one.likelihood).air, models
+        return max(models, key=lambda model: model.likelihood).air, models
 
     def averaged(self, state: State, air: Air, models: list["_Model"], converged: bool) -> Fit:
         """State and covariance over all turbulence, each weighted by its likelihood.
 
         A strength and a length are likely in proportion to the logarithm of their interval.
         """
-        likelihood = np.array([one.likelihood for one in models])
+        likelihood = np.array([model.likelihood for model in models])
         weight = np.exp(likelihood - likelihood.max())
         weight /= weight.sum()
-        steps = np.stack([one.step for one in models])
+        steps = np.stack([model.step for model in models])
         mean = weight @ steps
-        apart = steps - mean
-        within = np.einsum("m,mab->ab", weight, np.stack([one.covariance for one in models]))
+        deviation = steps - mean
+        within = np.einsum("m,mab->ab", weight, np.stack([model.covariance for model in models]))
         best = models[int(likelihood.argmax())]
         final = self._limited(state, state.of(state.vector + mean))
         free = (self.prior(state, air)[1] == 0).sum()
         return Fit(
             final,
-            within + np.einsum("m,ma,mb->ab", weight, apart, apart),
+            within + np.einsum("m,ma,mb->ab", weight, deviation, deviation),
             self.time,
             self.reference,
             air,

@@ -12,31 +12,31 @@ import numpy as np
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.retrieval.ground_vortices.fit import Assumptions
 from lidar_mi.retrieval.ground_vortices.scan_plane import PlaneScan
-from lidar_mi.retrieval.ground_vortices.swirl import lines_of, seen
+from lidar_mi.retrieval.ground_vortices.swirl import lines_of, radial_velocity
 
 _ACROSS = 40.0  # m of lines above and below that circulations are fitted to
 _SEARCH = 25.0  # m around the first guess
 
 
 def by_radial_velocities(
-    scan: PlaneScan, lidar: CoherentLidar, given: Assumptions, guess: np.ndarray
+    scan: PlaneScan, lidar: CoherentLidar, assumed: Assumptions, guess: np.ndarray
 ) -> np.ndarray | None:
     """y, z (m) and circulation (m^2/s) of the vortices (n, 3); None: no extremes.
 
     Parameters
     ----------
-    given : Assumptions
+    assumed : Assumptions
         Profile and core radius.
     guess : (n, 4) array
         Vortices as of a candidate of the detection, which say where to search.
     """
-    found = []
+    extremes = []
     for vortex in guess:
         place = _place(scan, vortex)
         if place is None:
             return None
-        found.append(place)
-    places = np.array(found)
+        extremes.append(place)
+    places = np.array(extremes)
     ranges, angles = np.hypot(*places.T), np.arctan2(places[:, 1], places[:, 0])
     design, values = [], []
     for place_range, angle in zip(ranges, angles, strict=True):
@@ -56,8 +56,8 @@ def by_radial_velocities(
         columns = []
         for place in places:
             at = np.broadcast_to(place, (rows.size, 2, 2))
-            core = np.array([1.0, np.log(given.core_radius)])
-            columns.append(seen(lines, at, core, given.ground, given.model)[0][:, 0])
+            core = np.array([1.0, np.log(assumed.core_radius)])
+            columns.append(radial_velocity(lines, at, core, assumed.ground, assumed.model)[0][:, 0])
         design.append(np.column_stack(columns))
         values.append((scan.velocity - _background(scan))[rows, gate])
     circulation, *_ = np.linalg.lstsq(np.concatenate(design), np.concatenate(values), rcond=None)
@@ -82,15 +82,15 @@ def _place(scan: PlaneScan, vortex: np.ndarray) -> np.ndarray | None:
     whole = np.isfinite(part).any(0)
     if not whole.any() or lines.size < 5:
         return None
-    # white noise alone makes extremes: three lines together
+    # means of three lines, as noise alone makes extremes
     smooth = np.stack([part[:-2], part[1:-1], part[2:]]).mean(0)
     differences = np.where(whole, np.nanmax(smooth, 0) - np.nanmin(smooth, 0), -np.inf)
     k = int(np.nanargmax(differences))
     place_range = scan.ranges[gates[k]]
     if 0 < k < len(gates) - 1 and np.isfinite(differences[[k - 1, k + 1]]).all():
-        before, here, after = differences[k - 1 : k + 2]
-        bend = before - 2 * here + after
-        shift = (before - after) / (2 * bend) if bend < 0 else 0.0
+        before, peak, after = differences[k - 1 : k + 2]
+        curvature = before - 2 * peak + after
+        shift = (before - after) / (2 * curvature) if curvature < 0 else 0.0
         place_range += shift * (scan.ranges[gates[k + 1]] - scan.ranges[gates[k]])
     column = smooth[:, k]
     ends = scan.angle[lines[1:-1]][[int(np.nanargmax(column)), int(np.nanargmin(column))]]

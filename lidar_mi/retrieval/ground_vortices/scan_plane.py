@@ -101,15 +101,15 @@ def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan]
     scans, lost, few = [], int((~known).sum()), "0 lines and 0 gates"
     for number in np.unique(sweep):
         whole = np.flatnonzero(sweep == number)
-        one = lines.isel(time=whole)
-        # in the plane, where an azimuth that turns at the zenith is no turn
-        azimuth, elevation = (np.deg2rad(one[name].values) for name in ("azimuth", "elevation"))
+        swept = lines.isel(time=whole)
+        # angles in the plane do not jump at the zenith, as azimuths do
+        azimuth, elevation = (np.deg2rad(swept[name].values) for name in ("azimuth", "elevation"))
         forward = np.cos(elevation) * np.cos(azimuth - common)
-        for part in _passes(np.arctan2(np.sin(elevation), forward), one["time"].values):
+        for part in _passes(np.arctan2(np.sin(elevation), forward), swept["time"].values):
             index = whole[part]
-            here = usable[index]
-            if here.any(1).sum() < _LEAST_LINES or here.any(0).sum() < _LEAST_GATES:
-                few = f"{here.any(1).sum()} lines and {here.any(0).sum()} gates"
+            valid = usable[index]
+            if valid.any(1).sum() < _LEAST_LINES or valid.any(0).sum() < _LEAST_GATES:
+                few = f"{valid.any(1).sum()} lines and {valid.any(0).sum()} gates"
                 lost += len(index)
                 continue
             scans.append(_plane_scan(lines.isel(time=index), noise, int(number), common))
@@ -132,15 +132,15 @@ def _passes(angle: np.ndarray, time: np.ndarray) -> list[slice]:
     clock = _clock(seconds)
     usual = (seconds.sum() / seconds.size) if clock else np.median(seconds)
     pause = seconds - clock > _PAUSE * usual
-    starts, way = [0], 0.0
+    starts, direction = [0], 0.0
     for k in np.flatnonzero(pause | (signs != 0)):
-        if pause[k] or (way and signs[k] != way):
+        if pause[k] or (direction and signs[k] != direction):
             starts.append(int(k) + 1)
-            way = 0.0
+            direction = 0.0
         else:
-            way = signs[k]
+            direction = signs[k]
     ends = [*starts[1:], len(angle)]
-    # an angle that jitters by more than its steps turns all the time
+    # jitter larger than the steps looks like turns: one pass
     if len(angle) < _LEAST_LINES * len(starts):
         return [slice(None)]
     return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
@@ -149,7 +149,7 @@ def _passes(angle: np.ndarray, time: np.ndarray) -> list[slice]:
 def _clock(steps: np.ndarray) -> float:
     """Resolution of times in which several lines are equal, s; 0: none are.
 
-    Lines that are there twice are not: a clock repeats a fifth of all times or more.
+    Lines stored twice do not count: a clock repeats a fifth of all times or more.
     """
     positive = steps[steps > 0]
     if not positive.size or np.mean(steps == 0) < 0.2:
@@ -175,10 +175,10 @@ def _regular(seconds: np.ndarray, clock: float) -> np.ndarray:
 def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: float) -> PlaneScan:
     azimuth, elevation = np.deg2rad(lines["azimuth"].values), np.deg2rad(lines["elevation"].values)
     along = common
-    if not _aside(azimuth, elevation, along) < _OUT_OF_PLANE:
+    if not _out_of_plane(azimuth, elevation, along) < _OUT_OF_PLANE:
         along = _azimuth(azimuth, elevation)
     forward = np.cos(elevation) * np.cos(azimuth - along)
-    aside = _aside(azimuth, elevation, along)
+    aside = _out_of_plane(azimuth, elevation, along)
     if not aside < _OUT_OF_PLANE:
         raise InputError(
             f"{source_name(lines)}: scan {number} leaves the vertical plane of azimuth "
@@ -218,7 +218,7 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
         velocity,
         variance,
         float(np.median(np.diff(angle[order]))),
-        not any(one in words for one in STANDING),
+        not any(word in words for word in STANDING),
         clock,
         float(np.rad2deg(along) % 360),
         number,
@@ -226,7 +226,7 @@ def _plane_scan(lines: xr.Dataset, noise: float | None, number: int, common: flo
     )
 
 
-def _aside(azimuth: np.ndarray, elevation: np.ndarray, along: float) -> float:
+def _out_of_plane(azimuth: np.ndarray, elevation: np.ndarray, along: float) -> float:
     """Largest distance of the directions from a vertical plane, of unit vectors."""
     return float(np.abs(np.cos(elevation) * np.sin(azimuth - along)).max())
 
@@ -243,8 +243,8 @@ def _azimuth(azimuth: np.ndarray, elevation: np.ndarray) -> float:
 def _noise_variance(velocity: np.ndarray) -> np.ndarray:
     """Variance of independent noise from second differences of three lines, each gate its own.
 
-    Robust, by the median of their absolute values; the air adds to it what differs from line to
-    line.
+    It is robust, from the median of their absolute values; differences of the air from line to line
+    add to it.
     """
     second = velocity[:-2] - 2 * velocity[1:-1] + velocity[2:]
     known = np.isfinite(second).any(0)

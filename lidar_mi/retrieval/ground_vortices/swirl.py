@@ -71,10 +71,10 @@ def shape(square: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
         return value, -(value**2)
     a = LAMB_OSEEN_CONSTANT
     s = np.maximum(square, _SMALL)
-    rest = np.exp(-a * s)
-    value = (1 - rest) / s
-    slope = (a * rest - value) / s
-    # below: the series, to 1e-8
+    decay = np.exp(-a * s)
+    value = (1 - decay) / s
+    slope = (a * decay - value) / s
+    # the series for small s, exact to 1e-8
     small = square < _SMALL
     value = np.where(small, a - a**2 * square / 2, value)
     return value, np.where(small, -(a**2) / 2 + a**3 * square / 3, slope)
@@ -106,9 +106,9 @@ def motion(
 ) -> np.ndarray:
     """Velocity (..., vortices, 2) of vortices along y and z, m/s.
 
-    Of the wind at their height and of each other's induction, and of the images below the ground:
-    vortices of opposite circulation as far below it. The wind is a polynomial of the height above
-    the reference (m): m/s, m/s per m, ...
+    It is the wind at their height, the induction of each other, and that of the image vortices of
+    opposite circulation below the ground. The wind is a polynomial of the height above the
+    reference (m): m/s, m/s per m, ...
     """
     y, z, circulation, core = np.moveaxis(vortices, -1, 0)
     above = z - reference
@@ -122,12 +122,12 @@ def motion(
         square = np.exp(-2 * core)[..., None, :]
         omega = shape((dy**2 + dz**2) * square, model)[0] * square
         omega = omega * strength[..., None, :] / (2 * np.pi)
-        # none on itself: at no distance it is zero
+        # zero for the vortex itself, at distance 0
         v, w = v - (omega * dz).sum(-1), w + (omega * dy).sum(-1)
     return np.stack([v, w], -1)
 
 
-def seen(
+def radial_velocity(
     lines: Lines,
     places: np.ndarray,
     strengths: np.ndarray,
@@ -156,10 +156,10 @@ def seen(
         By y, z, circulation, logarithm of the core radius, departure; by y and z times the time of
         the node, s, after `Lines.time`: of a line whose beam moves.
     """
-    value, slope = _seen(lines, places, strengths, None, model, departure)
+    value, slope = _radial_velocity(lines, places, strengths, None, model, departure)
     if ground is None:
         return value, slope
-    image, by = _seen(lines, places, strengths, ground, model, departure)
+    image, by = _radial_velocity(lines, places, strengths, ground, model, departure)
     return value + image, slope + by
 
 
@@ -169,7 +169,7 @@ def node_angles(lines: Lines) -> tuple[np.ndarray, np.ndarray]:
     return lines.angle[:, None] + offset, lines.time[:, None] + lines.rate[:, None] * offset
 
 
-def _seen(
+def _radial_velocity(
     lines: Lines,
     places: np.ndarray,
     strengths: np.ndarray,

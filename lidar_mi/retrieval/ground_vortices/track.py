@@ -27,41 +27,41 @@ _CORE_GROWTH = 0.03  # of the core radius, per root of second
 _CIRCULATION = 0.003  # of the circulation, per root of second: it differs along the axis
 
 
-def tracked(found: xr.Dataset, ground: float | None) -> xr.Dataset:
+def tracked(vortices: xr.Dataset, ground: float | None) -> xr.Dataset:
     """The data set with the smoothed numbers of every scan between the first and last valid one.
 
     A fit with a flag, or beyond the gate, is not used; the vortices are predicted there. The data
     set is that of `vortex_dataset`, in the order of time; the ground's height is in m.
     """
-    model = found.attrs["profile"]
-    number = found.sizes["vortex"]
-    measured = np.stack([found[name].values for name in NUMBERS], -1).reshape(-1, 4 * number)
-    seconds = (found["time"].values - found["time"].values[0]) / np.timedelta64(1, "s")
-    valid = np.flatnonzero(found["flag"].values == 0)
-    used = np.zeros(found.sizes["scan"], bool)
+    model = vortices.attrs["profile"]
+    number = vortices.sizes["vortex"]
+    measured = np.stack([vortices[name].values for name in NUMBERS], -1).reshape(-1, 4 * number)
+    seconds = (vortices["time"].values - vortices["time"].values[0]) / np.timedelta64(1, "s")
+    valid = np.flatnonzero(vortices["flag"].values == 0)
+    used = np.zeros(vortices.sizes["scan"], bool)
     values, stderr = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
     if valid.size:
         states: list[tuple[np.ndarray, np.ndarray]] = []
         steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         scans = np.arange(valid[0], valid[-1] + 1)
         for k in scans:
-            error = found["covariance"].values[k]
+            error = vortices["covariance"].values[k]
             if k == valid[0]:
-                wind = float(found["wind"].values[k])
+                wind = float(vortices["wind"].values[k])
                 state = np.concatenate([measured[k], [wind, 0.0, _DECAY]])
                 spread = np.array([_WIND, _WIND, _DECAY_SPREAD]) ** 2
                 covariance = scipy.linalg.block_diag(error, np.diag(spread))
                 used[k] = True
             else:
                 dt = float(seconds[k] - seconds[k - 1])
-                state, transition, noise = _predicted(state, dt, found, k, ground, model)
+                state, transition, noise = _predicted(state, dt, vortices, k, ground, model)
                 covariance = transition @ covariance @ transition.T + noise
                 steps.append((transition, noise, state))
-                if found["flag"].values[k] == 0:
-                    seen = measured[k], error, np.eye(measured.shape[1], len(state))
-                    square = kalman.innovation(state, covariance, *seen)
+                if vortices["flag"].values[k] == 0:
+                    observation = measured[k], error, np.eye(measured.shape[1], len(state))
+                    square = kalman.innovation(state, covariance, *observation)
                     if square <= scipy.stats.chi2.ppf(GATE, measured.shape[1]):
-                        state, covariance = kalman.updated(state, covariance, *seen)
+                        state, covariance = kalman.updated(state, covariance, *observation)
                         used[k] = True
             states.append((state, covariance))
         for k in range(len(scans) - 2, -1, -1):
@@ -76,31 +76,36 @@ def tracked(found: xr.Dataset, ground: float | None) -> xr.Dataset:
     for n, name in enumerate(NUMBERS):
         for suffix, part in (("tracked", values), ("tracked_stderr", stderr)):
             about = {
-                "units": found[name].attrs["units"],
-                "long_name": f"{found[name].attrs['long_name']}, of all scans together"
+                "units": vortices[name].attrs["units"],
+                "long_name": f"{vortices[name].attrs['long_name']}, of all scans together"
                 + (": standard error" if "stderr" in suffix else ""),
             }
             more[f"{name}_{suffix}"] = ("scan", "vortex"), part[:, n::OF_VORTEX], about
-    return found.assign(more)
+    return vortices.assign(more)
 
 
 def _predicted(
-    state: np.ndarray, dt: float, found: xr.Dataset, scan: int, ground: float | None, model: Model
+    state: np.ndarray,
+    dt: float,
+    vortices: xr.Dataset,
+    scan: int,
+    ground: float | None,
+    model: Model,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """State after a time, its derivatives and the covariance of what is unknown of the motion."""
+    """State after a time, its derivatives and the covariance of the process noise."""
     step = 1e-5 * np.maximum(np.abs(state), 1.0)
-    both = np.concatenate([[state], state + np.diag(step), state - np.diag(step)])
-    after = _moved(both, dt, ground, model)
+    shifted = np.concatenate([[state], state + np.diag(step), state - np.diag(step)])
+    after = _moved(shifted, dt, ground, model)
     size = len(state)
     transition = ((after[1 : 1 + size] - after[1 + size :]) / (2 * step)[:, None]).T
     number = (size - 3) // OF_VORTEX
     sigma, length = (
-        float(np.nanmedian(found[name].values)) for name in ("turbulence", "turbulence_length")
+        float(np.nanmedian(vortices[name].values)) for name in ("turbulence", "turbulence_length")
     )
     dissipation = _DISSIPATION * sigma**3 / length
-    apart = np.ptp(state[: OF_VORTEX * number : OF_VORTEX]) if number > 1 else 30.0
+    separation = np.ptp(state[: OF_VORTEX * number : OF_VORTEX]) if number > 1 else 30.0
     # eddies smaller than the pair move each vortex on its own, for much longer than a scan
-    place = (dissipation * max(apart, 10.0)) ** (2 / 3) * dt**2
+    place = (dissipation * max(separation, 10.0)) ** (2 / 3) * dt**2
     variance = np.zeros(size)
     for k in range(number):
         first = OF_VORTEX * k

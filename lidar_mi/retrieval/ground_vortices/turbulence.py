@@ -59,7 +59,7 @@ def of_gates(
     """
     steps = max(1, round(cell / _FINE))
     tables = np.stack(
-        [_table(lidar.pulse_duration, lidar.gate_length, steps, one) for one in lengths], -1
+        [_table(lidar.pulse_duration, lidar.gate_length, steps, length) for length in lengths], -1
     )
     last = np.array(tables.shape[:2]) - 1.001
     row = np.minimum(np.abs(along) / _STEP, last[0])

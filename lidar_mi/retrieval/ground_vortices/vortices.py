@@ -13,9 +13,10 @@ from threadpoolctl import threadpool_limits
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.vortices.vortex import Model
 from lidar_mi.errors import InputError
+from lidar_mi.flags import VortexFlag
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.progress import Notice
-from lidar_mi.retrieval.ground_vortices.dataset import ScanVortices, VortexFlag, vortex_dataset
+from lidar_mi.retrieval.ground_vortices.dataset import ScanVortices, vortex_dataset
 from lidar_mi.retrieval.ground_vortices.detection import SEPARATIONS, detect
 from lidar_mi.retrieval.ground_vortices.echo import at_the_echo
 from lidar_mi.retrieval.ground_vortices.fit import Air, Assumptions, Fit, fitted, residuals
@@ -144,43 +145,43 @@ def fit_vortices_to_lines(
     if not 0 < false_alarm < 1:
         raise InputError(f"false_alarm: {false_alarm} is not allowed; expected between 0 and 1")
     core = core_radius or (0.05 * span if span else _LIKELY_CORE)
-    given = Assumptions(profile, ground, core)
+    assumed = Assumptions(profile, ground, core)
     separations: tuple[float, ...] = SEPARATIONS
     if span is not None:
         separations = tuple(math.pi / 4 * span * factor for factor in (0.85, 1.0, 1.2))
-    found: list[ScanVortices] = []
+    fitted_scans: list[ScanVortices] = []
     remarks: list[str] = []
-    for number, one in enumerate(sets):
-        lidar = lidar_of(one, pulse_length, gate_length)
-        scans, more = plane_scans(at_the_echo(one, lidar), noise)
+    for number, data in enumerate(sets):
+        lidar = lidar_of(data, pulse_length, gate_length)
+        scans, more = plane_scans(at_the_echo(data, lidar), noise)
         remarks += more
         if max(lidar.pulse_length, lidar.gate_length) > _LONGEST:
             remarks.append(
                 f"pulses of {lidar.pulse_length:.4g} m and gates of {lidar.gate_length:.4g} m: "
                 f"stated errors were compared with true ones for {_LONGEST:g} m at most"
             )
-        tilt = unapplied_tilt(one)
+        tilt = unapplied_tilt(data)
         if tilt > 0:
             remarks.append(
                 f"pitch and roll of up to {np.rad2deg(tilt):.2f} degrees are not applied: "
                 f"{1000 * tilt:.1f} m of position per km of range, not in the errors"
             )
-        begun = len(found)
+        first = len(fitted_scans)
         for k, scan in enumerate(scans):
             if notice is not None:
                 notice("fitting vortices", (number + k / len(scans)) / len(sets))
             # matrices are small: threads would wait for each other longer than they compute
             with threadpool_limits(1, "blas"):
-                found.append(_scan(scan, lidar, given, kind, separations, false_alarm))
-        remarks += _of_overlapping_gates(found[begun:], one, lidar)
+                fitted_scans.append(_scan(scan, lidar, assumed, kind, separations, false_alarm))
+        remarks += _of_overlapping_gates(fitted_scans[first:], data, lidar)
     about: dict[str, str | float] = {
         "profile": profile,
         "kind": kind,
         "false_alarm_limit": false_alarm,
     }
     about["remarks"] = "\n".join(remarks)
-    vortices = vortex_dataset(found, about)
-    return tracked(vortices, ground) if len(found) > 1 else vortices
+    vortices = vortex_dataset(fitted_scans, about)
+    return tracked(vortices, ground) if len(fitted_scans) > 1 else vortices
 
 
 def _check(**numbers: float | None) -> None:
@@ -204,8 +205,8 @@ def lidar_of(lines: xr.Dataset, pulse: float | None, gate: float | None) -> Cohe
 def _of_overlapping_gates(
     scans: list[ScanVortices], lines: xr.Dataset, lidar: CoherentLidar
 ) -> list[str]:
-    """A remark on fits with a misfit that noise common to neighbouring gates may make."""
-    misfit = sum(bool(one.flag & VortexFlag.MISFIT.value) for one in scans)
+    """A remark on misfits that may be due to noise common to neighbouring gates."""
+    misfit = sum(bool(scan.flag & VortexFlag.MISFIT.value) for scan in scans)
     step = float(np.median(np.diff(lines["range"].values)))
     if not misfit or step > _OVERLAP * lidar.gate_length:
         return []
@@ -219,34 +220,36 @@ def _of_overlapping_gates(
 def _scan(
     scan: PlaneScan,
     lidar: CoherentLidar,
-    given: Assumptions,
+    assumed: Assumptions,
     kind: Kind,
     separations: tuple[float, ...],
     false_alarm: float,
 ) -> ScanVortices:
     single = kind == "single"
-    seen = detect(scan, lidar, given, separations=separations, single=single)
-    if not seen.candidates or seen.false_alarm > false_alarm:
-        return ScanVortices(scan, seen, None, VortexFlag.NO_WAKE.value, 1 if single else 2)
-    window = _window(scan, lidar, np.concatenate([one.vortices for one in seen.candidates]))
+    detection = detect(scan, lidar, assumed, separations=separations, single=single)
+    if not detection.candidates or detection.false_alarm > false_alarm:
+        return ScanVortices(scan, detection, None, VortexFlag.NO_WAKE.value, 1 if single else 2)
+    starts = [candidate.vortices for candidate in detection.candidates]
+    window = _window(scan, lidar, np.concatenate(starts))
     if window is None:
-        return ScanVortices(scan, seen, None, VortexFlag.NO_FIT.value, 1 if single else 2)
-    length = min(LENGTHS, key=lambda one: abs(math.log(one / seen.air.length)))
-    starts = [one.vortices for one in seen.candidates]
-    fit, others = fitted(window, starts, Air(seen.air.sigma, length), given)
+        return ScanVortices(scan, detection, None, VortexFlag.NO_FIT.value, 1 if single else 2)
+    length = min(LENGTHS, key=lambda length: abs(math.log(length / detection.air.length)))
+    fit, others = fitted(window, starts, Air(detection.air.sigma, length), assumed)
     if scan.sweeps and scan.step * window.lines.ranges.mean() > CELL:
-        # lines so far apart that it matters whether the beam moves while it measures
+        # with lines so far apart it matters whether the beam moves while it measures
         standing = replace(scan, sweeps=False)
-        still = _window(standing, lidar, np.concatenate([one.vortices for one in seen.candidates]))
-        if still is not None:
-            other, more = fitted(still, [fit.state.vortices, *starts], fit.air, given)
-            if other.log_likelihood > fit.log_likelihood:
-                scan, window, fit, others = standing, still, other, more
+        standing_window = _window(standing, lidar, np.concatenate(starts))
+        if standing_window is not None:
+            standing_fit, more = fitted(
+                standing_window, [fit.state.vortices, *starts], fit.air, assumed
+            )
+            if standing_fit.log_likelihood > fit.log_likelihood:
+                scan, window, fit, others = standing, standing_window, standing_fit, more
     if scan.stated != "gates":
-        left = residuals(window, fit, given)
-        window = window.with_noise_of(left, limited=scan.stated == "least")
-        fit, _ = fitted(window, [fit.state.vortices], fit.air, given)
-    return ScanVortices(scan, seen, fit, _flag(scan, fit, others, lidar), 1 if single else 2)
+        residual = residuals(window, fit, assumed)
+        window = window.with_noise_of(residual, limited=scan.stated == "least")
+        fit, _ = fitted(window, [fit.state.vortices], fit.air, assumed)
+    return ScanVortices(scan, detection, fit, _flag(scan, fit, others, lidar), 1 if single else 2)
 
 
 def _window(scan: PlaneScan, lidar: CoherentLidar, vortices: np.ndarray) -> Window | None:
@@ -287,6 +290,6 @@ def _flag(scan: PlaneScan, fit: Fit, others: list[np.ndarray], lidar: CoherentLi
         flag |= VortexFlag.SAME_SENSE
     if scipy.stats.chi2.sf(fit.misfit, fit.dof) < _MISFIT:
         flag |= VortexFlag.MISFIT
-    if any(np.abs((one - vortices)[:, :2]).max() > lidar.gate_length / 2 for one in others):
+    if any(np.abs((other - vortices)[:, :2]).max() > lidar.gate_length / 2 for other in others):
         flag |= VortexFlag.AMBIGUOUS
     return flag.value

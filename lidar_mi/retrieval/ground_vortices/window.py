@@ -52,8 +52,8 @@ class Window:
 
         If ``limited``, no less than the present one.
 
-        From their second differences over seven lines and three gates: where the vortices widen the
-        spectra, velocities are less certain than elsewhere.
+        It is estimated from their second differences over seven lines and three gates, as
+        velocities are less certain where the vortices widen the spectra.
         """
         lines = self.lines
         full = np.full((len(lines.time), len(lines.ranges)), np.nan)
@@ -62,8 +62,8 @@ class Window:
         square[1:-1] = (full[:-2] - 2 * full[1:-1] + full[2:]) ** 2 / 6
         known = np.isfinite(square)
         total, number = (
-            scipy.ndimage.uniform_filter(one, _NEIGHBOURS, mode="constant")
-            for one in (np.where(known, square, 0.0), known.astype(float))
+            scipy.ndimage.uniform_filter(array, _NEIGHBOURS, mode="constant")
+            for array in (np.where(known, square, 0.0), known.astype(float))
         )
         everywhere = float(square[known].mean())
         local = np.where(number > 0.3, total / np.maximum(number, 0.01), everywhere)
@@ -73,7 +73,7 @@ class Window:
 
     @property
     def height(self) -> np.ndarray:
-        """Of the cells above the lidar, m."""
+        """Height of the cells above the lidar, m."""
         return self.lines.ranges[self.gate] * np.sin(self.lines.angle[self.line])
 
 
@@ -94,8 +94,8 @@ def window_of(
 ) -> Window | None:
     """Cells between two ranges (m) and two angles (rad); None: hardly any.
 
-    Gates are left out until they are half a gate length apart or more; lines are averaged over
-    ``cell`` at the middle of the ranges, and over more where there were too many cells.
+    Gates are thinned to half a gate length or more; lines are averaged over ``cell`` at the middle
+    of the ranges, or over more to limit the number of cells.
     """
     gates = np.flatnonzero((scan.ranges >= ranges[0]) & (scan.ranges <= ranges[1]))
     lines = np.flatnonzero((scan.angle >= angles[0]) & (scan.angle <= angles[1]))
@@ -105,8 +105,8 @@ def window_of(
     thin = max(1, int(np.floor(0.5 * lidar.gate_length / step + 0.01)))
     gates = gates[gates.size % thin // 2 :: thin]
     fine = max(scan.step, 1e-9) * (ranges[0] + ranges[1]) / 2
-    many = max(1, round(cell / fine), int(np.ceil(lines.size * gates.size / MOST_CELLS)))
-    starts = np.arange(0, lines.size - many // 2, many)
+    averaged = max(1, round(cell / fine), int(np.ceil(lines.size * gates.size / MOST_CELLS)))
+    starts = np.arange(0, lines.size - averaged // 2, averaged)
     part = np.ix_(lines, gates)
     velocity, variance = scan.velocity[part], scan.variance[part]
     usable = np.isfinite(velocity)

@@ -64,31 +64,31 @@ def unfolded(
     for index in levels:
         wind = _likeliest(design[index], velocity[index], interval)
         folds[index] = np.round((design[index] @ wind - velocity[index]) / interval)
-    left, size, variance = np.zeros(len(velocity)), interval / 40, 0.0
+    residual, size, variance = np.zeros(len(velocity)), interval / 40, 0.0
     every = np.concatenate(levels)
     for _ in range(_ROUNDS):
         if nyquist is None:
-            near = np.abs(left) < 5 * size
-            pairs = [_beside(design[i], velocity[i], folds[i], near[i]) for i in levels]
-            speed, number = (np.concatenate(one) for one in zip(*pairs, strict=True))
+            near = np.abs(residual) < 5 * size
+            pairs = [_without_wind(design[i], velocity[i], folds[i], near[i]) for i in levels]
+            speed, number = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
             square = float(number @ number)
             if not square > 0:
                 return None
             interval = float(-(number @ speed) / square)
-            rest = speed + interval * number
-            variance = float(rest @ rest) / max(rest.size - 3 * len(levels) - 1, 1) / square
+            misfit = speed + interval * number
+            variance = float(misfit @ misfit) / max(misfit.size - 3 * len(levels) - 1, 1) / square
             if not interval > 0:
                 return None
         for index in levels:
             d, v = design[index], velocity[index]
-            near = np.abs(left[index]) < 5 * size
+            near = np.abs(residual[index]) < 5 * size
             wind, *_ = np.linalg.lstsq(d[near], (v + folds[index] * interval)[near], rcond=None)
             folds[index] = np.round((d @ wind - v) / interval)
-            left[index] = v + folds[index] * interval - d @ wind
-        size = max(1.4826 * float(np.median(np.abs(left[every]))), 1e-3 * interval)
+            residual[index] = v + folds[index] * interval - d @ wind
+        size = max(1.4826 * float(np.median(np.abs(residual[every]))), 1e-3 * interval)
     far = every[folds[every] != 0]
     chance = 10 * size / interval
-    count = int((np.abs(left[far]) < 5 * size).sum())
+    count = int((np.abs(residual[far]) < 5 * size).sum())
     if not (chance < 0.5 and scipy.stats.binom.sf(count - 1, far.size, chance) < _FALSE):
         return None
     return Unfolded(velocity + folds * interval, interval, variance, folds)
@@ -105,7 +105,7 @@ def _suspicious(design: np.ndarray, velocity: np.ndarray, interval: float) -> bo
 
 
 def _likeliest(design: np.ndarray, velocity: np.ndarray, interval: float) -> np.ndarray:
-    """Of horizontal winds on a grid an eighth of the interval apart along the lines."""
+    """Likeliest horizontal wind of a grid with steps of an eighth of the interval."""
     slant = float(np.hypot(design[:, 0], design[:, 1]).max())
     step = interval / (8 * max(slant, 1e-3))
     side = step * np.arange(-np.ceil(_FASTEST / step), np.ceil(_FASTEST / step) + 1)
@@ -115,27 +115,26 @@ def _likeliest(design: np.ndarray, velocity: np.ndarray, interval: float) -> np.
     return winds[:, int(np.cos(phase).mean(0).argmax())]
 
 
-def _beside(
+def _without_wind(
     design: np.ndarray, velocity: np.ndarray, folds: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities and folds less what a wind explains of them (Frisch and Waugh 1933)."""
-    both = np.column_stack([velocity, folds])[near]
+    """Residuals of velocities and folds about a wind (Frisch and Waugh 1933)."""
+    observed = np.column_stack([velocity, folds])[near]
     basis, _ = np.linalg.qr(design[near])
-    rest = both - basis @ (basis.T @ both)
-    return rest[:, 0], rest[:, 1]
+    unexplained = observed - basis @ (basis.T @ observed)
+    return unexplained[:, 0], unexplained[:, 1]
 
 
 def ambiguous(design: np.ndarray, wind: np.ndarray, nyquist: float | None) -> bool:
     """Whether few lines measure the same velocities, folded, in another wind that is as likely.
 
-    Of winds that are normal with 15 m/s a component, the other has a tenth of the probability or
-    more.
+    For normal winds of 15 m/s a component, the other wind has at least a tenth of the probability.
     """
     if nyquist is None or _directions(design) >= _LINES:
         return False
     slant = np.hypot(design[:, 0], design[:, 1])
     inclined = design[slant > 0.1 * slant.max()]
-    # opposite lines fold by opposite numbers: any line of the horizontal ones
+    # opposite lines fold by opposite numbers: one line is enough
     alias = 2 * nyquist * inclined[:, :2] / (slant[slant > 0.1 * slant.max()] ** 2)[:, None]
     others = np.concatenate([wind[:2] + alias, wind[:2] - alias])
     same = (2 * nyquist) * np.round((others - wind[:2]) @ design[:, :2].T / (2 * nyquist))

@@ -1,4 +1,4 @@
-"""Velocities of lines of sight that do not belong to the wind of the others."""
+"""Radial velocities that disagree with the wind of the other lines."""
 
 from itertools import combinations
 
@@ -7,8 +7,8 @@ import numpy as np
 LIMIT = 5.0
 """Residual of an outlier over the standard deviation of the lines.
 
-Turbulence has no normal, independent residuals, and few lines tell their spread to a third: less
-would reject air. Velocities without a signal are uniform within tens of m/s, and few are closer.
+Residuals by turbulence are neither normal nor independent, and the spread of few lines is known to
+a third: a lower limit would reject air. Velocities without a signal are uniform within tens of m/s.
 """
 
 _SUBSETS = 200
@@ -34,10 +34,10 @@ def residuals(design: np.ndarray, velocity: np.ndarray, seed: int = 0) -> np.nda
     if not len(subsets):
         return np.zeros(count)
     winds = np.linalg.solve(matrices, velocity[subsets][..., None])[..., 0]
-    left = velocity - winds @ design.T
+    residual = velocity - winds @ design.T
     # of n numbers of which three fit exactly, the middle of the others
-    middle = np.sort(np.abs(left), axis=1)[:, (count + 3) // 2]
-    return left[int(np.argmin(middle))]
+    middle = np.sort(np.abs(residual), axis=1)[:, (count + 3) // 2]
+    return residual[int(np.argmin(middle))]
 
 
 def refitted(
@@ -54,17 +54,17 @@ def refitted(
     return velocity - design @ wind, np.sqrt(np.maximum(1 - np.where(keep, 1, -1) * leverage, 1e-3))
 
 
-def spread(left: np.ndarray) -> float:
+def spread(residual: np.ndarray) -> float:
     """Standard deviation of residuals of several levels, robust: one may be nothing but noise."""
-    return float(_NORMAL * np.median(np.abs(left)))
+    return float(_NORMAL * np.median(np.abs(residual)))
 
 
-def spread_of_best(left: np.ndarray, count: np.ndarray) -> float:
+def spread_of_best(residual: np.ndarray, count: np.ndarray) -> float:
     """Standard deviation of the lines by `residuals` of levels of so many lines.
 
-    Three residuals of a level are 0, and the others are the smallest that any three lines leave:
-    they count by 1 + 5 / (n - 3) (Rousseeuw & Leroy 1987, Robust Regression and Outlier Detection,
+    Three residuals of a level are 0, and the others are the smallest of any three lines: they are
+    multiplied by 1 + 5 / (n - 3) (Rousseeuw & Leroy 1987, Robust Regression and Outlier Detection,
     chapter 5).
     """
-    others = np.abs(left) > 1e-9
-    return spread(left[others] * (1 + 5 / (count[others] - 3))) if others.any() else 0.0
+    others = np.abs(residual) > 1e-9
+    return spread(residual[others] * (1 + 5 / (count[others] - 3))) if others.any() else 0.0

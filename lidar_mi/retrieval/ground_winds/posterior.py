@@ -1,9 +1,8 @@
 """Mean wind over the lines of a scan: noise and turbulence as one Gaussian process.
 
-Lines of one scan see different air. Neighbouring lines see nearly the same eddies, so that the
-scatter of the velocities about a uniform wind tells less about its error than that of independent
-numbers would. Here the wind is a mean and von Karman's turbulence; what is asked for is its average
-along the path from line to line.
+Neighbouring lines measure nearly the same eddies, so that the scatter of the velocities about a
+uniform wind says less about its error than that of independent numbers. Here the wind is a mean and
+von Karman's turbulence; estimated is its average along the path from line to line.
 """
 
 import math
@@ -18,9 +17,8 @@ from lidar_mi.retrieval.ground_winds.turbulence_covariance import of_average, of
 LENGTHS = (50.0, 200.0, 800.0)
 """Length scales of turbulence that are considered, m: those of the boundary layer.
 
-A few lines do not tell the length, and half of what is unknown of the error is in it: all are
-equally likely before the data. Turbulence that is smaller than the distance of the lines acts as
-noise.
+Few lines do not determine the length, which causes half of the error's uncertainty: the prior of
+all is equal. Turbulence smaller than the distance of the lines acts as noise.
 """
 
 NOISE_FRACTIONS = (0.003, 0.03, 0.2, 0.6, 0.97)
@@ -68,7 +66,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What levels that share their turbulence tell of it.
+    """Posterior of the turbulence that levels share.
 
     Attributes
     ----------
@@ -101,33 +99,33 @@ def evidence(levels: Sequence[Level], lengths: Sequence[float], noise: float) ->
     noise : float
         Mean variance of the stated noise, (m/s)^2; 0: unknown.
     """
-    places = np.concatenate([one.places for one in levels])
-    design = np.concatenate([one.design for one in levels])
-    velocity = np.concatenate([one.velocity for one in levels])
-    independent = np.diag(np.concatenate([one.noise for one in levels]))
-    means = scipy.linalg.block_diag(*[one.averaged(one.design) for one in levels])
-    first = np.cumsum([0, *(len(one.design) for one in levels[:-1])])
+    places = np.concatenate([level.places for level in levels])
+    design = np.concatenate([level.design for level in levels])
+    velocity = np.concatenate([level.velocity for level in levels])
+    independent = np.diag(np.concatenate([level.noise for level in levels]))
+    means = scipy.linalg.block_diag(*[level.averaged(level.design) for level in levels])
+    first = np.cumsum([0, *(len(level.design) for level in levels[:-1])])
     together = Level(
         design,
         places,
         places,
-        np.concatenate([one.starts + k for one, k in zip(levels, first, strict=True)]),
+        np.concatenate([level.starts + k for level, k in zip(levels, first, strict=True)]),
         velocity,
         independent,
     )
     dof = len(velocity) - means.shape[1]
     likelihood, variance = [], []
     for length in lengths:
-        seen = _seen(together, length)
+        turbulent = _turbulent(together, length)
         for fraction in NOISE_FRACTIONS:
-            factor = np.linalg.cholesky((1 - fraction) * seen + fraction * independent)
+            factor = np.linalg.cholesky((1 - fraction) * turbulent + fraction * independent)
             white = scipy.linalg.solve_triangular(
                 factor, np.column_stack([means, velocity]), lower=True
             )
             basis, triangle = np.linalg.qr(white[:, :-1])
-            left = white[:, -1] - basis @ (basis.T @ white[:, -1])
+            residual = white[:, -1] - basis @ (basis.T @ white[:, -1])
             # velocities are rounded: no fit is better than 1 mm/s
-            square = max(float(left @ left), 1e-6 * dof)
+            square = max(float(residual @ residual), 1e-6 * dof)
             fit = -np.log(np.diag(factor)).sum() - np.log(np.abs(np.diag(triangle))).sum()
             fit -= dof / 2 * np.log(square)
             # the variance is inverse gamma; above a limit, its incomplete integrals
@@ -142,23 +140,23 @@ def evidence(levels: Sequence[Level], lengths: Sequence[float], noise: float) ->
 
 
 def mean_wind(
-    level: Level, found: Evidence, lengths: Sequence[float]
+    level: Level, shared: Evidence, lengths: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Average wind over the path of a level (3,), m/s, and its covariance (3, 3).
 
-    Under each model by universal kriging (Cressie, Statistics for Spatial Data, 1993, section 3.4);
-    the spread of the models is part of the error.
+    Both are by universal kriging under each model (Cressie, Statistics for Spatial Data, 1993,
+    section 3.4); the spread of the models is part of the error.
     """
     path = level.path[:: math.ceil(len(level.path) / _MOST_PLACES)]
     means = level.averaged(level.design)
     winds, errors = [], []
     for length in lengths:
-        seen = _seen(level, length)
+        covariance = _turbulent(level, length)
         cross = level.averaged(with_average(path, level.places, level.design, length))
         average = of_average(path, length)
         for fraction in NOISE_FRACTIONS:
             turbulent = 1 - fraction
-            factor = np.linalg.cholesky(turbulent * seen + fraction * np.diag(level.noise))
+            factor = np.linalg.cholesky(turbulent * covariance + fraction * np.diag(level.noise))
             white = scipy.linalg.solve_triangular(
                 factor, np.column_stack([means, level.velocity, turbulent * cross]), lower=True
             )
@@ -168,13 +166,13 @@ def mean_wind(
             gap = np.eye(3) - target.T @ design
             winds.append(mean + target.T @ (velocity - design @ mean))
             errors.append(turbulent * average - target.T @ target + gap @ inverse @ gap.T)
-    wind = found.weight @ np.array(winds)
-    apart = np.array(winds) - wind
-    within = np.einsum("m,m,mab->ab", found.weight, found.variance, np.array(errors))
-    return wind, within + np.einsum("m,ma,mb->ab", found.weight, apart, apart)
+    wind = shared.weight @ np.array(winds)
+    deviation = np.array(winds) - wind
+    within = np.einsum("m,m,mab->ab", shared.weight, shared.variance, np.array(errors))
+    return wind, within + np.einsum("m,ma,mb->ab", shared.weight, deviation, deviation)
 
 
-def _seen(level: Level, length: float) -> np.ndarray:
+def _turbulent(level: Level, length: float) -> np.ndarray:
     """Covariance of a level's averages by turbulence alone, of unit variance a component."""
     full = of_lines(level.places, level.design, length)
     return level.averaged(level.averaged(full).T)

@@ -1,12 +1,13 @@
 """Profiles of the wind as a CF data set."""
 
-import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
+
+from lidar_mi.flags import WindFlag, flag_attributes
 
 _COMPONENTS = {
     "u": ("eastward_wind", "wind to the east"),
@@ -29,23 +30,6 @@ Where most lines see nothing, those few that pass the threshold of the signal ar
 
 MAX_STDERR = 5.0
 """Largest standard error of the horizontal vector of a valid wind, m/s: as large as most winds."""
-
-
-class WindFlag(enum.IntFlag):
-    """Reasons not to use a wind; 0: valid."""
-
-    TOO_FEW_LINES = 1
-    """Fewer than three valid lines or than `MIN_FRACTION`, or lines in one plane."""
-    ILL_CONDITIONED = 2
-    """The lines hardly know one component: `MAX_CONDITION`."""
-    OUTLIERS = 4
-    """More than a third of the lines are outliers."""
-    ERROR_UNKNOWN = 8
-    """No residual and no stated noise tells the error."""
-    UNCERTAIN = 16
-    """The standard error of the horizontal wind is above `MAX_STDERR`."""
-    FOLDED = 32
-    """Velocities fold, and another wind would give the same ones."""
 
 
 @dataclass(eq=False)
@@ -74,23 +58,23 @@ def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr
     about : mapping
         Attributes of the lines of sight.
     """
-    heights = np.unique(np.round(np.concatenate([one.heights for one in profiles]), 2))
-    order = sorted(profiles, key=lambda one: one.time)
-    index = [np.searchsorted(heights, np.round(one.heights, 2)) for one in order]
+    heights = np.unique(np.round(np.concatenate([p.heights for p in profiles]), 2))
+    profiles = sorted(profiles, key=lambda p: p.time)
+    index = [np.searchsorted(heights, np.round(p.heights, 2)) for p in profiles]
 
     def full(values: Sequence[np.ndarray], missing: float = np.nan) -> np.ndarray:
-        found = np.full((len(order), heights.size), missing, np.asarray(values[0]).dtype)
-        for row, (places, one) in enumerate(zip(index, values, strict=True)):
-            found[row, places] = one
-        return found
+        table = np.full((len(profiles), heights.size), missing, np.asarray(values[0]).dtype)
+        for row, (levels, profile) in enumerate(zip(index, values, strict=True)):
+            table[row, levels] = profile
+        return table
 
-    wind = {n: full([one.wind[:, k] for one in order]) for k, n in enumerate(_COMPONENTS)}
+    wind = {n: full([p.wind[:, k] for p in profiles]) for k, n in enumerate(_COMPONENTS)}
     data: dict[str, Any] = {}
     for name, (standard, long_name) in _COMPONENTS.items():
         data[name] = _variable(wind[name], long_name, "m s-1", standard_name=standard)
     error = np.stack(
         [
-            np.stack([full([one.covariance[:, a, b] for one in order]) for b in range(3)], -1)
+            np.stack([full([p.covariance[:, a, b] for p in profiles]) for b in range(3)], -1)
             for a in range(3)
         ],
         -2,
@@ -104,10 +88,10 @@ def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr
             standard_name=f"{standard} standard_error",
         )
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        one, other = "uvw"[a], "uvw"[b]
-        data[f"{one}{other}_correlation"] = _variable(
+        first, second = "uvw"[a], "uvw"[b]
+        data[f"{first}{second}_correlation"] = _variable(
             error[..., a, b] / (stderr[..., a] * stderr[..., b]),
-            f"correlation of the errors of {one} and {other}",
+            f"correlation of the errors of {first} and {second}",
             "1",
         )
     speed = np.hypot(wind["u"], wind["v"])
@@ -125,31 +109,24 @@ def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr
         ("residual", "rms of the lines' residuals about a uniform wind", "m s-1"),
         ("condition", "condition number of the directions", "1"),
     ):
-        data[name] = _variable(full([getattr(one, name) for one in order]), long_name, unit)
+        data[name] = _variable(full([getattr(p, name) for p in profiles]), long_name, unit)
     for name, long_name in (
         ("dof", "degrees of freedom of the error"),
         ("lines", "lines used"),
         ("outliers", "lines left out as outliers"),
     ):
-        values = full([getattr(one, name) for one in order], 0).astype(np.int32)
+        values = full([getattr(p, name) for p in profiles], 0).astype(np.int32)
         data[name] = (("time", "height"), values, {"long_name": long_name, "units": "1"})
     missing = WindFlag.TOO_FEW_LINES.value
-    masks = np.array([one.value for one in WindFlag], np.uint16)
     data["flag"] = (
         ("time", "height"),
-        full([one.flag for one in order], missing).astype(np.uint16),
-        {
-            "long_name": "reasons not to use the wind, 0 = valid",
-            "standard_name": "quality_flag",
-            "flag_masks": masks,
-            "flag_values": masks,
-            "flag_meanings": " ".join(str(one.name).lower() for one in WindFlag),
-        },
+        full([p.flag for p in profiles], missing).astype(np.uint16),
+        flag_attributes(WindFlag, "reasons not to use the wind"),
     )
     coords = {
         "time": (
             "time",
-            np.array([one.time for one in order]).astype("datetime64[ns]"),
+            np.array([p.time for p in profiles]).astype("datetime64[ns]"),
             {"long_name": "mean time of the lines (UTC)", "axis": "T"},
         ),
         "height": (
@@ -158,16 +135,13 @@ def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr
             {"units": "m", "long_name": "height above the lidar", "axis": "Z", "positive": "up"},
         ),
     }
-    kept = {
-        name: about[name]
-        for name in ("instrument", "kind", "scan", "source", "remarks")
-        if name in about
-    }
-    found = xr.Dataset(
-        data, coords, {"Conventions": "CF-1.11", "title": "Winds from lines of sight", **kept}
+    names = "instrument", "kind", "scan", "source", "remarks"
+    attributes = {name: about[name] for name in names if name in about}
+    result = xr.Dataset(
+        data, coords, {"Conventions": "CF-1.11", "title": "Winds from lines of sight", **attributes}
     )
-    found["time"].encoding |= {"units": "seconds since 1970-01-01T00:00:00", "dtype": "float64"}
-    return found
+    result["time"].encoding |= {"units": "seconds since 1970-01-01T00:00:00", "dtype": "float64"}
+    return result
 
 
 def _variable(values: np.ndarray, long_name: str, units: str, **more: str) -> tuple[Any, ...]:

@@ -31,8 +31,8 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
     along = factor * scipy.special.kv(1 / 3, q)
     # f' = -factor K_2/3, as the derivative of q^n K_n is -q^n K_(n-1)
     across = along - q / 2 * factor * scipy.special.kv(2 / 3, q)
-    one = np.ones(1)
-    return np.concatenate([one, along]), np.concatenate([one, across])
+    unity = np.ones(1)
+    return np.concatenate([unity, along]), np.concatenate([unity, across])
 
 
 def _parts(
@@ -51,8 +51,8 @@ def of_lines(places: np.ndarray, directions: np.ndarray, length: float) -> np.nd
     Places are in m, as is the length of `correlations`; directions are unit vectors.
     """
     across, more, unit = _parts(places, places, length)
-    seen = np.einsum("ia,ija->ij", directions, unit)
-    return across * (directions @ directions.T) + more * seen * np.einsum(
+    radial = np.einsum("ia,ija->ij", directions, unit)
+    return across * (directions @ directions.T) + more * radial * np.einsum(
         "ja,ija->ij", directions, unit
     )
 
@@ -62,8 +62,8 @@ def with_average(
 ) -> np.ndarray:
     """Covariance (n, 3) of the wind along directions with its average over a path (m, 3)."""
     across, more, unit = _parts(path, places, length)
-    seen = more * np.einsum("ija,ja->ij", unit, directions)
-    return across.mean(0)[:, None] * directions + np.einsum("ij,ija->ja", seen, unit) / len(path)
+    radial = more * np.einsum("ija,ja->ij", unit, directions)
+    return across.mean(0)[:, None] * directions + np.einsum("ij,ija->ja", radial, unit) / len(path)
 
 
 def of_average(path: np.ndarray, length: float) -> np.ndarray:

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.flags import WindFlag
 from lidar_mi.retrieval.ground_winds.folding import ambiguous, unfolded
 from lidar_mi.retrieval.ground_winds.outliers import (
     LIMIT,
@@ -24,7 +25,6 @@ from lidar_mi.retrieval.ground_winds.profiles import (
     MAX_STDERR,
     MIN_FRACTION,
     Profile,
-    WindFlag,
     profile_dataset,
 )
 from lidar_mi.retrieval.ground_winds.source_name import source_name
@@ -109,13 +109,13 @@ def fit_winds_to_lines(
     remarks: list[str] = []
     tilt = unapplied_tilt(lines)
     for index in _scans(lines, interval):
-        one = lines.isel(time=index)
-        cells = _cells(one, usable[index], step)
+        scan = lines.isel(time=index)
+        cells = _cells(scan, usable[index], step)
         if cells is not None:
-            # small matrices
+            # matrices are small: threads would wait for each other
             with threadpool_limits(1, "blas"):
-                profiles.append(_profile(one, cells, stated[index], lengths, remarks))
-    if not any((one.condition < _IN_ONE_PLANE).any() for one in profiles):
+                profiles.append(_profile(scan, cells, stated[index], lengths, remarks))
+    if not any((profile.condition < _IN_ONE_PLANE).any() for profile in profiles):
         raise InputError(
             f"{source_name(lines)}: no height has three valid lines that are not in one plane "
             f"(scan: {lines.attrs.get('scan', 'unknown')}; {usable.sum()} of {usable.size} "
@@ -123,14 +123,14 @@ def fit_winds_to_lines(
         )
     if tilt > 0:
         for profile in profiles:
-            # its direction is not known
+            # the tilt's direction is unknown
             profile.covariance[:, 2, 2] += tilt**2 * (profile.wind[:, :2] ** 2).sum(1)
         remarks.append(
             f"pitch and roll of up to {np.rad2deg(tilt):.2f} degrees are not applied: the error of "
             "w contains them"
         )
-    said = [one for one in (lines.attrs.get("remarks", ""), *dict.fromkeys(remarks)) if one]
-    return profile_dataset(profiles, {**lines.attrs, "remarks": "\n".join(said)})
+    known_remarks = filter(None, (lines.attrs.get("remarks", ""), *dict.fromkeys(remarks)))
+    return profile_dataset(profiles, {**lines.attrs, "remarks": "\n".join(known_remarks)})
 
 
 def _check(
@@ -193,7 +193,7 @@ def _scans(lines: xr.Dataset, interval: float | None) -> Iterator[np.ndarray]:
 class _Cells:
     """Usable gates of a scan: line, gate and level of each, heights of the levels, their stride.
 
-    Levels that are one stride apart share no air; `all` is how many gates a level has, usable or
+    Levels that are one stride apart share no air; `all` is the number of a level's gates, usable or
     not.
     """
 
@@ -208,9 +208,9 @@ class _Cells:
 def _cells(scan: xr.Dataset, usable: np.ndarray, step: float | None) -> _Cells | None:
     if usable.sum() < 3:
         return None
-    # gates above and below are no levels
-    there = np.isfinite(scan["radial_velocity"].values) & usable.any(0)
-    line, gate = np.nonzero(there)
+    # gates beyond the usable ones form no levels
+    present = np.isfinite(scan["radial_velocity"].values) & usable.any(0)
+    line, gate = np.nonzero(present)
     sine = np.sin(np.deg2rad(scan["elevation"].values))
     ranges = scan["range"].values
     height = ranges[gate] * sine[line]
@@ -220,13 +220,13 @@ def _cells(scan: xr.Dataset, usable: np.ndarray, step: float | None) -> _Cells |
     else:
         number, level = np.unique(np.round(height / step).astype(int), return_inverse=True)
         heights = number * step
-    apart = np.median(np.diff(heights)) if heights.size > 1 else np.inf
+    spacing = np.median(np.diff(heights)) if heights.size > 1 else np.inf
     length = float(scan.attrs.get("gate_length", 0.0)) * float(sine.max())
-    # at most the whole profile: also where the file's length of a gate makes no sense
-    stride = int(np.clip(math.ceil(length / apart - 0.1), 1, heights.size))
+    # at most the whole profile, whatever gate length the file states
+    stride = int(np.clip(math.ceil(length / spacing - 0.1), 1, heights.size))
     level, count = level.ravel(), np.bincount(level.ravel())
-    kept = usable[line, gate]
-    return _Cells(line[kept], gate[kept], level[kept], heights, count, stride)
+    used = usable[line, gate]
+    return _Cells(line[used], gate[used], level[used], heights, count, stride)
 
 
 def _profile(
@@ -246,11 +246,10 @@ def _profile(
         ],
         axis=-1,
     )
-    # of all usable cells
     velocity = scan["radial_velocity"].values.astype(float)[cells.line, cells.gate]
     seconds = (scan["time"].values - scan["time"].values[0]) / np.timedelta64(1, "s")
     count = cells.heights.size
-    found = Profile(
+    profile = Profile(
         scan["time"].values[0] + np.timedelta64(round(1e9 * seconds.mean()), "ns"),
         cells.heights,
         np.full((count, 3), np.nan),
@@ -269,41 +268,41 @@ def _profile(
             f"velocities fold at {folding.interval / 2:.1f} m/s: {count} of {velocity.size} are "
             "unfolded"
         )
-    keep = _kept(members, design[cells.line], velocity, cells.stride)
+    keep = _inliers(members, design[cells.line], velocity, cells.stride)
     levels: dict[int, tuple[Level, float]] = {}
     for k, index in enumerate(members):
         used = index[keep[index]]
-        found.lines[k], found.outliers[k] = used.size, index.size - used.size
-        if found.outliers[k] > index.size / 3:
-            found.flag[k] |= WindFlag.OUTLIERS.value
+        profile.lines[k], profile.outliers[k] = used.size, index.size - used.size
+        if profile.outliers[k] > index.size / 3:
+            profile.flag[k] |= WindFlag.OUTLIERS.value
         line, gate = cells.line[used], cells.gate[used]
         ranges = scan["range"].values[gate]
-        found.condition[k] = _condition(design[line])
-        if not found.condition[k] < _IN_ONE_PLANE or index.size < MIN_FRACTION * cells.all[k]:
-            found.flag[k] |= WindFlag.TOO_FEW_LINES.value
+        profile.condition[k] = _condition(design[line])
+        if not profile.condition[k] < _IN_ONE_PLANE or index.size < MIN_FRACTION * cells.all[k]:
+            profile.flag[k] |= WindFlag.TOO_FEW_LINES.value
             continue
-        if found.condition[k] > MAX_CONDITION:
-            found.flag[k] |= WindFlag.ILL_CONDITIONED.value
-        here, noise = design[line], stated[line, gate]
+        if profile.condition[k] > MAX_CONDITION:
+            profile.flag[k] |= WindFlag.ILL_CONDITIONED.value
+        directions, noise = design[line], stated[line, gate]
         speed = velocity[used]
-        uniform, *_ = np.linalg.lstsq(here, speed, rcond=None)
+        uniform, *_ = np.linalg.lstsq(directions, speed, rcond=None)
         if used.size > 3:
-            left = speed - here @ uniform
-            found.residual[k] = math.sqrt(float(left @ left) / (used.size - 3))
+            residual = speed - directions @ uniform
+            profile.residual[k] = math.sqrt(float(residual @ residual) / (used.size - 3))
         moved = np.outer(seconds[line] - seconds.mean(), [uniform[0], uniform[1], 0.0])
-        if ambiguous(here, uniform, nyquist):
-            found.flag[k] |= WindFlag.FOLDED.value
-        places = here * ranges[:, None] - moved
-        levels[k] = _level(here, places, speed, noise)
-        found.wind[k] = uniform
-    _add_errors(found, levels, cells.stride, lengths)
+        if ambiguous(directions, uniform, nyquist):
+            profile.flag[k] |= WindFlag.FOLDED.value
+        places = directions * ranges[:, None] - moved
+        levels[k] = _level(directions, places, speed, noise)
+        profile.wind[k] = uniform
+    _add_errors(profile, levels, cells.stride, lengths)
     if folding is not None and folding.variance > 0:
         for k in levels:
             used = members[k][keep[members[k]]]
-            found.covariance[k] += folding.wind_error(used, design[cells.line[used]])
-    variance = found.covariance[:, 0, 0] + found.covariance[:, 1, 1]
-    found.flag[variance > MAX_STDERR**2] |= WindFlag.UNCERTAIN.value
-    return found
+            profile.covariance[k] += folding.wind_error(used, design[cells.line[used]])
+    variance = profile.covariance[:, 0, 0] + profile.covariance[:, 1, 1]
+    profile.flag[variance > MAX_STDERR**2] |= WindFlag.UNCERTAIN.value
+    return profile
 
 
 def _nyquist(scan: xr.Dataset) -> float | None:
@@ -312,14 +311,14 @@ def _nyquist(scan: xr.Dataset) -> float | None:
     return float(stated) if isinstance(stated, int | float) and stated > 0 else None
 
 
-def _kept(
+def _inliers(
     members: Sequence[np.ndarray], design: np.ndarray, velocity: np.ndarray, stride: int
 ) -> np.ndarray:
     """Which gates are no outliers: `LIMIT` times the spread of the levels around."""
-    left, count = np.zeros(len(velocity)), np.zeros(len(velocity))
+    residual, count = np.zeros(len(velocity)), np.zeros(len(velocity))
     for index in members:
         if index.size >= 5:
-            left[index] = residuals(design[index], velocity[index])
+            residual[index] = residuals(design[index], velocity[index])
             count[index] = index.size
     tried = [k for k, index in enumerate(members) if index.size >= 5]
     around = {}
@@ -328,19 +327,19 @@ def _kept(
         around[k] = near[count[near] > 0]
     keep, size = np.ones(len(velocity), bool), np.ones(len(velocity))
     for k in tried:
-        limit = LIMIT * max(spread_of_best(left[around[k]], count[around[k]]), _LEAST_SPREAD)
-        keep[members[k]] = np.abs(left[members[k]]) <= limit
-    # the fit of three lines is poor: by the wind of all that are kept, more may be
+        limit = LIMIT * max(spread_of_best(residual[around[k]], count[around[k]]), _LEAST_SPREAD)
+        keep[members[k]] = np.abs(residual[members[k]]) <= limit
+    # the fit of three lines is poor: the wind of all that are kept may accept more
     for _ in range(_ROUNDS):
         before = keep.copy()
         refit = [k for k in tried if before[members[k]].sum() >= 4]
         for k in refit:
             index = members[k]
-            left[index], size[index] = refitted(design[index], velocity[index], before[index])
+            residual[index], size[index] = refitted(design[index], velocity[index], before[index])
         for k in refit:
             near = around[k][before[around[k]]]
-            limit = LIMIT * max(spread(left[near] / size[near]), _LEAST_SPREAD)
-            keep[members[k]] = np.abs(left[members[k]]) <= limit * size[members[k]]
+            limit = LIMIT * max(spread(residual[near] / size[near]), _LEAST_SPREAD)
+            keep[members[k]] = np.abs(residual[members[k]]) <= limit * size[members[k]]
         if (keep == before).all():
             break
     return keep
@@ -370,37 +369,37 @@ def _level(
     path = along(places)
     steep, azimuth = np.round(20 * design[:, 2]), np.arctan2(design[:, 0], design[:, 1])
     order = np.lexsort((azimuth, steep))
-    design, places, velocity, noise = (one[order] for one in (design, places, velocity, noise))
-    many = math.ceil(len(velocity) / _MOST_LINES)
-    # of very many lines, neighbours are one line
-    every = Level(design, places, path, np.arange(0, len(velocity), many), velocity, noise)
-    design, places, velocity = (every.averaged(one) for one in (design, places, velocity))
+    design, places, velocity, noise = (array[order] for array in (design, places, velocity, noise))
+    grouped = math.ceil(len(velocity) / _MOST_LINES)
+    # neighbours among very many lines are averaged
+    every = Level(design, places, path, np.arange(0, len(velocity), grouped), velocity, noise)
+    design, places, velocity = (every.averaged(array) for array in (design, places, velocity))
     size = math.ceil(len(velocity) / _MOST)
     starts = np.arange(0, len(velocity), size)
     level = Level(design, places, path, starts, velocity, noise)
     weights = np.where(np.isfinite(noise), noise, 1.0)
     counts = np.diff(np.append(starts, len(velocity)))
-    variance = level.averaged(every.averaged(weights)) / counts / many
+    variance = level.averaged(every.averaged(weights)) / counts / grouped
     known = float(variance.mean()) if np.isfinite(noise).all() else math.nan
     noise = variance / variance.mean()
     return Level(design, places, path, starts, level.averaged(velocity), noise), known
 
 
 def _add_errors(
-    found: Profile, levels: dict[int, tuple[Level, float]], stride: int, lengths: Sequence[float]
+    profile: Profile, levels: dict[int, tuple[Level, float]], stride: int, lengths: Sequence[float]
 ) -> None:
     """Winds and covariances, in blocks of levels that share their turbulence but no gate."""
     for offset in range(stride):
         column = [k for k in sorted(levels) if k % stride == offset]
         for start in range(0, len(column), _BLOCK):
             block = column[start : start + _BLOCK]
-            # a rest of one or two has too few lines of its own
+            # one or two levels have too few lines for statistics of their own
             around = column[-_BLOCK:] if len(block) < 3 else block
-            _block(found, levels, block, around, lengths)
+            _block(profile, levels, block, around, lengths)
 
 
 def _block(
-    found: Profile,
+    profile: Profile,
     levels: dict[int, tuple[Level, float]],
     block: Sequence[int],
     around: Sequence[int],
@@ -411,13 +410,13 @@ def _block(
     known = float(np.mean(noise)) if np.isfinite(noise).all() else 0.0
     shared = evidence([levels[k][0] for k in around], lengths, known) if dof > 2 else None
     for k in block:
-        level, own = levels[k]
+        level, level_noise = levels[k]
         if shared is not None:
-            found.wind[k], found.covariance[k] = mean_wind(level, shared, lengths)
-            found.dof[k] = shared.dof
-        elif math.isfinite(own):
+            profile.wind[k], profile.covariance[k] = mean_wind(level, shared, lengths)
+            profile.dof[k] = shared.dof
+        elif math.isfinite(level_noise):
             means = level.averaged(level.design)
-            weight = means / (level.noise * own)[:, None]
-            found.covariance[k] = np.linalg.inv(weight.T @ means)
+            weight = means / (level.noise * level_noise)[:, None]
+            profile.covariance[k] = np.linalg.inv(weight.T @ means)
         else:
-            found.flag[k] |= WindFlag.ERROR_UNKNOWN.value
+            profile.flag[k] |= WindFlag.ERROR_UNKNOWN.value

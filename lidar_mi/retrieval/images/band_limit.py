@@ -51,12 +51,12 @@ class Filter(NamedTuple):
     noisy_slopes: float
 
     def of_values(self) -> "Filter":
-        """That of the differences alone."""
+        """The filter of the differences alone."""
         passed = self.passed if self.values is self.gain else 1.0
         return self._replace(gain=self.values, passed=passed)
 
     def of_slopes(self) -> "Filter":
-        """That of the slopes alone."""
+        """The filter of the slopes alone."""
         return self._replace(gain=self.slopes)
 
     def to(self, like: torch.Tensor) -> "Filter":
@@ -148,10 +148,10 @@ def best_filter(
     values, slopes = (gain, gain) if blur else (white.sqrt(), response * white.sqrt())
     # power of the filtered slopes with noise, the part of it from texture, and its variance
     # the mean of two images has half the variance of their noise
-    both = texture + floor / 2
+    noisy = texture + floor / 2
     steep = radius**2 * gain[shell] ** 2
     power, informed, spread = (
-        float((steep * spectrum[shell]).sum()) for spectrum in (both, texture, response * both)
+        float((steep * spectrum[shell]).sum()) for spectrum in (noisy, texture, response * noisy)
     )
     return Filter(
         gain,
@@ -219,7 +219,7 @@ def flat_if_better(
 
 
 def _mean(values: torch.Tensor, sizes: Sequence[int]) -> float:
-    """Over all waves, of values at those of a real Fourier transform."""
+    """Mean over all waves of values at those of a real Fourier transform."""
     # all but the first column stand for two waves
     return float(values[..., :1].sum() + 2 * values[..., 1:].sum()) / math.prod(sizes)
 
@@ -296,7 +296,7 @@ def shell_means(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Power spectrum by shells of wavenumber, mean over the images; white noise gives its variance.
 
-    So it does where only some pixels are `known`, (images, ...), and the others are the mean.
+    This holds also where only some pixels are `known`, (images, ...), and the others are the mean.
 
     Each shell's value is a mean over `smoothing` neighbours. Returns these means and their
     relative standard errors.

@@ -58,7 +58,7 @@ def checked_times(
             f"times: {len(times)} for {len(images)} images are not allowed; expected those of two "
             "images"
         )
-    found = []
+    pixel_times = []
     for number, (time, image) in enumerate(zip(times, images, strict=True)):
         name = f"times[{number}]"
         time = checked_image(name, time)
@@ -70,16 +70,16 @@ def checked_times(
                 f"{name}: {without or values.size} pixels are not finite; expected a time in s for "
                 "every pixel that has a value"
             )
-        found.append(values)
-    delay = dt + found[1] - found[0]
+        pixel_times.append(values)
+    delay = dt + pixel_times[1] - pixel_times[0]
     if np.nanmin(delay, initial=np.inf) <= 0:
         raise InputError(
             f"times: dt = {dt:g} s is not allowed, as a pixel is seen {np.nanmin(delay):g} s after "
             "the first scan saw it; expected more than 0 s"
         )
-    if not any(np.nan_to_num(values).any() for values in found):
+    if not any(np.nan_to_num(values).any() for values in pixel_times):
         return None
-    return [nearest_filled(values) for values in found]
+    return [nearest_filled(values) for values in pixel_times]
 
 
 def vector_times(

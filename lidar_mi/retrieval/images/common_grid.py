@@ -118,13 +118,13 @@ def _around_gaps(image: xr.DataArray, nodes: dict[str, np.ndarray]) -> xr.DataAr
     gap = ~np.isfinite(image.values)
     if not gap.any():
         return resample(image, nodes["y"], nodes["z"])
-    found = resample(image.copy(data=nearest_filled(image.values)), nodes["y"], nodes["z"])
+    resampled = resample(image.copy(data=nearest_filled(image.values)), nodes["y"], nodes["z"])
     gap_fraction = RegularGridInterpolator(
         [_axis(image, str(dim))[1] for dim in image.dims], gap.astype(float), bounds_error=False
     )
     at = np.meshgrid(*(nodes[str(dim)] for dim in image.dims), indexing="ij")
     free = xr.DataArray(~(gap_fraction(np.stack(at, -1)) > 1e-6), dims=image.dims)
-    return found.where(free.transpose("z", "y").values)
+    return resampled.where(free.transpose("z", "y").values)
 
 
 @checked_arguments
@@ -168,7 +168,7 @@ def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArra
 
 
 def all_on_one_grid(images: Sequence[xr.DataArray]) -> list[xr.DataArray]:
-    """A sequence of images, two or more, as `on_one_grid` has two; messages count from 1."""
+    """`on_one_grid` for a sequence of two or more images; messages count from 1."""
     for number, image in enumerate(images, 1):
         on_axes = {"z", "y"} == set(image.dims) <= set(image.coords)
         if not on_axes or image.ndim != 2 or min(image.shape) < 2:
@@ -205,12 +205,12 @@ def _axis(image: xr.DataArray, name: str) -> tuple[str, np.ndarray]:
         grid = coordinate.values.astype(float)
         spans = [np.ptp(grid, axis=axis).max() for axis in (0, 1)]
         along = int(spans[1] > spans[0])
-        dim, other = coordinate.dims[along], coordinate.dims[1 - along]
+        dim, other_dim = coordinate.dims[along], coordinate.dims[1 - along]
         values = grid.mean(axis=1 - along)
         if not spans[1 - along] <= 1e-3 * spans[along] / max(len(values) - 1, 1):
             raise InputError(
                 f"image.{name}: varies along both dims; only separable grids can be resampled "
-                f"({name} constant along {other!r} to 0.1 % of the spacing)"
+                f"({name} constant along {other_dim!r} to 0.1 % of the spacing)"
             )
     else:
         raise InputError(f"image.{name}: {coordinate.ndim} dims; one or two are allowed")

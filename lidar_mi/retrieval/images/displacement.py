@@ -22,7 +22,7 @@ class Displacement(NamedTuple):
     score : torch.Tensor
         How well the windows match: correlation or mismatch, depending on the method.
     flag : torch.Tensor of int16
-        `quality.Flag` bits.
+        `flags.Flag` bits.
     covariance : torch.Tensor, shape (components, components, *windows.count), optional
         Of the components' errors, px^2, from methods that give it.
     quantities : mapping, optional
@@ -49,7 +49,7 @@ class Displacement(NamedTuple):
         return self.d[-1]
 
     def medians(self) -> "Displacement":
-        """Of 3 vectors along each axis, without chance peaks; NaN where no vector is known."""
+        """Medians of 3 vectors along each axis; NaN where no vector is known."""
         dims = len(self.d)
         around = pad(self.d, (1, 1) * dims, value=torch.nan)
         for axis in range(1, dims + 1):

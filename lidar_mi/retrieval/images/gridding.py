@@ -44,13 +44,11 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
     a linear trend: Matheron 1963, Econ. Geol. 58, 1246-1266; Cressie 1993, Statistics for Spatial
     Data, sect. 3.4) for a structure of Gaussian covariance of 1.5 spacings. It passes through the
     beams' values and is exact for fields linear in place. Standard errors follow from the same
-    weights and independent errors of the beams; those of neighbouring nodes are correlated
-    afterwards. What the weights leave of the structure of `Y` and `Y_noisy` becomes
-    `Y_resampling_std` and `Y_noisy_resampling_std`, see `resampling_error`: the white noise that
-    counts as much as these errors, which are correlated between nodes. So does what nodes share of
-    the beams' noise. The `beam_time` is averaged
-    with the same weights, and is within those of the scan: where beams next to each other have
-    very different times, a node's value mixes times (see `one_instant`).
+    weights and independent errors of the beams. The kriging error of `Y` and `Y_noisy`, and the
+    noise that neighbouring nodes share, become `Y_resampling_std` and `Y_noisy_resampling_std`:
+    the white noise of the same weight as these correlated errors, see `resampling_error`. The
+    `beam_time` is averaged with the same weights, within the times of the scan; where beams next
+    to each other have very different times, a node's value mixes times (see `synchronised`).
 
     Parameters
     ----------
@@ -80,42 +78,44 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
                 f"{axis}_reported: {int((~np.isfinite(values)).sum())} beams are not finite; "
                 "expected a place in m for every beam"
             )
-    own = np.meshgrid(*(scan[axis].values.astype(float) for axis in "zy"), indexing="ij")
+    grid = np.meshgrid(*(scan[axis].values.astype(float) for axis in "zy"), indexing="ij")
     places, nodes = (
-        np.stack([part.ravel() / (step or 1.0) for part, step in zip(both, steps, strict=True)], -1)
-        for both in (reported, own)
+        np.stack([part.ravel() / (step or 1.0) for part, step in zip(axes, steps, strict=True)], -1)
+        for axes in (reported, grid)
     )
-    rest = scan.drop_vars(["y_reported", "z_reported"])
+    gridded = scan.drop_vars(["y_reported", "z_reported"])
     off = np.abs(places - nodes).max(1) > _ON_NODE
     if not off.any():
-        return rest
+        return gridded
     if len(places) < 3:
         raise InputError(f"y_reported: {len(places)} beams are not allowed; expected at least 3")
     inside = _inside(places, nodes)
     changed = np.flatnonzero(off & inside)
     weights = _weights(places, nodes[changed])
-    images = [name for name in _IMAGES if name in rest and rest[name].ndim == 2]
+    images = [name for name in _IMAGES if name in gridded and gridded[name].ndim == 2]
     for name in images if errors else []:
-        rest[f"{name}_resampling_std"] = _resampling_error(
-            rest, name, places, nodes, changed, weights
+        gridded[f"{name}_resampling_std"] = _resampling_error(
+            gridded, name, places, nodes, changed, weights
         )
-    for name in [str(n) for n in rest.data_vars if {"z", "y"} <= set(rest[n].dims)]:
-        field = rest[name].transpose(..., "z", "y")
+    for name in [str(n) for n in gridded.data_vars if {"z", "y"} <= set(gridded[n].dims)]:
+        field = gridded[name].transpose(..., "z", "y")
         values = field.values.reshape(-1, len(nodes))
-        found = values.astype(values.dtype if values.dtype.kind == "f" else float)
+        at_nodes = values.astype(values.dtype if values.dtype.kind == "f" else float)
         if name.endswith("_resampling_std"):
-            found[:, ~inside] = np.nan
-            rest[name] = field.copy(data=found.reshape(field.shape))
+            at_nodes[:, ~inside] = np.nan
+            gridded[name] = field.copy(data=at_nodes.reshape(field.shape))
             continue
         if _ERRORS.fullmatch(name):
-            found[:, changed] = np.sqrt(weights.power(2) @ values.T.astype(float) ** 2).T
+            at_nodes[:, changed] = np.sqrt(weights.power(2) @ values.T.astype(float) ** 2).T
         else:
-            found[:, changed] = (weights @ values.T.astype(float)).T
+            at_nodes[:, changed] = (weights @ values.T.astype(float)).T
         if name == "beam_time":  # a mean whose weights may be negative
-            found = found.clip(values.min(), values.max())
-        found[:, ~inside] = np.nan
-        rest[name] = field.copy(data=found.reshape(field.shape)).transpose(*rest[name].dims)
-    return rest
+            at_nodes = at_nodes.clip(values.min(), values.max())
+        at_nodes[:, ~inside] = np.nan
+        gridded[name] = field.copy(data=at_nodes.reshape(field.shape)).transpose(
+            *gridded[name].dims
+        )
+    return gridded
 
 
 def _resampling_error(
@@ -128,8 +128,8 @@ def _resampling_error(
 ) -> xr.DataArray:
     """Standard deviation of what resampling adds to an image's white noise, of its nodes.
 
-    What the weights leave of the structure, and the sums of the noise's covariances with all other
-    nodes: sums of pixels vary by these, whatever the correlation.
+    It is the kriging error of the structure, plus the noise's covariances with all other nodes, by
+    which sums of pixels vary.
     """
     image = scan[name].transpose("z", "y")
     values = image.values.ravel().astype(float)
@@ -151,9 +151,9 @@ def _resampling_error(
         error[changed[part]] = variance(structure(speed), factors[part], from_node, when[part])
     error[changed] *= strength_at(errors, nodes[changed])
     error[changed] *= correlation_area(places, nodes[changed])
-    # what a node's noise shares with that of its neighbours, beyond its own
+    # covariance of a node's noise with that of the other nodes
     shared = weights @ weights.sum(0) - weights.power(2).sum(1)
-    # of sums, as the scatter from node to node is as often negative
+    # a local mean, as single nodes may have a negative sum
     _, around = KDTree(nodes[changed]).query(nodes[changed], min(_BEAMS, len(changed)))
     shared = shared[around].reshape(len(changed), -1).mean(1)
     error[changed] += errors.noise * np.clip(shared, 0.0, None)
@@ -181,18 +181,18 @@ def _leave_one_out(
 
 
 def _weights(places: np.ndarray, nodes: np.ndarray) -> csr_array:
-    """Of every beam for the value at every node, (nodes, beams); places in spacings."""
+    """Weight of every beam in the value at every node, (nodes, beams); places in spacings."""
     beams = min(_BEAMS, len(places))
     _, near = KDTree(places).query(nodes, beams)
-    found = _weights_of(places, nodes, near.reshape(len(nodes), beams))
+    weights = _weights_of(places, nodes, near.reshape(len(nodes), beams))
     first = np.arange(len(nodes) + 1) * beams
-    return csr_array((found.ravel(), near.ravel(), first), shape=(len(nodes), len(places)))
+    return csr_array((weights.ravel(), near.ravel(), first), shape=(len(nodes), len(places)))
 
 
 def _weights_of(places: np.ndarray, nodes: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Of the beams of numbers near (nodes, beams), for the value at every node."""
+    """Weights of the beams `near` (nodes, beams) in the value at every node."""
     beams = near.shape[1]
-    found = np.zeros(near.shape)
+    weights = np.zeros(near.shape)
     for start in range(0, len(nodes), _CHUNK):
         chosen = slice(start, start + _CHUNK)
         from_node = places[near[chosen]] - nodes[chosen][:, None]
@@ -205,12 +205,12 @@ def _weights_of(places: np.ndarray, nodes: np.ndarray, near: np.ndarray) -> np.n
         matrix[:, [-2, -1], [-2, -1]] = -_SLOPE
         right = np.zeros((len(from_node), beams + 3))
         right[:, :beams], right[:, beams] = _covariance(from_node), 1.0
-        found[chosen] = np.linalg.solve(matrix, right[..., None])[:, :beams, 0]
-    return found
+        weights[chosen] = np.linalg.solve(matrix, right[..., None])[:, :beams, 0]
+    return weights
 
 
 def _covariance(separation: np.ndarray) -> np.ndarray:
-    """Of the structure at two places, by their distance (..., 2) in spacings."""
+    """Covariance of the structure at a distance (..., 2) in spacings."""
     return np.exp(-0.5 * (separation**2).sum(-1) / _LENGTH**2)
 
 

@@ -1,4 +1,4 @@
-"""Values for pixels that are not known, for filters alone: the smoothest ones."""
+"""The smoothest values for unknown pixels, used by filters only."""
 
 from collections.abc import Callable
 
@@ -18,22 +18,22 @@ _TENSION = 0.1
 
 
 def inpainted(values: np.ndarray) -> np.ndarray:
-    """Values with smooth ones in place of those that are not finite.
+    """Values with smooth ones in place of non-finite ones.
 
-    These minimise the sum of the squared second differences along the axes and, so that slopes do
-    not go on for long, of a tenth of the squared first ones: a thin plate under tension (Smith &
-    Wessel 1990, Geophysics 55, 293-305). Steps to any constant would be structure at rest. Beyond
-    8 px from the known ones they are constant. Some value must be finite.
+    They minimise the squared second differences along the axes plus a tenth of the squared first
+    ones, which makes slopes fade: a thin plate under tension (Smith & Wessel 1990, Geophysics 55,
+    293-305). Steps to any constant would be structure at rest. Beyond 8 px from the known ones they
+    are constant. Some value must be finite.
     """
     missing = ~np.isfinite(values)
     distance, nearest = distance_transform_edt(missing, return_indices=True)
-    found = values[tuple(nearest)]
+    filled = values[tuple(nearest)]
     unknown = missing & (distance <= _REACH)
     number = np.full(values.shape, -1)
     number[unknown] = np.arange(np.count_nonzero(unknown))
     matrices, rights = [], []
     for axis in range(values.ndim):
-        along, known = np.moveaxis(number, axis, 0), np.moveaxis(found, axis, 0)
+        along, known = np.moveaxis(number, axis, 0), np.moveaxis(filled, axis, 0)
         for stencil in (np.array([1.0, -2.0, 1.0]), np.sqrt(_TENSION) * np.array([-1.0, 1.0])):
             length = len(along) - len(stencil) + 1
             if length < 1:
@@ -52,26 +52,26 @@ def inpainted(values: np.ndarray) -> np.ndarray:
             matrices.append(sparse.csr_matrix((data, (row, column)), shape=shape))
             rights.append(right)
     matrix, right = sparse.vstack(matrices).tocsr(), np.concatenate(rights)
-    found = found.astype(float, copy=True)
-    found[unknown] = spsolve((matrix.T @ matrix).tocsc(), matrix.T @ right)
-    return found
+    filled = filled.astype(float, copy=True)
+    filled[unknown] = spsolve((matrix.T @ matrix).tocsc(), matrix.T @ right)
+    return filled
 
 
 def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.Tensor:
     """An image `inpainted`, all of it or only where some pixels are.
 
-    As it is if it is finite all over, or nowhere.
+    Unchanged if it is finite everywhere; zero if nowhere.
     """
-    smooth = _of_known(image, inpainted)
+    smooth = _replaced(image, inpainted)
     return smooth if pixels is None else torch.where(pixels, smooth, image)
 
 
 def nearest_in(image: torch.Tensor) -> torch.Tensor:
     """An image with the value of the nearest finite pixel where one is not."""
-    return _of_known(image, nearest_filled)
+    return _replaced(image, nearest_filled)
 
 
-def _of_known(image: torch.Tensor, fill: Callable[[np.ndarray], np.ndarray]) -> torch.Tensor:
+def _replaced(image: torch.Tensor, fill: Callable[[np.ndarray], np.ndarray]) -> torch.Tensor:
     finite = torch.isfinite(image)
     if bool(finite.all()):
         return image

@@ -1,4 +1,4 @@
-"""Equal brightness of images of the same air: over the whole, and over what is valid in all."""
+"""Equal brightness of images of the same air: over the whole, and over pixels valid in all."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from lidar_mi.retrieval.images.windows import stored, working
 
 
 def normalised(images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Images of one texture but unlike brightness: all with mean 0 and the first one's contrast.
+    """Images of different brightness, brought to mean 0 and the first one's contrast.
 
     Non-finite pixels are NaN.
     """

@@ -50,7 +50,7 @@ def variance_of_residual(
 ) -> torch.Tensor:
     """Variance of the difference of two matched images by place, over its mean.
 
-    s q + 1 - s: a share s of the residual's mean square is noise and varies as it does, with the
+    s q + 1 - s: a fraction s of the residual's mean square is noise and varies as it does, with the
     relative variance q. The rest, such as motion that a match does not resolve, does not follow the
     map. s is twice the noise's mean square, that of two images, over the residual's, at most 1.
 
@@ -68,5 +68,5 @@ def variance_of_residual(
     if noise is None or not bool(use.any()):
         return relative
     whole = float(residual[use].square().mean())
-    share = min(1.0, 2 * rms(noise) ** 2 / whole) if whole > 0 else 1.0
-    return share * relative + 1 - share
+    fraction = min(1.0, 2 * rms(noise) ** 2 / whole) if whole > 0 else 1.0
+    return fraction * relative + 1 - fraction

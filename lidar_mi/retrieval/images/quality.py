@@ -1,6 +1,5 @@
 """The quality of a displacement vector: flags, the texture of its window, its uncertainty."""
 
-import enum
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,48 +9,9 @@ from scipy.special import chdtri
 from torch.nn.functional import max_pool2d, max_pool3d
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.windows import Windows, working
 from lidar_mi.retrieval.symmetric import eigenvalues, largest_eigenvalue
-
-
-class Flag(enum.IntFlag):
-    """Why a vector is rejected, one bit per reason; 0 is a valid vector.
-
-    Names and values become the CF attributes `flag_meanings` and `flag_masks`.
-    """
-
-    PEAK_ON_RIM = 1
-    """Best match on the rim of the search range: the true one may lie outside. No displacement."""
-    LOW_CORRELATION = 2
-    """Correlation at the peak below the threshold (cross-correlation only)."""
-    LOW_TEXTURE = 4
-    """The template has too little structure in at least one direction (aperture problem)."""
-    MEDIAN_OUTLIER = 8
-    """Fails the normalised median test against its neighbours."""
-    NO_SUBPIXEL_FIT = 16
-    """A neighbour of the peak is not positive: the displacement is an integer."""
-    NON_FINITE_INPUT = 32
-    """NaN or infinity in the search region of one of the images. No displacement."""
-    NO_MATCH = 64
-    """No candidate could be compared (no contrast, no positive weight). No displacement."""
-    REPLACED = 128
-    """The previous pass found an outlier; this one began at its neighbours' median (multi-pass)."""
-    UNRELATED = 256
-    """The images around it correlate no better than unrelated textures (`relation`)."""
-    SATURATED = 512
-    """The template holds a saturated area at rest, or is saturated by a quarter (`rest`)."""
-    AT_REST = 1024
-    """Structure at rest or stray pixels in the template, or a pattern spoils all (`rest`).
-
-    Or one of the images is the one before it, bit for bit."""
-    NO_SKILL = 2048
-    """The standard error approaches the wind's own spread."""
-    RESAMPLED = 4096
-    """What resampling of scattered beams lost exceeds the noise (`resampling_error`)."""
-    ERROR_UNKNOWN = 8192
-    """Too few valid vectors around it, or too few clearly textured, to state one (`bootstrap`)."""
-    OTHER_MOTION = 16384
-    """Another displacement explains the images around it better (`other_motions`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:
@@ -63,9 +23,9 @@ def check_between(name: str, value: float, low: float, high: float) -> None:
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
 # noise: (1/2) from the difference times (1 + 4 + 1) / 16 from the smoothing across it.
 _SOBEL_NOISE = 3 / 16
-# By which texture exceeds its thresholds that exceeds them clearly.
+# Factor by which clear texture exceeds its thresholds.
 _MARGIN = 1.5
-# Standard error, px, that is no reason to reject a vector in any wind.
+# Standard error, px, up to which no vector is rejected.
 SMALL = 0.05
 
 
@@ -114,10 +74,10 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
     squares = eigenvalues(along_y, across, along_z)
     weakest, strongest = (square.clamp(min=0).sqrt() for square in squares)
     mean = windows.of_templates(image)
-    some = weakest > 0
+    textured = weakest > 0
     return Texture(
-        torch.where(some, weakest / mean.abs(), 0.0),
-        torch.where(some, weakest / strongest, 0.0),
+        torch.where(textured, weakest / mean.abs(), 0.0),
+        torch.where(textured, weakest / strongest, 0.0),
         mean,
     )
 
@@ -146,7 +106,7 @@ def low_texture(
         raise InputError(f"min_texture: {min_texture!r} px^-1 is not >= 0")
     check_between("min_isotropy", min_isotropy, 0, 1)
     image = working(image)
-    found = texture(image, windows)
+    textures = texture(image, windows)
     sigma = torch.as_tensor(noise, dtype=image.dtype, device=image.device)
     if sigma.ndim and sigma.shape != image.shape:
         raise InputError(
@@ -156,13 +116,13 @@ def low_texture(
     if not bool((sigma >= 0).all()):
         raise InputError("noise: not a standard deviation >= 0 everywhere")
     variance = windows.of_templates((sigma**2).expand_as(image))
-    squared = (found.slope * found.mean) ** 2
+    squared = (textures.slope * textures.mean) ** 2
     low = (
-        (found.slope <= min_texture)
-        | (found.isotropy < min_isotropy)
+        (textures.slope <= min_texture)
+        | (textures.isotropy < min_isotropy)
         | (squared < 2 * _SOBEL_NOISE * variance)
     )
-    return found, low
+    return textures, low
 
 
 def clearly_textured(
@@ -204,9 +164,9 @@ def of_bootstrap(covariance: torch.Tensor) -> torch.Tensor:
 def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """Where a displacement's variance is above a quarter of the variance of all about their mean.
 
-    Means over the components of d (components, ...) and covariance (components, components, ...).
-    Everywhere where that holds of the median variance of all. An error below 0.05 px is small for
-    any wind: in uniform wind no error is small compared with its spread.
+    Variances are means over the components of d (components, ...) and covariance (components,
+    components, ...). All have no skill where the median variance has none. Errors below 0.05 px
+    always have skill, as in uniform wind every error exceeds the spread.
     """
     known = covariance.isfinite().all(0).all(0) & d.isfinite().all(0)
     if not bool(known.any()):
@@ -227,8 +187,8 @@ def worst_variance(covariance: torch.Tensor) -> torch.Tensor:
 def misfit_variance(misfit: torch.Tensor, valid: torch.Tensor, number: int) -> torch.Tensor:
     """Variance of white noise from its sums of squares about the mean of `number` values each.
 
-    The median of valid ones over that of chi-square with number - 1 degrees of freedom: a few
-    places where more than noise differs change it little. 0 without any sum; of shape ().
+    The median of valid ones over that of chi-square with number - 1 degrees of freedom, robust
+    against a few places where more than noise differs. Shape (); 0 without any sum.
     """
     median = torch.where(valid, misfit, torch.nan).nanmedian()
     return median.nan_to_num(0.0) / chdtri(number - 1, 0.5)
@@ -252,8 +212,8 @@ def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
 def informative(images: Sequence[torch.Tensor]) -> torch.Tensor:
     """Pixels (images, ...) that filters hardly mix with non-finite ones.
 
-    They are three away from these, and one away from lines and single pixels of an image: across a
-    pixel smooth values (`inpainting.inpainted`) are good guesses.
+    They are three pixels away from these, but only one from lines and single pixels of an image,
+    across which smooth values (`inpainting.inpainted`) are good guesses.
     """
     bad = torch.stack([~torch.isfinite(image) for image in images])
     if bad.ndim > 3 or not bool(bad.any()):

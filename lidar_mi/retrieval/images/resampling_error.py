@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from scipy.optimize import least_squares, nnls
 from scipy.spatial import KDTree
 
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 
 # Neighbours of a beam whose differences make the variogram, and bins along distance and time.
 _NEIGHBOURS, _BINS = 12, 12
@@ -58,17 +58,17 @@ class Pairs(NamedTuple):
 
 
 def pairs(places: np.ndarray, times: np.ndarray) -> Pairs:
-    """Of every beam with its nearest ones; places (n, 2) in spacings, times (n,) in s."""
+    """Pairs of every beam with its nearest ones; places (n, 2) in spacings, times (n,) in s."""
     _, near = KDTree(places).query(places, min(_NEIGHBOURS + 1, len(places)))
     near = near[:, 1:]
     return Pairs(places[near] - places[:, None], times[near] - times[:, None], near)
 
 
 def variogram(values: np.ndarray, near: Pairs) -> Variogram:
-    """The one that fits the differences of neighbouring beams best (Cressie 1985).
+    """The variogram that fits the differences of neighbouring beams best (Cressie 1985).
 
     Bins of distance and time count by their number of pairs over the square of the model (Cressie
-    1985, Math. Geol. 17, 563-586). What no distance explains is the noise.
+    1985, Math. Geol. 17, 563-586). The rest is the noise.
     """
     half = ((values[near.near] - values[:, None]) ** 2 / 2).ravel()
     distance, delay = np.linalg.norm(near.separation, axis=-1).ravel(), np.abs(near.delay).ravel()
@@ -80,7 +80,7 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
     ]
     index = cell[0] * (_BINS + 1) + cell[1]
     number = np.bincount(index)
-    h, tau, seen = (
+    h, tau, observed = (
         np.bincount(index, part)[number > 0] / number[number > 0]
         for part in (distance, delay, half)
     )
@@ -94,7 +94,7 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
         made = model(p)
         expected = made(np.stack([h, 0 * h], -1), tau) + made.noise
         # relative: squared differences scatter in proportion to their mean
-        return np.sqrt(number) * (seen / expected - 1)
+        return np.sqrt(number) * (observed / expected - 1)
 
     start = np.array([1.0, np.log(3.0), 2.0, 1.0, 0.05])
     low = np.array([-4.0, np.log(0.7), _MANY, 0.0, 1e-6])
@@ -105,13 +105,12 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
 def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray) -> xr.Dataset:
     """The wind with vectors flagged where resampling lost more than stated errors can hold.
 
-    What is lost depends on the air and on the places of the beams, which are at rest: it is not
-    only noise, but also a bias. Flagged are vectors with a place at most half a template away, over
-    whose template its mean square exceeds 4 times that of the noise: a smooth field carries the
-    bias to its neighbours. With no place but those over the template, errors in the interior of
-    Lissajous figures are 1.5 to 1.7 times as large as stated. All vectors are flagged where two
-    thirds of those that have a displacement are: the others' errors are then up to 2.6 times as
-    large as stated.
+    The loss depends on the air and on the fixed places of the beams: it is a bias as well as noise.
+    Flagged are vectors with a place at most half a template away, over whose template its mean
+    square exceeds 4 times that of the noise: a smooth field carries the bias to its neighbours. If
+    only places over the template counted, errors in the interior of Lissajous figures would be 1.5
+    to 1.7 times as large as stated. All vectors are flagged where two thirds of those that have a
+    displacement are: the others' errors are then up to 2.6 times as large as stated.
 
     Parameters
     ----------
@@ -128,17 +127,17 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
     at = {axis: wind[axis] for axis in ("z", "y")}
     bad = lost.interp(at, method="nearest").transpose(*wind["flag"].dims).values > 0.5
     flag = wind["flag"]
-    found_at_all = np.isfinite(wind["v"].transpose(*flag.dims).values)
-    bad |= bool(found_at_all.any()) and bad[found_at_all].mean() > _MOST
-    found = flag.values | np.where(bad, Flag.RESAMPLED.value, 0)
-    return wind.assign(flag=flag.copy(data=found.astype(flag.dtype)))
+    displaced = np.isfinite(wind["v"].transpose(*flag.dims).values)
+    bad |= bool(displaced.any()) and bad[displaced].mean() > _MOST
+    flags = flag.values | np.where(bad, Flag.RESAMPLED.value, 0)
+    return wind.assign(flag=flag.copy(data=flags.astype(flag.dtype)))
 
 
 class LeaveOneOut(NamedTuple):
-    """Beams as their neighbours estimate them.
+    """Beams estimated from their neighbours.
 
-    Places (n, 2), squared errors without noise (n,), and what these are for `structure` of
-    strength 1 (n,); the noise of a beam and the strength in the mean.
+    Places (n, 2), squared errors without noise (n,), their expectation for `structure` of strength
+    1 (n,); mean noise of a beam and mean strength.
     """
 
     places: np.ndarray
@@ -149,7 +148,7 @@ class LeaveOneOut(NamedTuple):
 
 
 def structure(speed: float) -> Variogram:
-    """Of strength 1 and the length for which beams are weighted, rough beyond it."""
+    """Variogram of strength 1 and the length for which beams are weighted."""
     return Variogram(1.0, _LENGTH, 1.0, speed, 0.0)
 
 
@@ -158,20 +157,20 @@ def leave_one_out(
 ) -> LeaveOneOut:
     """Beams with the noise that explains their squared errors, together with the structure.
 
-    A beam that its neighbours estimate errs by the structure between them and by the noise of all,
-    ``noisy`` times that of one. Both are fitted, not below 0, to means over bins of the structure's
-    part: where beams are close only the noise is left.
+    The error of a beam estimated from its neighbours is due to the structure between them and to
+    the noise of all, ``noisy`` times that of one. Both are fitted, not below 0, to means over bins
+    of the structure's part: of close beams only the noise remains.
     """
     edges = np.quantile(expected, np.linspace(0, 1, _NOISE_BINS + 1)[1:-1])
     index = np.searchsorted(edges, expected)
     number = np.bincount(index)
     means = [np.bincount(index, part) for part in (square, noisy, expected)]
-    seen, by_noise, by_air = (part[number > 0] / number[number > 0] for part in means)
-    seen = np.maximum(seen, 1e-300)
-    # divided by what was seen: bins of close beams, which show the noise, count as much as others
-    matrix = np.stack([by_noise / seen, by_air / seen], 1)
+    observed, by_noise, by_air = (part[number > 0] / number[number > 0] for part in means)
+    observed = np.maximum(observed, 1e-300)
+    # relative to the observed: bins of close beams, which show the noise, weigh as much as others
+    matrix = np.stack([by_noise / observed, by_air / observed], 1)
     scale = np.maximum(matrix.max(0), 1e-300)
-    (noise, strength), _ = nnls(matrix / scale, np.ones(len(seen)))
+    (noise, strength), _ = nnls(matrix / scale, np.ones(len(observed)))
     noise, strength = noise / scale[0], strength / scale[1]
     return LeaveOneOut(places, square - noise * noisy, expected, float(noise), float(strength))
 
@@ -195,7 +194,7 @@ def correlation_area(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 
 
 def variance(
-    found: Variogram, weights: np.ndarray, from_node: np.ndarray, times: np.ndarray
+    structure: Variogram, weights: np.ndarray, from_node: np.ndarray, times: np.ndarray
 ) -> np.ndarray:
     """Mean squared error of weighted beams for the structure at a node, (m,).
 
@@ -203,8 +202,8 @@ def variance(
     (Cressie 1993, eq. 3.2.6), whether or not they are the best for it; from_node (m, k, 2).
     Times (m, k) are relative to the node's, which is their weighted mean.
     """
-    own = 2 * (weights * found(from_node, times)).sum(-1)
+    to_node = 2 * (weights * structure(from_node, times)).sum(-1)
     separation = from_node[:, :, None] - from_node[:, None]
     delay = times[:, :, None] - times[:, None]
-    both = np.einsum("mi,mij,mj->m", weights, found(separation, delay), weights)
-    return np.clip(own - both, 0.0, None)
+    among = np.einsum("mi,mij,mj->m", weights, structure(separation, delay), weights)
+    return np.clip(to_node - among, 0.0, None)

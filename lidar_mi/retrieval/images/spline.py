@@ -52,11 +52,11 @@ class Spline(NamedTuple):
     settings: FilterSettings
 
     def only(self, number: int) -> "Spline":
-        """That of one of the images."""
+        """The spline of one of the images."""
         return self._replace(coefficients=self.coefficients[number : number + 1])
 
     def stacked_with(self, other: "Spline") -> "Spline":
-        """With the images of another one after the same filter."""
+        """The spline with the images of another one, after the same filter."""
         return self._replace(coefficients=torch.cat([self.coefficients, other.coefficients]))
 
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
@@ -98,7 +98,7 @@ class Spline(NamedTuple):
         return value, *(self.settings.nodes * slope for slope in slopes)
 
     def values(self, *place: torch.Tensor) -> torch.Tensor:
-        """The first of `sample` alone."""
+        """Values of `sample` without slopes."""
         at = self._in_nodes(place)
         if len(at) == 2:
             return _read_images(self.coefficients, at[0], at[1], slopes=False)[0]
@@ -153,15 +153,15 @@ def _read_images(
 
 def _read_volumes(coefficients: torch.Tensor, *place: torch.Tensor) -> torch.Tensor:
     """Values and slopes, per node, at places counted in nodes: three dimensions, by tiles."""
-    found = place[0].new_empty(4, *place[0].shape)
+    sampled = place[0].new_empty(4, *place[0].shape)
     for number, volume in enumerate(coefficients[: len(place[0])]):
         points = [axis[number].reshape(-1) for axis in place]
-        part = found[:, number].reshape(4, -1)
+        part = sampled[:, number].reshape(4, -1)
         for start in range(0, len(points[0]), _POINTS):
-            here = slice(start, start + _POINTS)
-            part[:, here] = _read_volume(volume, *(axis[here] for axis in points))
-        found[:, number] = part.reshape(4, *place[0].shape[1:])
-    return found
+            chunk = slice(start, start + _POINTS)
+            part[:, chunk] = _read_volume(volume, *(axis[chunk] for axis in points))
+        sampled[:, number] = part.reshape(4, *place[0].shape[1:])
+    return sampled
 
 
 def _read_volume(volume: torch.Tensor, *at: torch.Tensor) -> torch.Tensor:
@@ -264,7 +264,7 @@ def band_limited(
 
 
 def likeliest(image: torch.Tensor, settings: FilterSettings) -> Spline:
-    """Spline through what an image most likely is without its white noise: its Wiener filter.
+    """Spline through an image after its Wiener filter, which removes white noise.
 
     Of texture of spectral density S with noise N, S / (S + N) of the image is the mean of the
     texture given the image. The filter of `band_limited` is g = sqrt(S / (S + N / 2)), so that this
@@ -298,13 +298,13 @@ def spectrum_of(
     """The power spectrum of images that `band_limited` filters."""
     known = torch.stack([torch.isfinite(image) for image in images])
     sizes = transform_sizes(images[0].shape, settings)
-    found = power_spectrum(finite(images), sizes, settings, weight, known)
+    spectrum = power_spectrum(finite(images), sizes, settings, weight, known)
     if bool(known.all()):
-        return found
+        return spectrum
     # smooth values go on with the noise at the rim, the nearest ones make steps: both add power
     nearest = torch.stack([stored(nearest_in(image)) for image in images])
-    other = power_spectrum(nearest, sizes, settings, weight, known)
-    return found._replace(density=torch.minimum(found.density, other.density))
+    by_nearest = power_spectrum(nearest, sizes, settings, weight, known)
+    return spectrum._replace(density=torch.minimum(spectrum.density, by_nearest.density))
 
 
 def finite(images: torch.Tensor | Sequence[torch.Tensor]) -> torch.Tensor:
@@ -346,22 +346,22 @@ def filtered_splines(
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
     )
-    # stored of images for the next ones, as the shells are
+    # cached for images only
     factor = _through_nodes if len(dims) == 2 else _through_nodes.__wrapped__
     through = factor(tuple(sizes), finer, images.dtype, images.device)
     keep = [slice(finer * (n + 2 * margin)) for n in shape]
     return [
         Spline(
-            _refined(spectrum * (one.gain[shell] * through), sizes, finer)[:, *keep] + mean,
+            _refined(spectrum * (filter_.gain[shell] * through), sizes, finer)[:, *keep] + mean,
             shape,
-            one.passed,
-            one.excess,
-            one.gain,
-            one.efficiency,
-            one.noisy_slopes,
+            filter_.passed,
+            filter_.excess,
+            filter_.gain,
+            filter_.efficiency,
+            filter_.noisy_slopes,
             settings,
         )
-        for one in filters
+        for filter_ in filters
     ]
 
 

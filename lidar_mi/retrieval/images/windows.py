@@ -135,9 +135,9 @@ class Windows:
                     slice(top, min(top + height, rows)),
                     slice(left, min(left + width, columns)),
                 )
-                yield Tile(vectors, (self._seen(vectors[0]), self._seen(vectors[1])))
+                yield Tile(vectors, (self._searched(vectors[0]), self._searched(vectors[1])))
 
-    def _seen(self, vectors: slice) -> slice:
+    def _searched(self, vectors: slice) -> slice:
         """Pixels along an axis in the search regions of some windows of an image."""
         return slice(vectors.start * self.stride, (vectors.stop - 1) * self.stride + self.search)
 
@@ -214,9 +214,9 @@ def window_sums(
 
 def averaged(field: torch.Tensor, known: torch.Tensor, width: float) -> torch.Tensor:
     """Gaussian mean of a field where it is known; the mean of all of it where nothing is near."""
-    both = torch.stack([torch.where(known, field, 0.0), known.to(field)])
-    total, number = _gaussian_sums(both, width)
-    mean = both[0].sum() / both[1].sum().clamp(min=1)
+    fields = torch.stack([torch.where(known, field, 0.0), known.to(field)])
+    total, number = _gaussian_sums(fields, width)
+    mean = fields[0].sum() / fields[1].sum().clamp(min=1)
     return torch.where(number > 1e-3, total / number.clamp(min=1e-3), mean)
 
 

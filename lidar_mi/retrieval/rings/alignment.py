@@ -70,8 +70,8 @@ def crests(sectors: Sectors) -> np.ndarray:
     noise[known] = passed * np.sqrt(sectors.profile_noise[known] / sectors.profile_count[known])
     if not np.ptp(smooth) > SIGNIFICANT * np.median(noise):
         raise InputError("rings: none detected; expected at least 2")
-    places, found = find_peaks(smooth, prominence=PROMINENT * np.ptp(smooth))
-    places = places[found["prominences"] > SIGNIFICANT * noise[places]]
+    places, properties = find_peaks(smooth, prominence=PROMINENT * np.ptp(smooth))
+    places = places[properties["prominences"] > SIGNIFICANT * noise[places]]
     if len(places) < 2:
         raise InputError(f"rings: {len(places)} detected; expected at least 2")
     return places
@@ -96,7 +96,7 @@ def _pieces(sectors: Sectors) -> list[tuple[int, int]]:
 
 def _shifts(sectors: Sectors, pieces: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
     """Shift of every piece in every sector, px^2, NaN where it is not known; the pieces' r^2."""
-    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.used, strict=True)])
+    value = np.stack([_filled(*pair) for pair in zip(sectors.value, sectors.used, strict=True)])
     shift = np.full((len(pieces), SECTORS), np.nan)
     for number, (first, last) in enumerate(pieces):
         size = last - first + 1
@@ -152,11 +152,11 @@ def _change(shift: np.ndarray, middle: np.ndarray, angle: np.ndarray, free: bool
     rows /= np.where(scale > 0, scale, 1)
     used = np.ones(len(value), bool)
     for _ in range(10):
-        found = np.linalg.lstsq(rows[used], value[used], rcond=1e-9)[0]
-        off = value - rows @ found
+        solution = np.linalg.lstsq(rows[used], value[used], rcond=1e-9)[0]
+        off = value - rows @ solution
         # dust and reflections: beyond 4 standard deviations, these from the median
         used = np.abs(off) <= 4 * 1.4826 * np.median(np.abs(off[used])) + 1e-9
-    change = found[-6:] / np.where(scale > 0, scale, 1)[-6:]
+    change = solution[-6:] / np.where(scale > 0, scale, 1)[-6:]
     return np.where(scale[-6:] > 0, change, 0.0)
 
 

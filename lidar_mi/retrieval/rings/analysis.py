@@ -119,7 +119,7 @@ class Rings(Tabular):
         """
         lines = len(self.fraction)
         table = np.full((self.order.max() + 2, lines), np.nan)
-        # a component that passes the centre first belongs to the order outside
+        # a component that passes the centre first belongs to the next order
         table[self.order, self.line] = self.radius**2
         split = table[:, 1:] - table[:, :1]
         return split[np.isfinite(split).any(1)]
@@ -257,7 +257,7 @@ def analyse_rings(
         uneven=fit.uneven,
         ellipticity=fit.geometry.ellipticity,
         tilt=fit.geometry.tilt,
-        doubt="; ".join(one for one in (doubt, few_levels(values)) if one),
+        doubt="; ".join(reason for reason in (doubt, few_levels(values)) if reason),
         r2=fit.sectors.r2,
         profile=fit.sectors.profile,
     )
@@ -272,7 +272,7 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     places = crests(sectors)
     high = sectors.profile[places] - sectors.profile.min()
     places = sectors.r2[places[high > CREST * high.max()]]
-    pattern, doubt, noise = _found(sectors, spacing)
+    pattern, doubt, noise = _best_pattern(sectors, spacing)
     radii = ", ".join(f"{math.sqrt(place):.0f}" for place in places)
     wrong = InputError(
         f"rings: radii of {radii} px are not allowed; expected squares that rise by equal "
@@ -289,23 +289,23 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
 
 
 def _explains(pattern: Pattern, noise: float) -> bool:
-    """Whether all of the profile but noise is of the pattern."""
+    """Whether the pattern explains the profile to its noise."""
     return pattern.unexplained - 2 * noise * pattern.freedom <= UNEXPLAINED * pattern.power
 
 
 def _rings_alone(sectors: Sectors, spacing: float | None) -> Pattern | None:
     """Lines of the strongest period where they explain the profile, of a longer one where not.
 
-    None where neither does: nothing is hidden of rings that are not there.
+    None where neither does: without rings nothing is hidden.
     """
     profile, noise = _profile(sectors)
     if spacing is None:
         with threads_for(len(profile.r2)):
-            found = lines_at(profile, strongest_period(profile), noise, most=1)
-        if found is not None and found.unexplained < UNEXPLAINED * found.power:
-            return found
-    found, _, noise = _found(sectors, spacing)
-    return found if found is not None and _explains(found, noise) else None
+            pattern = lines_at(profile, strongest_period(profile), noise, most=1)
+        if pattern is not None and pattern.unexplained < UNEXPLAINED * pattern.power:
+            return pattern
+    pattern, _, noise = _best_pattern(sectors, spacing)
+    return pattern if pattern is not None and _explains(pattern, noise) else None
 
 
 def _profile(sectors: Sectors) -> tuple[Profile, float]:
@@ -315,12 +315,12 @@ def _profile(sectors: Sectors) -> tuple[Profile, float]:
     return profile, float(1 / weight[weight > 0].mean())
 
 
-def _found(sectors: Sectors, spacing: float | None) -> tuple[Pattern | None, str, float]:
+def _best_pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern | None, str, float]:
     """Pattern of the profile, what is doubtful about it, and the noise of its annuli."""
     profile, noise = _profile(sectors)
     with threads_for(len(profile.r2)):
-        found = find_pattern(profile, noise, spacing)
-    return (None, "", noise) if found is None else (*found, noise)
+        pattern = find_pattern(profile, noise, spacing)
+    return (None, "", noise) if pattern is None else (*pattern, noise)
 
 
 @dataclass(frozen=True)
@@ -338,16 +338,16 @@ class _Law:
 def _law(fit: CurveFit) -> _Law:
     """Least squares of square = (order + fraction) spacing, weighted as for white noise.
 
-    The standard errors are those of the rings; where the rings deviate more than these allow, at
-    the level of 1 %, they are scaled up to the deviation.
+    Standard errors follow from those of the rings; where the rings deviate more, at the
+    significance of 1 %, they are scaled to the deviation.
     """
     lines = len(fit.pattern.fraction)
     rows = np.column_stack([fit.order, fit.line[:, None] == np.arange(lines)]).astype(float)
     weight = np.linalg.pinv(fit.model_covariance, hermitian=True)
     gain = np.linalg.solve(rows.T @ weight @ rows, rows.T @ weight)
-    found = gain @ fit.square
-    off = fit.square - rows @ found
-    spacing, first = found[0], found[1:]
+    coefficients = gain @ fit.square
+    off = fit.square - rows @ coefficients
+    spacing, first = coefficients[0], coefficients[1:]
     freedom = len(fit.square) - 1 - lines
     covariance = gain @ fit.square_covariance @ gain.T
     misfit = math.nan

@@ -32,15 +32,15 @@ _WORST_CONDITION = 1e13
 def standard_deviations(fisher: torch.Tensor) -> torch.Tensor:
     """Roots of the diagonal of the inverse, NaN where there is none, shape (images, free).
 
-    There is none, either, where rounding alone makes the matrix invertible.
+    Matrices that only rounding makes invertible have none.
     """
     scale = fisher.diagonal(dim1=1, dim2=2).rsqrt()
     scaled = fisher * scale[:, :, None] * scale[:, None, :]
     inverse, info = torch.linalg.inv_ex(scaled)
     condition = torch.linalg.matrix_norm(scaled, 1) * torch.linalg.matrix_norm(inverse, 1)
-    found = inverse.diagonal(dim1=1, dim2=2).sqrt() * scale
+    deviation = inverse.diagonal(dim1=1, dim2=2).sqrt() * scale
     determined = (info == 0) & (condition < _WORST_CONDITION)
-    return torch.where(determined[:, None], found, torch.nan)
+    return torch.where(determined[:, None], deviation, torch.nan)
 
 
 def free_names(model: RingModel, free: Sequence[str] | None) -> list[str]:
@@ -135,8 +135,8 @@ def cramer_rao_of(
     bounds = []
     for free in chosen:
         places = torch.tensor([names.index(name) for name in free])
-        found = standard_deviations(fisher[:, places][:, :, places])[0]
-        if not torch.isfinite(found).all():
+        bound = standard_deviations(fisher[:, places][:, :, places])[0]
+        if not torch.isfinite(bound).all():
             raise InputError(f"free: the image does not determine {', '.join(free)} all together")
-        bounds.append({name: float(value) for name, value in zip(free, found, strict=True)})
+        bounds.append({name: float(value) for name, value in zip(free, bound, strict=True)})
     return bounds

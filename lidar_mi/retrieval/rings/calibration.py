@@ -1,4 +1,4 @@
-"""An instrument as frames of a known line show it: stored in a file, given to the ring fit."""
+"""An instrument calibrated from frames of a known line: stored in a file, used by the ring fit."""
 
 import json
 import math
@@ -141,16 +141,16 @@ class Calibration(Tabular):
 
     def _gap_rows(self) -> list[tuple[str, str]]:
         """The gap of several lines; that it is ambiguous where it is."""
-        many = len(self.gaps)
+        count = len(self.gaps)
         rows = [
             (
-                "gap" if many == 1 else f"gap, {k} of {many} that agree",
+                "gap" if count == 1 else f"gap, {k} of {count} that agree",
                 with_error(1e3 * gap, 1e3 * std, "mm"),
             )
             for k, (gap, std) in enumerate(self.gaps[:_LISTED], 1)
         ]
-        if many > 1:
-            more = f"ambiguous, {many} gaps agree: the nominal one is kept"
+        if count > 1:
+            more = f"ambiguous, {count} gaps agree: the nominal one is kept"
             rows.append(("whole order at the centre", more))
         elif self.whole_orders:
             first, last = self.whole_orders[0], self.whole_orders[-1]
@@ -186,20 +186,20 @@ def calibration_of(data: xr.Dataset) -> Calibration:
             single[name] = tuple(single.get(name, ()))
         single["gaps"] = tuple((float(gap), float(std)) for gap, std in single.get("gaps", ()))
         single.update(arrays)
-        found = Calibration(**single)
+        result = Calibration(**single)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"calibration: {error} is missing or wrong; expected the file of a calibration"
         ) from None
-    numbers = (found.pixel, found.wavelength, found.focal_length, found.order_at_centre)
+    numbers = (result.pixel, result.wavelength, result.focal_length, result.order_at_centre)
     size = (1 + len(INSTRUMENT),) * 2
-    whole = found.response.shape == found.shape and found.systematic.shape == size
-    finite = all(np.isfinite(getattr(found, name)).all() for name in _ARRAYS)
+    whole = result.response.shape == result.shape and result.systematic.shape == size
+    finite = all(np.isfinite(getattr(result, name)).all() for name in _ARRAYS)
     if not (whole and finite and all(isinstance(v, float) and v > 0 for v in numbers)):
         raise InputError(
             "calibration: sizes or numbers that cannot be; expected the file of a calibration"
         )
-    return found
+    return result
 
 
 def calibrated(model: RingModel, calibration: Calibration) -> RingModel:
@@ -214,9 +214,11 @@ def calibrated(model: RingModel, calibration: Calibration) -> RingModel:
         sizes = " and ".join(f"{h} x {w}" for h, w in (calibration.shape, model.shape))
         raise InputError(f"calibration: sizes {sizes} px (height x width) of cameras differ")
     for name in ("pixel", "wavelength"):
-        own, other = getattr(calibration, name), getattr(model, name)
-        if not math.isclose(own, other, rel_tol=1e-3):
-            raise InputError(f"calibration: {name} {own:g} m is not that of the model, {other:g} m")
+        expected, given = getattr(calibration, name), getattr(model, name)
+        if not math.isclose(expected, given, rel_tol=1e-3):
+            raise InputError(
+                f"calibration: {name} {expected:g} m is not that of the model, {given:g} m"
+            )
     order = calibration.order_at_centre
     # the nominal gap may be given to another fraction of an order; one by two lines is absolute,
     # and line widths in orders change in proportion

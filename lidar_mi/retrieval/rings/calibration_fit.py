@@ -114,7 +114,7 @@ def calibrate_rings(
         )
     noise = noise or PixelNoise()
     mean = frames.mean(0, dtype=torch.float64)
-    # those that would mislead the start; the others are found after a fit
+    # hot pixels that would mislead the start; the fit masks others
     hot = spots(mean, noise, len(frames))
     whole = torch.where(hot, torch.from_numpy(median_filter(mean.numpy(), 3)), mean)
     centre = gradient_centre(whole)
@@ -122,7 +122,7 @@ def calibrate_rings(
     model = replace(
         model, light_degree=light_degree, background_degree=background_degree, centre=centre
     )
-    model = _near(model, whole, tolerances["focal_length"])
+    model = _with_focal_length(model, whole, tolerances["focal_length"])
     given = torch.ones(model.shape, dtype=torch.float64) if response is None else response.double()
     given = torch.where(hot, 0.0, given)
     start = fit_rings(frames, model, noise, centre=centre, response=given, max_chi_square=math.inf)
@@ -162,8 +162,8 @@ class _State:
 class _Fit(_State):
     """The instrument after a fit.
 
-    ``covariance`` is that of what all frames have in common, by ``names``; ``speed_by_shared`` and
-    ``speed_variance`` are the frames' own speeds' dependence on it and their own variances.
+    ``covariance`` is that of the parameters ``names``, which all frames share; ``speed_by_shared``
+    is the dependence of each frame's speed on them, ``speed_variance`` its variance without them.
     """
 
     names: tuple[str, ...]
@@ -174,7 +174,7 @@ class _Fit(_State):
     freedom: int
 
 
-def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
+def _with_focal_length(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
     """The model with the focal length of the steps of r^2 between rings, if that is near."""
     try:
         spacing = analyse_rings(mean.numpy()).spacing
@@ -213,12 +213,12 @@ def _fitted(
         weight = torch.where(normal.abs() <= OUTLIER * scale, weight, 0.0)
         fisher = fisher_matrix(jacobian, weight)
         score = (jacobian @ (weight * residual)[:, :, None])[:, :, 0]
-        # what every frame has of its own is eliminated: Schur's complement
-        own, mixed = fisher[:, :few, :few], fisher[:, :few, few:]
-        by_shared = torch.linalg.solve(own, mixed)
-        own_step = torch.linalg.solve(own, score[:, :few, None])[:, :, 0]
+        # the frames' local parameters are eliminated (Schur complement)
+        local_fisher, mixed = fisher[:, :few, :few], fisher[:, :few, few:]
+        by_shared = torch.linalg.solve(local_fisher, mixed)
+        local_step = torch.linalg.solve(local_fisher, score[:, :few, None])[:, :, 0]
         total = (fisher[:, few:, few:] - mixed.transpose(1, 2) @ by_shared).sum(0)
-        reduced = (score[:, few:] - torch.einsum("bls,bl->bs", mixed, own_step)).sum(0)
+        reduced = (score[:, few:] - torch.einsum("bls,bl->bs", mixed, local_step)).sum(0)
         for k, name in enumerate(shared):
             if name in INSTRUMENT:
                 information = tolerances[name] ** -2
@@ -233,17 +233,16 @@ def _fitted(
             for name, value in zip(shared, step.tolist(), strict=True)
         }
         # back substitution, with the speed within the linear range of the waves
-        own_step = own_step - by_shared @ step
+        local_step = local_step - by_shared @ step
         limit = state.model.velocity_range / 16
-        own_step[:, 0] = own_step[:, 0].clamp(-limit, limit)
+        local_step[:, 0] = local_step[:, 0].clamp(-limit, limit)
         parameters = state.parameters.clone()
-        for name, column in zip(local, own_step.unbind(1), strict=True):
+        for name, column in zip(local, local_step.unbind(1), strict=True):
             parameters[:, PARAMETERS.index(name)] += column
         for name in shared:
             if name in ("falloff", "damping", "roughness", *LIGHT):
                 parameters[:, PARAMETERS.index(name)] += change[name]
         used = int((weight > 0).sum())
-        # every frame has local parameters of its own
         freedom = max(used - len(shared) - few * len(frames), 1)
         state = fit = _Fit(
             _moved(state.model, change),
@@ -252,13 +251,13 @@ def _fitted(
             shared,
             covariance,
             by_shared[:, 0],
-            torch.linalg.inv(own)[:, 0, 0],
+            torch.linalg.inv(local_fisher)[:, 0, 0],
             float((weight * residual**2).sum()) / freedom,
             freedom,
         )
         if close:
             return fit
-        # frames that are not the model's: the steps grow without limit
+        # the steps diverge where frames do not follow the model
         if not all(
             0 <= at < n for at, n in zip(fit.model.centre, frames.shape[:0:-1], strict=True)
         ):
@@ -270,7 +269,7 @@ def _fitted(
 
 
 def _moved(model: RingModel, change: Mapping[str, float]) -> RingModel:
-    """The model after a step of what is built into it."""
+    """The model after a step of the instrument's parameters."""
     return replace(
         model,
         centre=(model.centre[0] + change["x"], model.centre[1] + change["y"]),
@@ -299,7 +298,7 @@ def _residual(
 def _bad_pixels(
     mean: torch.Tensor, state: _State, noise: PixelNoise, count: int, response: torch.Tensor
 ) -> torch.Tensor:
-    """Further ones that are far from the model and from their neighbours: dust, warm pixels."""
+    """Further pixels far from the model and from their neighbours: dust, warm pixels."""
     residual = _residual(mean, state, noise, count, response).numpy()
     # a smooth residual is an error of the model
     return torch.from_numpy(np.abs(residual - median_filter(residual, 5)) > _BAD)
@@ -323,7 +322,7 @@ def _calibration(
     # the frames' mean speed depends on the shared parameters: v = v_0 - g . shared
     slope = -state.speed_by_shared.mean(0).numpy()
     zero = float(slope @ covariance @ slope + own_variance.sum() / count**2)
-    # what the speeds scatter by beyond their own errors
+    # scatter of the speeds beyond their errors
     drift = math.sqrt(max(0.0, speed.var(ddof=1) - own_variance.mean()))
     places = [names.index(name) for name in INSTRUMENT]
     systematic = np.empty((1 + len(INSTRUMENT),) * 2)

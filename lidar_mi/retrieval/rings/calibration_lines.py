@@ -37,14 +37,14 @@ def combined(
     achromatic: bool = True,
     tolerances: Mapping[str, float] = TOLERANCES,
 ) -> Calibration:
-    """The instrument of the first line, with its gap and what the other lines say of it.
+    """The instrument of the first line, with its gap, from all lines.
 
     Parameters
     ----------
     lines : sequence of Calibration
         Two or more, all for the same nominal gap.
     gap, gap_tolerance : float
-        The nominal gap times its refractive index, and what it may differ by, m.
+        The nominal gap times its refractive index, and its largest error, m.
     mirror_orders : sequence of float
         Of every line, by which the mirrors' phase shifts its orders.
     wavelength_accuracy : float
@@ -76,37 +76,39 @@ def combined(
             f"the gap, {0.01 * gap:.3g} m"
         )
     shared = [n for n in _GEOMETRY if achromatic or n not in CHROMATIC]
-    parts = [_geometry(one, shared, tolerances) for one in lines]
-    for one, part in zip(lines[1:], parts[1:], strict=True):
-        _check_same(lines[0], one, parts[0], part, achromatic)
+    parts = [_geometry(line, shared, tolerances) for line in lines]
+    for line, part in zip(lines[1:], parts[1:], strict=True):
+        _check_same(lines[0], line, parts[0], part, achromatic)
     information = parts[0].information + sum(p.determined for p in parts[1:])
     covariance = np.linalg.inv(information)
-    # of departures from the first line's, so that numbers of different size cause no loss
+    # as departures from the first line, so that no digits are lost
     step = covariance @ sum(p.determined @ (p.value - parts[0].value) for p in parts[1:])
     common = parts[0].value + step
-    slopes, own, fraction = [], [], []
-    for one, part, shift in zip(lines, parts, mirror_orders, strict=True):
-        by = one.systematic[0, part.places] @ part.information  # m/s per unit
-        per_order = _per_order(one)
+    slopes, independent, fraction = [], [], []
+    for line, part, shift in zip(lines, parts, mirror_orders, strict=True):
+        by = line.systematic[0, part.places] @ part.information  # m/s per unit
+        per_order = _per_order(line)
         moved = by @ (common - part.value) / per_order
         slopes.append(by / per_order)
-        own.append((one.systematic[0, 0] - by @ one.systematic[part.places, 0]) / per_order**2)
-        fraction.append((one.order_at_centre + moved - shift) % 1)
-    errors = np.diag(own) + np.array(slopes) @ covariance @ np.array(slopes).T
-    orders = np.array([one.order_at_centre for one in lines])
+        independent.append(
+            (line.systematic[0, 0] - by @ line.systematic[part.places, 0]) / per_order**2
+        )
+        fraction.append((line.order_at_centre + moved - shift) % 1)
+    errors = np.diag(independent) + np.array(slopes) @ covariance @ np.array(slopes).T
+    orders = np.array([line.order_at_centre for line in lines])
     errors += np.diag((wavelength_accuracy * orders) ** 2)
-    wavelengths = [one.wavelength for one in lines]
-    found = gap_of_covariance(fraction, errors, wavelengths, gap, gap_tolerance)
+    wavelengths = [line.wavelength for line in lines]
+    common_gap = gap_of_covariance(fraction, errors, wavelengths, gap, gap_tolerance)
     first = _moved(lines[0], parts[0], step, covariance)
-    groups = tuple(zip(found.group.tolist(), found.group_std.tolist(), strict=True))
+    groups = tuple(zip(common_gap.group.tolist(), common_gap.group_std.tolist(), strict=True))
     first = replace(first, lines=tuple(wavelengths), gaps=groups)
     if len(groups) > 1:
         return first
-    best = int(found.chi_square.argmin())
-    order = float(found.order[best, 0] + fraction[0] + mirror_orders[0])
+    best = int(common_gap.chi_square.argmin())
+    order = float(common_gap.order[best, 0] + fraction[0] + mirror_orders[0])
     return replace(
         first,
-        whole_orders=tuple(sorted(set(found.order[:, 0].tolist()))),
+        whole_orders=tuple(sorted(set(common_gap.order[:, 0].tolist()))),
         focal_length=first.focal_length * math.sqrt(order / first.order_at_centre),
         order_at_centre=order,
     )
@@ -116,8 +118,8 @@ def combined(
 class _Geometry:
     """Estimate from one line of the shared part of the instrument.
 
-    ``information`` is the inverse of its covariance, ``determined`` that of its
-    frames without the prior, which all lines have in common.
+    ``information`` is the inverse of its covariance, ``determined`` that of its frames without the
+    prior, as all lines share the prior.
     """
 
     places: list[int]  # in `Calibration.systematic`
@@ -128,21 +130,21 @@ class _Geometry:
 
 
 def _geometry(
-    one: Calibration, shared: Sequence[str], tolerances: Mapping[str, float]
+    line: Calibration, shared: Sequence[str], tolerances: Mapping[str, float]
 ) -> _Geometry:
     value = {
-        "focal_length": math.log(one.focal_length),
-        "tilt_x": one.tilt[0],
-        "tilt_y": one.tilt[1],
-        "distortion": one.distortion,
-        "blur": one.blur,
+        "focal_length": math.log(line.focal_length),
+        "tilt_x": line.tilt[0],
+        "tilt_y": line.tilt[1],
+        "distortion": line.distortion,
+        "blur": line.blur,
     }
     places = [1 + INSTRUMENT.index(name) for name in shared]
-    covariance = one.systematic[np.ix_(places, places)]
-    known = np.array([one.std[name] < _DETERMINED * tolerances[name] for name in shared])
-    both = np.ix_(known, known)
+    covariance = line.systematic[np.ix_(places, places)]
+    known = np.array([line.std[name] < _DETERMINED * tolerances[name] for name in shared])
+    index = np.ix_(known, known)
     determined = np.zeros_like(covariance)
-    determined[both] = np.linalg.inv(covariance[both])
+    determined[index] = np.linalg.inv(covariance[index])
     return _Geometry(
         places,
         np.array([value[name] for name in shared]),
@@ -153,49 +155,49 @@ def _geometry(
 
 
 def _check_same(
-    first: Calibration, other: Calibration, one: _Geometry, two: _Geometry, achromatic: bool
+    first: Calibration, second: Calibration, part1: _Geometry, part2: _Geometry, achromatic: bool
 ) -> None:
     """Refuse lines whose rings are not of one instrument."""
-    known = one.known & two.known
+    known = part1.known & part2.known
     if not known.any():
         return
-    both = np.ix_(known, known)
-    off = (two.value - one.value)[known]
-    noise = np.linalg.inv(one.information)[both] + np.linalg.inv(two.information)[both]
+    index = np.ix_(known, known)
+    off = (part2.value - part1.value)[known]
+    noise = np.linalg.inv(part1.information)[index] + np.linalg.inv(part2.information)[index]
     misfit = float(off @ np.linalg.solve(noise, off))
     if chi2.sf(misfit, known.sum()) > _UNLIKELY:
         return
-    wider = other.focal_length / first.focal_length - 1
+    wider = second.focal_length / first.focal_length - 1
     cause = "or a lens that is not achromatic" if achromatic else "or one camera for both"
     raise InputError(
-        f"line of {1e9 * other.wavelength:.7g} nm: its rings, wider by {wider:+.2g} than those of "
+        f"line of {1e9 * second.wavelength:.7g} nm: its rings, wider by {wider:+.2g} than those of "
         f"{1e9 * first.wavelength:.7g} nm allow, are not of the same instrument; expected the "
         f"line's true wavelength, {cause}"
     )
 
 
-def _per_order(one: Calibration) -> float:
+def _per_order(line: Calibration) -> float:
     """Speed that moves rings by one order, m/s."""
-    return speed_of_light / (2 * one.order_at_centre)
+    return speed_of_light / (2 * line.order_at_centre)
 
 
 def _moved(
-    one: Calibration, part: _Geometry, step: np.ndarray, covariance: np.ndarray
+    line: Calibration, part: _Geometry, step: np.ndarray, covariance: np.ndarray
 ) -> Calibration:
-    """A calibration after its shared part is moved by a step, with what is correlated to that."""
-    gain = one.systematic[:, part.places] @ part.information
+    """A calibration after a step of its shared part and of the parameters correlated with it."""
+    gain = line.systematic[:, part.places] @ part.information
     change = dict(zip(("v_los", *INSTRUMENT), gain @ step, strict=True))
-    systematic = one.systematic - gain @ (np.linalg.inv(part.information) - covariance) @ gain.T
+    systematic = line.systematic - gain @ (np.linalg.inv(part.information) - covariance) @ gain.T
     std = dict(zip(INSTRUMENT, np.sqrt(np.diag(systematic))[1:].tolist(), strict=True))
     return replace(
-        one,
-        focal_length=one.focal_length * math.exp(change["focal_length"]),
-        order_at_centre=one.order_at_centre + change["v_los"] / _per_order(one),
-        tilt=(one.tilt[0] + change["tilt_x"], one.tilt[1] + change["tilt_y"]),
-        distortion=one.distortion + change["distortion"],
-        blur=one.blur + change["blur"],
-        damping=one.damping + change["damping"],
-        roughness=one.roughness + change["roughness"],
-        std={**one.std, **std},
+        line,
+        focal_length=line.focal_length * math.exp(change["focal_length"]),
+        order_at_centre=line.order_at_centre + change["v_los"] / _per_order(line),
+        tilt=(line.tilt[0] + change["tilt_x"], line.tilt[1] + change["tilt_y"]),
+        distortion=line.distortion + change["distortion"],
+        blur=line.blur + change["blur"],
+        damping=line.damping + change["damping"],
+        roughness=line.roughness + change["roughness"],
+        std={**line.std, **std},
         systematic=systematic,
     )

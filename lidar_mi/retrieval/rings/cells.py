@@ -173,18 +173,6 @@ def annular_sectors(
     return Cells(index, count, centre, mean_x, mean_y, mean_r2, spread, smooth)
 
 
-def annular_average(
-    images: torch.Tensor, centre: tuple[float, float], step: float
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Mean r^2 (px^2), mean values and numbers of pixels of annuli of equal steps in r^2.
-
-    Of images (..., height, width); centre and step as in `annular_sectors`.
-    """
-    height, width = images.shape[-2:]
-    cells = annular_sectors((height, width), centre, step, 1, images.device)
-    return cells.r2, cells.means(images), cells.count
-
-
 def _sums(index: torch.Tensor, values: torch.Tensor, size: int) -> torch.Tensor:
     """Sum of the values of each cell, without those that do not count."""
     total = torch.zeros(size + 1, dtype=torch.float64, device=values.device)

@@ -67,9 +67,9 @@ def ring_centre(image: np.ndarray) -> tuple[float, float]:
 
     As `gradient_centre`, but robust: the lines along gradients count by how close to the centre
     they pass (Geman and McClure 1985, Proc. Stat. Comp. Sect. ASA, 12), from several starts and
-    distances that become smaller. Those of a sloping background, of edges and of hot pixels pass it
-    by. Of the points found, on the image and on the image without its coarse structure, the one
-    about which averages over circles have the largest contrast is the centre.
+    distances that become smaller. Those of a sloping background, of edges and of hot pixels miss
+    it. Candidates are from the image and from the image without its coarse structure; the one about
+    which averages over circles have the largest contrast is the centre.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def ring_centre(image: np.ndarray) -> tuple[float, float]:
     x, y = ((value - (block - 1) / 2) / block for value in gradient_centre(image))
     starts = [(x, y)]
     starts += [(columns * a, rows * b) for a in (0.25, 0.5, 0.75) for b in (0.25, 0.5, 0.75)]
-    found = [
+    candidates = [
         _robust_centre(gaussian_filter(part, 2.0), start)
         for part in (coarse, fine)
         for start in starts
@@ -97,7 +97,7 @@ def ring_centre(image: np.ndarray) -> tuple[float, float]:
         _, mean, weight = circular_average(fine, place)
         return float(weight @ (mean - (weight @ mean) / weight.sum()) ** 2)
 
-    x, y = (v * block + (block - 1) / 2 for v in max(found, key=contrast))
+    x, y = (v * block + (block - 1) / 2 for v in max(candidates, key=contrast))
     return x, y
 
 
@@ -210,7 +210,7 @@ def midpoint_points(
         Direction (along x, along y), side (before, behind the centre), band, and (x, y) in px.
         NaN where the line leaves the image or has no crest.
     """
-    found = np.full((2, 2, bands, 2), np.nan)
+    points = np.full((2, 2, bands, 2), np.nan)
     for direction in range(2):
         # lines along x of the image; along y the same on the transposed image
         lines = image if direction == 0 else image.T
@@ -233,8 +233,8 @@ def midpoint_points(
                     point = peak(x, values[low:high], x.mean(), half_width), place
                 except InputError:
                     continue
-                found[direction, side, band] = point if direction == 0 else point[::-1]
-    return found
+                points[direction, side, band] = point if direction == 0 else point[::-1]
+    return points
 
 
 def midpoint_line_centre(

@@ -102,8 +102,8 @@ def few_levels(image: np.ndarray) -> str:
     Rounding to steps q is like uniform noise of variance q^2 / 12 where the noise before it has a
     standard deviation of q / 2 or more: then all moments of the sum are those of independent
     numbers to 1 % (Widrow & Kollar 2008, Quantization Noise, chapter 4). Below, crests are flat and
-    slopes are steps, which is structure. Counts of single photons have coarser steps, but the
-    variance of these: their mean times q.
+    slopes are steps, which is structure. Counts of single photons have coarser steps, with their
+    own variance: their mean times q.
     """
     values = np.unique(image)
     if values.size > MOST_LEVELS:
@@ -111,7 +111,7 @@ def few_levels(image: np.ndarray) -> str:
     step = float(np.diff(values).min()) if values.size > 1 else 0.0
     # of neighbours along rows and columns, by second differences: slopes of rings cancel
     square = [np.diff(image, 2, axis).clip(-1e6 * step, 1e6 * step) ** 2 / 6 for axis in (0, 1)]
-    noise = float(np.mean([one.mean() for one in square]))
+    noise = float(np.mean([along.mean() for along in square]))
     counted = step * float((image - values[0]).mean())
     if noise >= min((step / 2) ** 2, 0.5 * counted):
         return ""
@@ -141,8 +141,8 @@ def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tenso
 def patches(image: torch.Tensor) -> torch.Tensor:
     """Pixels of bright patches, as of a reflection, and those within 2 px of one.
 
-    Brighter than the crests, taken as the brightest percent, by half of what these are above the
-    median. Where that is more than `MOST_SPOTS` of the pixels it is no patch, and none is.
+    They exceed the crests, taken as the brightest percent, by half of the crests' height above the
+    median. Where these are more than `MOST_SPOTS` of the pixels, none is a patch.
     """
     low, high = np.quantile(image.cpu().numpy(), [0.5, 0.99])
     bright = (image > high + 0.5 * (high - low)).float()[None, None]

@@ -296,22 +296,22 @@ def gap_from_lines(
     if (sorted_heights[1:] > 0.8 * sorted_heights[:-1]).any():
         # lines of about one height may be either way round
         orders.append(by_height[::-1])
-    found, refused = [], None
-    for one in orders:
+    gaps, refused = [], None
+    for order in orders:
         try:
-            e = fractions_of(rings, np.asarray(wavelength, float), one)
-            covariance = rings.fraction_covariance[np.ix_(one, one)]
-            found.append(gap_of_covariance(e, covariance, wavelength, nominal, tolerance))
+            e = fractions_of(rings, np.asarray(wavelength, float), order)
+            covariance = rings.fraction_covariance[np.ix_(order, order)]
+            gaps.append(gap_of_covariance(e, covariance, wavelength, nominal, tolerance))
         except InputError as error:
             refused = error
-    if not found:
+    if not gaps:
         raise refused or InputError("wavelength: no line")
-    if len(found) > 1:
+    if len(gaps) > 1:
         raise InputError(
             "wavelength: lines of about one height agree with a gap in either order of the "
             "wavelengths; expected a nominal gap that excludes one, or lines of different height"
         )
-    return found[0]
+    return gaps[0]
 
 
 def fractions_of(rings: Rings, wavelength: np.ndarray, line: np.ndarray) -> np.ndarray:

@@ -54,16 +54,16 @@ class Light:
 def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
     """Profile and cells of sectors (sectors, annuli): mean and number of pixels of each cell."""
     q = r2 / r2[-1]
-    some = count > 0
+    filled = count > 0
     smooth = np.broadcast_to(np.column_stack([np.ones_like(q), np.sqrt(q), q]), (*value.shape, 3))
     # a start: each sector less its own background, without what stands out of an annulus
-    residual = np.where(some, value - _fitted(value, smooth, count)[0], np.nan)
+    residual = np.where(filled, value - _fitted(value, smooth, count)[0], np.nan)
     middle = _median(residual)
     # 1.4826 times the median deviation is the standard deviation of normal errors
     reach = 3 * 1.4826 * np.nanmedian(np.abs(residual - middle))
     clipped = np.nan_to_num(np.clip(residual, middle - reach, middle + reach))
     profile = (clipped * count).sum(0) / np.maximum(count.sum(0), 1)
-    used, fraction = some, count / np.maximum(count.sum(0), 1)
+    used, fraction = filled, count / np.maximum(count.sum(0), 1)
     visible = np.ones(len(value), bool)
     for iteration in range(ITERATIONS):
         # a height that changes with r only once there is a profile to compare with
@@ -72,14 +72,14 @@ def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
             [smooth, np.broadcast_to(np.column_stack(parts), (*value.shape, len(parts)))], -1
         )
         model, linear, std = _fitted(value, columns, count * used)
-        residual = np.where(some, value - model, 0.0) * np.sqrt(count)
+        residual = np.where(filled, value - model, 0.0) * np.sqrt(count)
         # the profile follows a sector that is alone in an annulus
         remaining = 1 - fraction
         noise = _noise(residual / np.sqrt(np.maximum(remaining, 0.5)), used & (remaining >= 0.5))
         # on a crest there is more, as of photons
-        typical = _median(np.where(some & visible[:, None], np.abs(residual), np.nan))
+        typical = _median(np.where(filled & visible[:, None], np.abs(residual), np.nan))
         scale = np.maximum(noise, (1.4826 * typical) ** 2)
-        used = some & (np.abs(residual) <= OUTLIER * np.sqrt(scale) + 1e-12)
+        used = filled & (np.abs(residual) <= OUTLIER * np.sqrt(scale) + 1e-12)
         height = linear[:, 3:] @ np.stack([np.ones_like(q), q])[: len(parts)]
         mean = (height * count * used).sum(1) / np.maximum((count * used).sum(1), 1)
         # a sector of a few cells fits any profile, and its height is as large as its error
@@ -124,16 +124,16 @@ def _noise(residual: np.ndarray, used: np.ndarray) -> np.ndarray:
     for first, last in pairwise(edges):
         cells = np.abs(residual[:, first:last][used[:, first:last]])
         variances.append((1.4826 * np.median(cells)) ** 2 if len(cells) else np.nan)
-    found = np.array(variances)
-    known = found > 0
+    variance = np.array(variances)
+    known = variance > 0
     if not known.any():
         return np.full(size, np.finfo(float).tiny)
     middle = (edges[:-1] + edges[1:]) / 2
-    return np.interp(np.arange(size), middle[known], found[known])
+    return np.interp(np.arange(size), middle[known], variance[known])
 
 
 def _median(value: np.ndarray) -> np.ndarray:
-    """Over sectors; 0 where there is none."""
+    """Median over sectors; 0 where there is none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # an annulus without cells
         return np.nan_to_num(np.nanmedian(value, 0))

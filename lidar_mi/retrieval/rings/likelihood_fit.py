@@ -263,14 +263,15 @@ class _Task(NamedTuple):
 def _fit(images: torch.Tensor, task: _Task, number: int, method: str) -> RingFit:
     """`fit_rings` for some of the images, from the ``number``-th on.
 
-    If one is refused, each is fitted alone; what is refused then, without its bright patches.
+    If one is refused, each is fitted alone; those refused again are fitted without their bright
+    patches.
     """
     try:
         return _fit_together(images, task, number, method)
     except InputError:
         if len(images) > 1:
             each = enumerate(images[:, None], number)
-            return _joined([_fit(one, task, k, method) for k, one in each])
+            return _joined([_fit(image, task, k, method) for k, image in each])
         bright = patches(images[0])
         if method != "annular" or task.spotless or not bright.any():
             raise
@@ -307,7 +308,7 @@ def _fit_together(images: torch.Tensor, task: _Task, number: int, method: str) -
 
 
 def _without_spots(fit: RingFit, images: torch.Tensor, task: _Task, number: int) -> RingFit:
-    """Images that fit poorly again, without their hot and dead pixels, if they have any."""
+    """Poorly fitted images fitted again without their hot and dead pixels."""
     for k in (fit.chi_square > POOR).nonzero()[:, 0].tolist():
         bad = spots(images[k].double(), task.noise)
         if 0 < bad.sum() < MOST_SPOTS * bad.numel():
@@ -324,8 +325,8 @@ def _part(fit: RingFit, which: slice) -> RingFit:
 
 def _check(fit: RingFit, task: _Task, number: int) -> None:
     """Raise InputError unless all images have their centre inside, two rings and a good fit."""
-    found = (values.tolist() for values in (fit.of("x"), fit.of("y"), fit.rings, fit.chi_square))
-    for k, (x, y, rings, misfit) in enumerate(zip(*found, strict=True)):
+    numbers = (values.tolist() for values in (fit.of("x"), fit.of("y"), fit.rings, fit.chi_square))
+    for k, (x, y, rings, misfit) in enumerate(zip(*numbers, strict=True)):
         name = f"images[{number + k}]"
         inside(x, y, task.model.shape, f"{name}: centre")
         if rings < 2:
@@ -391,13 +392,13 @@ def _start(
     )
     weight = cells.count
     inverse = torch.linalg.pinv((basis * weight) @ basis.T, hermitian=True)
-    found = (means * weight) @ basis.T @ inverse
+    coefficients = (means * weight) @ basis.T @ inverse
     # the noise at the image's mean
-    spread = noise.variance(found[:, :1].clamp(min=0), found[:, :1].clamp(min=0))
-    size = found[:, 1:].norm(dim=1)
+    spread = noise.variance(coefficients[:, :1].clamp(min=0), coefficients[:, :1].clamp(min=0))
+    size = coefficients[:, 1:].norm(dim=1)
     error = (spread[:, 0] * inverse.diagonal()[1:].mean()).sqrt()
     for k in range(len(means)):
-        if not (found[k, 0] > 0 and size[k] > SIGNIFICANT * error[k]):
+        if not (coefficients[k, 0] > 0 and size[k] > SIGNIFICANT * error[k]):
             raise InputError(
                 f"images[{number + k}]: no rings detected (contrast {float(size[k]):.3g} electrons "
                 f"with {float(error[k]):.2g} of noise); expected rings"
@@ -405,11 +406,11 @@ def _start(
     parameters = model.start(means.device).repeat(len(means), 1)
     first = model.amplitudes(parameters[:1])[0][0, 0]
     # level Re(2 A_1 exp(2 pi i (m + s v))) = a cos + b sin: A_1 exp(2 pi i s v) ~ a - i b
-    wave = torch.complex(found[:, 1], -found[:, 2])
+    wave = torch.complex(coefficients[:, 1], -coefficients[:, 2])
     v = torch.angle(wave / first) / (2 * torch.pi) * model.velocity_range
     # no higher than the mean, so that the background is not negative
-    level = torch.minimum(size / (2 * abs(first)), found[:, 0])
-    for name, value in (("v_los", v), ("level", level), ("background", found[:, 0] - level)):
+    level = torch.minimum(size / (2 * abs(first)), coefficients[:, 0])
+    for name, value in (("v_los", v), ("level", level), ("background", coefficients[:, 0] - level)):
         parameters[:, PARAMETERS.index(name)] = value
     return parameters
 
@@ -428,7 +429,7 @@ def _sensitivity(waves: Waves, end: Scored, task: _Task) -> torch.Tensor:
     fisher = torch.diag(information) + fisher_matrix(free, weight)
     moved = torch.linalg.solve(fisher, (free * weight[:, None]) @ known.transpose(1, 2))
     first = moved[:, task.free.index("v_los")]
-    # the zero of the speeds itself moves all of them
+    # an error of the zero shifts all speeds
     return -torch.cat([torch.ones_like(first[:, :1]), first], 1)
 
 

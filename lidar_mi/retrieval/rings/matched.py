@@ -81,7 +81,7 @@ class MatchedScore:
 
 @dataclass(frozen=True, eq=False)
 class MatchedRead:
-    """What was read, tensors of shape (images,) unless stated, float64.
+    """Retrieved values, tensors of shape (images,) unless stated, float64.
 
     Attributes
     ----------
@@ -165,9 +165,9 @@ def matched_score(
 def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
     """Speeds and all other parameters of images near a reference.
 
-    Frames are summed up over the cells once, which takes most of the time. They are not searched
-    for hot pixels or saturated crests, as by `fit_rings`: an image that has some is not ``read``
-    once they show in chi-square. Images (images, height, width) are in electrons.
+    Frames are summed up over the cells once, which takes most of the time. Unlike in `fit_rings`
+    they are not searched for hot pixels or saturated crests: an image with some is not ``read``
+    where chi-square is too large. Images (images, height, width) are in electrons.
 
     Raises
     ------
@@ -198,10 +198,10 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
 
 
 def _read(means: torch.Tensor, score: MatchedScore) -> tuple[torch.Tensor, ...]:
-    """Of some images the parameters from the cells' centre, their errors, chi-square, and an end.
+    """Parameters of some images from the cells' centre, errors, chi-square, and convergence.
 
-    From means (images, cells) to (images, `PARAMETERS`), (images, names), (images,) and whether
-    the last step was small, (images,). An image whose last step was small is not looked at again.
+    From means (images, cells) to (images, `PARAMETERS`), (images, names), (images,) and whether the
+    last step was small, (images,). Images whose last step was small are finished.
     """
     model, names, columns = score.model, score.names, _columns(score)
     at, mean = _started(score, means)
@@ -213,20 +213,22 @@ def _read(means: torch.Tensor, score: MatchedScore) -> tuple[torch.Tensor, ...]:
     std, chi_square = at.new_zeros(len(at), len(names)), at.new_zeros(len(at))
     far = torch.arange(len(at), device=at.device)
     for number in range(ITERATIONS):
-        here = at[far]
+        current = at[far]
         if number:
-            mean = mean_and_jacobian(model, score.single, here.float())[0]
+            mean = mean_and_jacobian(model, score.single, current.float())[0]
         misfit = (means[far] - mean).float()
-        variance = cell_variance(mean.float(), here.float(), score.noise) / score.single.cells.count
-        brighter = (here[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
+        variance = (
+            cell_variance(mean.float(), current.float(), score.noise) / score.single.cells.count
+        )
+        brighter = (current[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
         grown = torch.where(added, 1.0, brighter)
         std[far] = ((variance @ squares.T).double() + by_priors).sqrt() / grown
         chi_square[far] = (misfit**2 / variance).sum(1).double() / freedom
         total = (misfit @ influence.T).double()
-        total += (middle - here[:, columns]) * information @ score.inverse
+        total += (middle - current[:, columns]) * information @ score.inverse
         step = total / grown
-        here[:, columns] += step
-        at[far] = here
+        current[:, columns] += step
+        at[far] = current
         far = far[(step.abs() > CLOSE * std[far]).any(1)]
         if not len(far):
             break
@@ -244,10 +246,10 @@ def _started(score: MatchedScore, means: torch.Tensor) -> tuple[torch.Tensor, to
     at = score.values.repeat(len(means), 1)
     at[:, _PLACE] = 0
     count = score.waves.cells.count
-    lit = score.mean - score.dark
-    brighter = (((means - score.dark) @ count) / (lit @ count)).clamp(0.1, 10)
+    signal = score.mean - score.dark
+    brighter = (((means - score.dark) @ count) / (signal @ count)).clamp(0.1, 10)
     at[:, _LEVEL] *= brighter
-    return at, score.dark + brighter[:, None] * lit
+    return at, score.dark + brighter[:, None] * signal
 
 
 def _in_single(waves: Waves) -> Waves:
@@ -263,5 +265,4 @@ def _in_single(waves: Waves) -> Waves:
         spread=spread,
         terms=cells.terms.float(),
     )
-    rest = (part.float() for part in waves[1:])
-    return Waves(cells, *rest)
+    return Waves(cells, *(part.float() for part in waves[1:]))

@@ -125,7 +125,7 @@ def _area(model: RingModel) -> float:
     return PIXEL_R2 + model.blur / 2
 
 
-def _lean(model: RingModel, r2: torch.Tensor) -> torch.Tensor:
+def _cosine_less_one(model: RingModel, r2: torch.Tensor) -> torch.Tensor:
     """Cosine of the angle less 1."""
     tangent2 = (model.pixel / model.focal_length) ** 2 * r2
     secant2 = 1 + tangent2
@@ -175,22 +175,22 @@ def mean_and_jacobian(
     r2 = squared_radius(model, cells, dx, dy)
     light = _light(model, cells, r2, parameters)
     # more light at the inner end of a cell
-    lean = _lean(model, torch.addcmul(r2, falloff, waves.variance, value=-1 / area))
+    lean = _cosine_less_one(model, torch.addcmul(r2, falloff, waves.variance, value=-1 / area))
     centre = model.order_at_centre
     moved = torch.add(centre % 1 - waves.order, lean, alpha=centre)
-    # the speed itself turns all waves alike, below: here is how that falls off with the angle
+    # the phase by the speed on the axis is applied below: this is its decrease with the angle
     moved.addcmul_(v / model.velocity_range, lean)
     amplitudes, by = model.amplitudes(parameters)
     n = torch.arange(1, amplitudes.shape[1] + 1, dtype=torch.float64, device=v.device)
     turned = torch.polar(torch.ones_like(v), 2 * math.pi * v / model.velocity_range) ** n
-    # of the Taylor series in the order
+    # terms of the Taylor series in the order
     powers = torch.stack([(2j * math.pi * n) ** k / math.factorial(k) for k in range(4)])
     terms = _product((powers[:, None] * (amplitudes * turned)).flatten(0, 1), waves.waves).chunk(4)
     profile = terms[3]
     for term in reversed(terms[:3]):
         profile = torch.addcmul(term, moved, profile)
-    lit = light * profile.add_(1)
-    mean = torch.addcmul(background, level, lit)
+    pattern = light * profile.add_(1)
+    mean = torch.addcmul(background, level, pattern)
     uneven = [name for name in model.smooth if name in BACKGROUND]
     if uneven:
         mean += _smooth(model, cells, parameters, uneven)
@@ -205,19 +205,19 @@ def mean_and_jacobian(
             row[:] = bright * slope * (cosine / model.velocity_range)
         elif name in ("x", "y"):
             off = dx - cells.x if name == "x" else dy - cells.y
-            row[:] = (by_r2 - level * lit * falloff / area) * 2 * off
+            row[:] = (by_r2 - level * pattern * falloff / area) * 2 * off
         elif name == "level":
-            row[:] = lit
+            row[:] = pattern
         elif name == "background":
             row[:] = 1
         elif name == "falloff":
-            row[:] = -level * lit * r2 / area
+            row[:] = -level * pattern * r2 / area
         elif name in SHAPE:
             first = by[name] * turned
             change = _product(first, waves.waves)
             row[:] = bright * (change + moved * _product(first * (2j * math.pi * n), waves.waves))
         elif name in LIGHT:
-            row[:] = level * lit * cells.terms[:, model.smooth.index(name)]
+            row[:] = level * pattern * cells.terms[:, model.smooth.index(name)]
         elif name in BACKGROUND:
             row[:] = cells.terms[:, model.smooth.index(name)]
         elif name == "focal_length":
@@ -366,7 +366,7 @@ def _disc(square: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     Both are entire functions of z^2, so that a fit may pass through 0; below it they are modified
     Bessel functions.
     """
-    # next to 0 differences of numbers next to each other: the series is exact to 1e-9
+    # the closed forms cancel near 0: there the series is exact to 1e-9
     value = 1 - square / 8 + square**2 / 192
     slope = -1 / 8 + square / 96 - square**2 / 3072
     for side, zeroth, first, sign in (

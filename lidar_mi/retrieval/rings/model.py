@@ -146,7 +146,7 @@ class RingModel:
                     f"priors: {name}: {mean!r} +- {std!r} is not allowed; expected a parameter, a "
                     "finite mean and a standard deviation above 0"
                 )
-        # degrees that cannot be
+        # raises for impossible degrees
         term_names("light", self.light_degree)
         term_names("background", self.background_degree)
 
@@ -332,13 +332,13 @@ class PixelNoise:
     def variance(self, mean: Electrons, signal: Electrons) -> Electrons:
         """Electrons^2, of pixels with ``mean`` electrons, ``signal`` of them laser light.
 
-        A Poisson number whose mean is Gamma distributed is negative binomial: mean +
-        signal^2 / M. Its likelihood, like Poisson's own, has the score (count - mean) / variance
-        d mean, so that weighting by the variance of the fitted mean *is* maximum likelihood.
-        With read noise the exact density is a convolution; the same score then loses less than
-        1 % of the information for a mean of 20 electrons or more and 4 % at worst (5 electrons
-        rms, M = 10 or more). A multiplied number has the variance ``excess`` times Poisson's; the
-        score is then that of its first two moments.
+        A Poisson number whose mean is Gamma distributed is negative binomial: mean + signal^2 / M.
+        Its likelihood, like Poisson's own, has the score (count - mean) / variance d mean, so that
+        weighting by the variance of the fitted mean is maximum likelihood. With read noise the
+        exact density is a convolution; the same score then loses less than 1 % of the information
+        for a mean of 20 electrons or more and 4 % at worst (5 electrons rms, M = 10 or more). A
+        multiplied number has the variance ``excess`` times Poisson's; the score is then that of its
+        first two moments.
         """
         return self.excess * mean + signal**2 / self.speckle_modes + self.read_noise**2
 

@@ -82,10 +82,10 @@ def _harmonics(phase: np.ndarray, loss: float, spread: np.ndarray) -> np.ndarray
     """exp(-n loss - n^2 spread + 2 pi i n phase) from n = 1 on, complex, (n, annuli)."""
     n = np.arange(1, MOST_HARMONICS + 1)
     weight = np.exp(-n * loss - n**2 * spread.min())
-    # those after the last that counts, in P or in a derivative
+    # harmonics that neither P nor a derivative needs
     small = np.flatnonzero((weight < 1e-5) & (n * weight < 1e-4))
     waves = np.empty((small[0] + 1 if small.size else len(n), len(phase)), complex)
-    # from one to the next: exp(-n^2 spread) falls by exp(-(2 n - 1) spread)
+    # recursion: exp(-n^2 spread) falls by exp(-(2 n - 1) spread)
     factor = np.exp(2j * np.pi * phase - loss - spread)
     fall = np.exp(-2 * spread)
     before = np.ones(1)
@@ -107,9 +107,9 @@ def _derivatives(waves: np.ndarray, fraction: np.ndarray) -> np.ndarray:
     n = np.arange(1, len(waves) + 1)
     by = 2 * np.stack([np.ones(len(n)), 2j * np.pi * n, -n, -(n**2)])
     turned = by[:, None] * np.exp(-2j * np.pi * n * fraction[:, None])
-    found = _product(turned.reshape(-1, len(n)), waves).real.reshape(4, len(fraction), -1)
-    found[0] += 1
-    return found
+    derivatives = _product(turned.reshape(-1, len(n)), waves).real.reshape(4, len(fraction), -1)
+    derivatives[0] += 1
+    return derivatives
 
 
 def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -160,8 +160,8 @@ class Profile:
     def residual(self, pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Weighted residual, columns and linear parameters of least squares."""
         columns = self.columns(pattern)
-        found = np.linalg.solve(_squares(columns), columns.T @ (self.value * self.root))
-        return self.value * self.root - columns @ found, columns, found
+        linear = np.linalg.solve(_squares(columns), columns.T @ (self.value * self.root))
+        return self.value * self.root - columns @ linear, columns, linear
 
     def matched(
         self, pattern: Pattern, bins: int = 64
@@ -194,7 +194,7 @@ class Profile:
                 spread=x[-1],
             )
 
-        found = least_squares(
+        solution = least_squares(
             lambda x: self.residual(made(x))[0],
             start.clip(low + 1e-9, high - 1e-9),
             jac=lambda x: self._slopes(made(x), pattern.spacing),
@@ -204,10 +204,10 @@ class Profile:
             ftol=1e-7,
             xtol=1e-6,
         )
-        best = made(found.x)
+        best = made(solution.x)
         residual, columns, linear = self.residual(best)
         wave = columns[:, 3:] @ linear[3:]
-        # power of the pattern alone: the part that a background would explain is not its own
+        # power of the pattern less the part that a background would explain
         basis = np.linalg.qr(columns[:, :3])[0]
         wave = wave - basis @ (basis.T @ wave)
         per_line = linear[3:].reshape(lines, -1)
@@ -220,7 +220,7 @@ class Profile:
             height=height / top,
             unexplained=float(residual @ residual),
             power=float(wave @ wave),
-            freedom=max(len(residual) - len(linear) - len(found.x), 1),
+            freedom=max(len(residual) - len(linear) - len(solution.x), 1),
         )
 
     def _slopes(self, pattern: Pattern, unit: float) -> np.ndarray:
@@ -239,8 +239,8 @@ class Profile:
             -(height * by_loss).sum(0),
             -(height * by_spread).sum(0),
         ]
-        found = np.stack(rows, 1)
-        return found - columns @ np.linalg.solve(_squares(columns), columns.T @ found)
+        slopes = np.stack(rows, 1)
+        return slopes - columns @ np.linalg.solve(_squares(columns), columns.T @ slopes)
 
     def top(self, pattern: Pattern) -> float:
         """Height of the highest line, in the profile's unit."""
@@ -256,7 +256,7 @@ class Profile:
         lines = len(pattern.fraction)
         waves = columns[:, 3:].reshape(len(self.r2), lines, -1) / self.root[:, None, None]
         parts = (waves * linear[3:].reshape(lines, -1)).sum(2)
-        found = []
+        crests = []
         for line, fraction in enumerate(pattern.fraction):
             alone = self.value - parts.sum(1) + parts[:, line]
             orders = np.arange(1, self.last / pattern.spacing - 1)
@@ -265,8 +265,8 @@ class Profile:
             middle, low, high = (
                 np.interp(place + by, self.r2, alone) for by in (0.0, -width, width)
             )
-            found.append((middle - (low + high) / 2).mean() if len(place) else np.inf)
-        return np.array(found)
+            crests.append((middle - (low + high) / 2).mean() if len(place) else np.inf)
+        return np.array(crests)
 
     def height_std(self, pattern: Pattern, noise: float) -> np.ndarray:
         """Standard errors of the relative heights for weighted noise of that variance."""
@@ -338,11 +338,11 @@ def lines_at(profile: Profile, spacing: float, noise: float, most: int = LINES) 
         tried = sorted(
             map(profile.fitted, _starts(best, further, most)), key=lambda p: p.unexplained
         )
-        for one in tried:
-            if _plausible(one, profile, noise):
-                chosen = one
+        for candidate in tried:
+            if _plausible(candidate, profile, noise):
+                chosen = candidate
                 break
-        best = next((one for one in tried if len(one.fraction) < most), tried[0])
+        best = next((candidate for candidate in tried if len(candidate.fraction) < most), tried[0])
         further = profile.matched(best)
         if best.height.min() <= 0:
             break
@@ -351,9 +351,9 @@ def lines_at(profile: Profile, spacing: float, noise: float, most: int = LINES) 
 
 def _first(profile: Profile, spacing: float, loss: float) -> Pattern:
     """One line of that width where it explains most."""
-    none, one = np.zeros(0), np.ones(1)
+    none = np.zeros(0)
     fraction, height, std = profile.matched(Pattern(spacing, none, none, loss, 0.0))
-    return Pattern(spacing, fraction[[(height / std).argmax()]], one, loss, 0.0)
+    return Pattern(spacing, fraction[[(height / std).argmax()]], np.ones(1), loss, 0.0)
 
 
 def _starts(pattern: Pattern, further: tuple[np.ndarray, ...], most: int) -> list[Pattern]:
@@ -373,7 +373,7 @@ def _starts(pattern: Pattern, further: tuple[np.ndarray, ...], most: int) -> lis
         for part in parts
         if len(others) + len(part) <= most
     ]
-    return [replace(one, height=np.ones(len(one.fraction))) for one in (added, *split)]
+    return [replace(start, height=np.ones(len(start.fraction))) for start in (added, *split)]
 
 
 def _plausible(pattern: Pattern, profile: Profile, noise: float) -> bool:
@@ -384,9 +384,9 @@ def _plausible(pattern: Pattern, profile: Profile, noise: float) -> bool:
     distance = np.diff(np.append(fraction, fraction[0] + 1))
     std = profile.height_std(pattern, noise)
     top = profile.top(pattern)
-    _, other, other_std = profile.matched(pattern)
-    above_noise = np.abs(other) > SIGNIFICANT * math.sqrt(noise) * other_std
-    floor = np.abs(other[above_noise]).max(initial=0.0) / top
+    _, further, further_std = profile.matched(pattern)
+    above_noise = np.abs(further) > SIGNIFICANT * math.sqrt(noise) * further_std
+    floor = np.abs(further[above_noise]).max(initial=0.0) / top
     least = np.maximum(SIGNIFICANT * std, max(FAINT, 2 * floor))
     if (pattern.height < least).any() or distance.min() < DISTINCT * pattern.width:
         return False
@@ -414,8 +414,8 @@ def find_pattern(
     equal distances cannot be distinguished from one line of a shorter spacing.
     """
     if spacing is not None:
-        found = lines_at(profile, spacing, noise)
-        return None if found is None else (found, "")
+        pattern = lines_at(profile, spacing, noise)
+        return None if pattern is None else (pattern, "")
     base = strongest_period(profile)
     tried: dict[int, Pattern] = {}
     multiples = [m for m in range(1, MULTIPLES + 1) if profile.last >= ORDERS * m * base]
@@ -427,9 +427,9 @@ def find_pattern(
         less = (min(residual[: multiples.index(multiple)], default=math.inf)) - remaining
         if first is not None and less < MATERIAL / DOUBTFUL * power:
             continue
-        found = lines_at(profile, multiple * base, noise)
-        if found is not None:
-            tried[multiple] = found
+        pattern = lines_at(profile, multiple * base, noise)
+        if pattern is not None:
+            tried[multiple] = pattern
     if not tried:
         return None
     power = max(p.power for p in tried.values())

@@ -68,12 +68,12 @@ def peaks(
         return slopes
 
     guess = (reach / 2, low, *first_guess, *[high - low] * number, *[0.0] * slope)
-    found, covariance, *_, end = leastsq(
+    solution, covariance, *_, end = leastsq(
         misfit, guess, Dfun=jacobian, col_deriv=True, full_output=True, maxfev=3000
     )
     if end not in (1, 2, 3, 4) or covariance is None:
         raise failed
-    places, heights = found[2 : 2 + number], found[2 + number : 2 + 2 * number]
+    places, heights = solution[2 : 2 + number], solution[2 + number : 2 + 2 * number]
     if not (np.all(np.abs(places - first_guess) < 0.7 * reach) and np.all(heights > 0)):
         raise failed
     return places

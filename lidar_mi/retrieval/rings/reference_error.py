@@ -132,11 +132,11 @@ class ReferenceUncertainty:
         """
         drifts = replace(self, scrambling=1.0).total
         unscrambled = replace(self, scrambling=0.0).terms()
-        plates = math.hypot(unscrambled["bow and pupil"], unscrambled["wedge and pupil"])
+        by_pupil = math.hypot(unscrambled["bow and pupil"], unscrambled["wedge and pupil"])
         if not limit >= drifts:
             raise InputError(
                 f"limit: {limit!r} m/s is not allowed; expected at least {drifts:.3g} m/s, which "
                 "laser and etalon drift cause"
             )
         room = math.sqrt(limit**2 - drifts**2)
-        return 0.0 if room >= plates else 1 - room / plates
+        return 0.0 if room >= by_pupil else 1 - room / by_pupil

@@ -96,8 +96,8 @@ def fit_all(
         # a ring that its noise would move off its line stays where the pattern has it
         firm = system.parts(std)[1] < 0.1 * pattern.width
         deviation = {
-            key: float(deviation.get(key, 0.0) + moved) if held else 0.0
-            for key, moved, held in zip(system.keys, ring_change, firm, strict=True)
+            key: float(deviation.get(key, 0.0) + moved) if certain else 0.0
+            for key, moved, certain in zip(system.keys, ring_change, firm, strict=True)
         }
         top = np.maximum(pattern.height + heights, 0.2 * pattern.height)
         pattern = replace(
@@ -131,8 +131,8 @@ def fit_all(
 def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
     """Where the rings of a pattern are lower than `HIDDEN` of the usual ring, for certain.
 
-    The height of a ring in a sector is by least squares over an order about it, together with a
-    level and a slope.
+    The height of a ring in a sector is a least-squares fit over one order about it, with a level
+    and a slope.
     """
     if pattern is None:
         return None
@@ -161,7 +161,7 @@ def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
         return None
     usual = np.quantile(height[firm], 0.8)
     which = height + 3 * std < HIDDEN * usual
-    # the edge of what hides them runs through their neighbours
+    # the obstacle's edge runs through the neighbours
     which |= np.roll(which, 1, 0) | np.roll(which, -1, 0)
     return Hidden(pattern.spacing, fraction, which) if which.any() else None
 
@@ -213,7 +213,7 @@ class _System:
         q1 = q / q[-1]
         smooth = np.stack([np.ones_like(q), np.sqrt(q1), q1, total, q1 * total], -1)
         smooth = np.repeat(smooth[None], SECTORS, 0)
-        # about a single ring, a height that changes is hardly another than a shift
+        # for a single ring a height gradient is hardly different from a shift
         extent = np.where(sectors.used > 0, q, 0).max(1)
         smooth[extent < TWO_RINGS * pattern.spacing, :, 4] = 0
         root = np.sqrt(sectors.used)
@@ -234,7 +234,7 @@ class _System:
             local = linear[:, 3, None] + linear[:, 4, None] * q1
             residual = sectors.value - np.einsum("sqk,sk->sq", smooth, linear)
             residual = residual - local * along_q * sectors.offset
-            keep = keep * _usual(residual, weight)
+            keep = keep * _undisturbed(residual, weight)
         columns = np.concatenate([moved, np.broadcast_to(shared.T, (SECTORS, *shared.T.shape))], -1)
         columns = columns * (local * root * keep)[..., None]
         residual = residual * root * keep
@@ -328,15 +328,15 @@ class _System:
         """Sectors over which errors are correlated: Andrews' rule for an autoregression."""
         shift, information = self._shifts()
         reduced = np.nan_to_num(shift * np.sqrt(information))
-        both = (reduced != 0) & (np.roll(reduced, 1, 1) != 0)
-        product = (reduced * np.roll(reduced, 1, 1))[both].sum()
-        power = (reduced**2)[both].sum()
+        pairs = (reduced != 0) & (np.roll(reduced, 1, 1) != 0)
+        product = (reduced * np.roll(reduced, 1, 1))[pairs].sum()
+        power = (reduced**2)[pairs].sum()
         if not power > 0:
             return 0.0
         # the harmonics that the geometry takes make neighbours of white noise anticorrelated
         correlation = product / power + (1 + self.geometry_slots) / SECTORS
         # of white noise the estimate scatters by one over the root of the number of pairs
-        if correlation < 2.5 / np.sqrt(both.sum()):
+        if correlation < 2.5 / np.sqrt(pairs.sum()):
             return 0.0
         rho = min(correlation, 0.9)
         return min(1.1447 * (4 * rho**2 / (1 - rho**2) ** 2 * SECTORS) ** (1 / 3), SECTORS / 5)
@@ -352,7 +352,7 @@ class _System:
 
 def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
     """Order, line and number of sectors of the rings in enough of them, by their radius."""
-    found = []
+    rings = []
     present = (sectors.used > 0).sum(0)
     half = 0.5 * pattern.width * pattern.spacing
     for line, fraction in enumerate(pattern.fraction):
@@ -360,14 +360,14 @@ def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
             place = (order + fraction) * pattern.spacing
             last = int((place + half) / sectors.step)
             if place > 2 * half and last < len(present) and present[last] >= LEAST:
-                found.append((place, order, line, present[last]))
-    if len(found) < 2:
-        raise InputError(f"rings: {len(found)} detected; expected at least 2")
-    found.sort()
-    return np.array([f[1:] for f in found]).T
+                rings.append((place, order, line, present[last]))
+    if len(rings) < 2:
+        raise InputError(f"rings: {len(rings)} detected; expected at least 2")
+    rings.sort()
+    return np.array([f[1:] for f in rings]).T
 
 
-def _usual(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _undisturbed(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Cells that are no dust and no reflection: near the median of their annulus."""
     reduced = np.where(weight > 0, residual * weight, np.nan)
     with warnings.catch_warnings():

@@ -60,7 +60,7 @@ def robust_scoring(
         if all(torch.equal(a, b) for a, b in zip(inside, used, strict=True)):
             break
         used, parameters = inside, end.parameters
-    # where the rest does not fit either, it is the model that is wrong: no cell is to blame
+    # where the remaining cells do not fit either, the model is wrong: none is masked
     wrong = (end.chi_square > POOR) & (end.outliers > 0)
     if wrong.any():
         used = [part | wrong[:, None] for part in end.used]

@@ -79,8 +79,8 @@ class Hidden:
 class Sectors:
     """Averages over sectors of annuli of equal steps in squared mean radius.
 
-    Out to where the last sector leaves the image. A sector cut by the edge has no pixels: it would
-    average another part of the image.
+    They extend to where the last sector leaves the image. Sectors cut by the edge have no pixels,
+    as they would average another part of the image.
 
     Attributes
     ----------
@@ -123,9 +123,9 @@ class Sectors:
         full = full[:, :last]
         self.r2 = (np.arange(last) + 0.5) * self.step
         self.count = np.where(full, count[:, :last], 0).astype(float)
-        some = np.maximum(self.count, 1)
-        self.value = np.where(full, total[:, :last], 0) / some
-        self.offset = np.where(self.count > 0, total_r2[:, :last] / some - self.r2, 0.0)
+        divisor = np.maximum(self.count, 1)
+        self.value = np.where(full, total[:, :last], 0) / divisor
+        self.offset = np.where(self.count > 0, total_r2[:, :last] / divisor - self.r2, 0.0)
         if hidden is not None:
             self.count = np.where(hidden.cells(self.r2), 0.0, self.count)
         light = common_light(self.r2, self.value, self.count)

@@ -44,10 +44,10 @@ class RingSeries(Tabular):
 
     def columns(self) -> dict[str, list[Any]]:
         """The same as numbers, one value for each frame; NaN where there is none."""
-        found: dict[str, list[Any]] = {"frame": list(range(len(self.rings)))}
+        columns: dict[str, list[Any]] = {"frame": list(range(len(self.rings)))}
 
         def column(name: str, value: Callable[[Rings], Any]) -> None:
-            found[name] = [np.nan if one is None else value(one) for one in self.rings]
+            columns[name] = [np.nan if rings is None else value(rings) for rings in self.rings]
 
         column("centre_x", lambda r: r.centre[0])
         column("centre_x_std", lambda r: r.centre_std[0])
@@ -60,11 +60,11 @@ class RingSeries(Tabular):
             for name in ("fraction", "fraction_std", "height"):
                 column(f"{name}_{k}", partial(_of_line, name, k))
         column("misfit", lambda r: r.misfit)
-        found["note"] = [
+        columns["note"] = [
             reason if rings is None else rings.doubt
             for rings, reason in zip(self.rings, self.refused, strict=True)
         ]
-        return found
+        return columns
 
 
 def _of_line(name: str, line: int, rings: Rings) -> float:
@@ -87,28 +87,28 @@ def analyse_series(
     of `analyse_rings`.
     """
     stored = list(frames)
-    rings: list[Rings | None] = []
+    series: list[Rings | None] = []
     refused: list[str] = []
     for frame in stored:
-        one, reason = _tried(frame, centre, saturation, spacing)
-        rings.append(one)
+        rings, reason = _tried(frame, centre, saturation, spacing)
+        series.append(rings)
         refused.append(reason)
-    known = np.array([one.spacing for one in rings if one is not None])
+    known = np.array([rings.spacing for rings in series if rings is not None])
     if spacing is not None or not len(known):
-        return RingSeries(tuple(rings), tuple(refused))
+        return RingSeries(tuple(series), tuple(refused))
     same = np.abs(known[:, None] / known - 1) < SAME
     common = float(np.median(known[same[same.sum(1).argmax()]]))
-    for number, one in enumerate(rings):
-        if one is not None and abs(one.spacing / common - 1) < SAME:
-            rings[number] = replace(one, doubt="")
+    for number, rings in enumerate(series):
+        if rings is not None and abs(rings.spacing / common - 1) < SAME:
+            series[number] = replace(rings, doubt="")
             continue
         again, reason = _tried(stored[number], centre, saturation, common)
         if again is not None:
-            rings[number], refused[number] = replace(again, doubt=""), ""
-        elif one is not None:
-            doubt = f"{one.spacing / common:.3g} times the spacing of the other frames"
-            rings[number] = replace(one, doubt=doubt)
-    return RingSeries(tuple(rings), tuple(refused))
+            series[number], refused[number] = replace(again, doubt=""), ""
+        elif rings is not None:
+            doubt = f"{rings.spacing / common:.3g} times the spacing of the other frames"
+            series[number] = replace(rings, doubt=doubt)
+    return RingSeries(tuple(series), tuple(refused))
 
 
 def _tried(

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, non_finite
+from lidar_mi.retrieval.images.quality import non_finite
 from lidar_mi.retrieval.images.windows import Windows, image_pair
 from lidar_mi.retrieval.vortices.image_builder import Acquisition
 from lidar_mi.retrieval.vortices.image_fit import fit_pixels

@@ -27,9 +27,9 @@ def wind_bound(
 
     The Cramer-Rao bound, see `bound.displacement_bound`. Grid and parameters are those of
     `retrieve_wind`, as is the time difference of a vector, which is that of air at rest. Infinite
-    without texture, NaN near non-finite pixels. A field that is fitted
-    to the images as a whole uses more than a template and may be better. Noise below 0.001 of the
-    median of a map is raised to that.
+    without texture, NaN near non-finite pixels. A field that is fitted to the images as a whole
+    uses more than a template and may be better. Noise below 0.001 of the map's median is raised to
+    that value.
 
     Returns
     -------
@@ -42,22 +42,22 @@ def wind_bound(
         As `retrieve_wind`.
     """
     dt = positive("dt", dt)
-    (image1, image2), known = checked_stack([image1, image2], noise)
+    (image1, image2), checked = checked_stack([image1, image2], noise)
     frame = windows.on(image1.shape)
-    level: float | torch.Tensor | None
-    if isinstance(known, xr.DataArray):
-        level = on_device(known.clip(min=1e-3 * float(known.median())), device)
+    sigma: float | torch.Tensor | None
+    if isinstance(checked, xr.DataArray):
+        sigma = on_device(checked.clip(min=1e-3 * float(checked.median())), device)
     else:
-        level = known
+        sigma = checked
     pair = [on_device(image, device) for image in (image1, image2)]
-    covariance = displacement_bound(filled(pair[0]), filled(pair[1]), level, frame.template)
+    covariance = displacement_bound(filled(pair[0]), filled(pair[1]), sigma, frame.template)
     rows, columns = (torch.as_tensor(frame.starts(axis)) for axis in (0, 1))
     root = covariance[:2, rows][:, :, columns].sqrt()
     bound = torch.where(non_finite(pair, frame), torch.nan, root).cpu().numpy()
     tau = checked_times(times, [image1, image2], dt)
     interval = vector_times(tau, dt, frame, np.zeros((2, *frame.count)), False).difference
-    found = {}
+    bounds = {}
     for name, values, step in zip("wv", bound, spacing(image1), strict=True):
         about = f"Cramer-Rao bound of {name} from one template", "m s-1"
-        found[f"{name}_bound"] = field(("z", "y"), values * step / interval, *about)
-    return xr.Dataset(found, centres(image1, frame, "template"))
+        bounds[f"{name}_bound"] = field(("z", "y"), values * step / interval, *about)
+    return xr.Dataset(bounds, centres(image1, frame, "template"))

@@ -9,8 +9,8 @@ import torch
 import xarray as xr
 
 import lidar_mi.plots  # noqa: F401 - data.lidar.plot()
+from lidar_mi.flags import REJECTED, Flag, flag_attributes
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 
 COMPONENTS = {"x": "u", "y": "v", "z": "w"}
@@ -28,7 +28,7 @@ Variable = tuple[Sequence[str], np.ndarray, dict[str, Any]]
 
 
 def spacing(image: xr.DataArray) -> tuple[float, ...]:
-    """Of the pixels along every dim, m."""
+    """Spacing of the pixels along every dim, m."""
     nodes = [image.coords.variables[axis].values.astype(float) for axis in image.dims]
     return tuple(float((n[-1] - n[0]) / (len(n) - 1)) for n in nodes)
 
@@ -44,19 +44,19 @@ def field(
 
 def centres(image: xr.DataArray, windows: Windows, what: str) -> dict[str, Variable]:
     """Coordinates of the windows' centres, m."""
-    found: dict[str, Variable] = {}
+    coords: dict[str, Variable] = {}
     for number, axis in enumerate(map(str, image.dims)):
         pixel = image.coords.variables[axis].values.astype(float)
         start = np.asarray(windows.starts(number))
         place = (pixel[start] + pixel[start + windows.template - 1]) / 2
         direction, about = _DIRECTIONS[axis]
         about = {"long_name": f"{what} centre, {direction}", "units": "m", **about}
-        found[axis] = (axis,), place, about
-    return found
+        coords[axis] = (axis,), place, about
+    return coords
 
 
 def winds(
-    found: Displacement, axes: Sequence[str], steps: Sequence[float], dt: float | np.ndarray
+    displacement: Displacement, axes: Sequence[str], steps: Sequence[float], dt: float | np.ndarray
 ) -> dict[str, Variable]:
     """Every component with its standard error and the correlations of their errors (m/s, 1).
 
@@ -65,7 +65,7 @@ def winds(
 
     Parameters
     ----------
-    found : Displacement
+    displacement : Displacement
     axes : sequence of str
         Of its components.
     steps : sequence of float
@@ -75,17 +75,17 @@ def winds(
     """
     names = {COMPONENTS[axis]: (number, axis) for number, axis in enumerate(axes)}
     names = dict(sorted(names.items()))
-    nothing = torch.full_like(found.d[0], torch.nan)
+    nothing = torch.full_like(displacement.d[0], torch.nan)
     dims = len(axes)
     covariance = nothing.expand(dims, dims, *nothing.shape)
-    if found.covariance is not None:
-        covariance = torch.where(found.d[0].isnan(), torch.nan, found.covariance)
+    if displacement.covariance is not None:
+        covariance = torch.where(displacement.d[0].isnan(), torch.nan, displacement.covariance)
     root = covariance.diagonal().sqrt().movedim(-1, 0)
     variables = {}
     for name, (number, axis) in names.items():
         variables[name] = field(
             axes,
-            found.d[number].cpu().numpy() * steps[number] / dt,
+            displacement.d[number].cpu().numpy() * steps[number] / dt,
             f"wind along {axis}",
             "m s-1",
             standard_name=_STANDARD_NAMES[name],
@@ -98,24 +98,19 @@ def winds(
             "m s-1",
             standard_name=f"{_STANDARD_NAMES[name]} standard_error",
         )
-    for one, other in combinations(names, 2):
-        a, b = names[one][0], names[other][0]
-        both = root[a] * root[b]
-        correlation = torch.where(both == 0, 0.0, covariance[a, b] / both)
-        long_name = f"correlation of the errors of {one} and {other}"
-        variables[f"{one}{other}_correlation"] = field(axes, correlation, long_name, "1")
+    for first, second in combinations(names, 2):
+        a, b = names[first][0], names[second][0]
+        product = root[a] * root[b]
+        correlation = torch.where(product == 0, 0.0, covariance[a, b] / product)
+        long_name = f"correlation of the errors of {first} and {second}"
+        variables[f"{first}{second}_correlation"] = field(axes, correlation, long_name, "1")
     return variables
 
 
-def flags(found: Displacement, axes: Sequence[str]) -> Variable:
+def flags(displacement: Displacement, axes: Sequence[str]) -> Variable:
     """The flag with its CF attributes."""
-    about = {
-        "long_name": "reasons to reject the vector, 0 = valid",
-        "standard_name": "quality_flag",
-        "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint16),
-        "flag_meanings": " ".join(str(bit.name).lower() for bit in Flag),
-    }
-    return tuple(axes), found.flag.cpu().numpy().astype(np.uint16), about
+    about = flag_attributes(Flag, REJECTED)
+    return tuple(axes), displacement.flag.cpu().numpy().astype(np.uint16), about
 
 
 def dataset(
@@ -123,13 +118,13 @@ def dataset(
     coords: Mapping[str, Variable],
     title: str,
     attributes: Mapping[str, object],
-    found: Displacement,
+    displacement: Displacement,
 ) -> xr.Dataset:
     """The data set, with the scalar quantities of the result."""
     attrs = {"Conventions": "CF-1.11", "title": title, **attributes, "dt_units": "s"}
     # all at once: each variable that a data set takes later copies and aligns it again
     scalars: dict[str, Any] = {}
-    for name, quantity in found.quantities.items():
+    for name, quantity in displacement.quantities.items():
         about: dict[str, str | float] = {"long_name": quantity.long_name, "units": quantity.units}
         scalars[name] = (), quantity.value, about
         about = about | {"long_name": f"standard error of {quantity.long_name}"}
@@ -137,7 +132,7 @@ def dataset(
             about["per_rotation"] = quantity.per_rotation
         scalars[f"{name}_stderr"] = (), quantity.stderr, about
     result = xr.Dataset({**variables, **scalars}, coords, attrs)
-    result.attrs.update(found.attributes)
+    result.attrs.update(displacement.attributes)
     for axis in result.dims:
         result.variables[axis].encoding["_FillValue"] = None
     return result

@@ -1,4 +1,4 @@
-"""What `retrieve_wind` and its like for series and volumes are asked for."""
+"""Options of `retrieve_wind` and of its like for series and volumes."""
 
 from dataclasses import dataclass
 

@@ -9,6 +9,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.correlation.outliers import median_outliers
 from lidar_mi.retrieval.correlation.settings import MultipassSettings
@@ -21,13 +22,7 @@ from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.beam_times import vector_times
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import (
-    Flag,
-    clearly_textured,
-    low_texture,
-    of_bootstrap,
-    of_fit,
-)
+from lidar_mi.retrieval.images.quality import clearly_textured, low_texture, of_bootstrap, of_fit
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.wind.dataset import centres
@@ -108,7 +103,7 @@ def retrieve_wind(
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
         their correlation, `time` (s from image 1's reference time, the vector's mid-time),
         `displacement_y`, `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1),
-        `isotropy`, `flag` (bits of `quality.Flag`, 0 = valid). The auxiliary coordinates
+        `isotropy`, `flag` (bits of `flags.Flag`, 0 = valid). The auxiliary coordinates
         `y_vector`, `z_vector` are the position of the vector at mid-time: the centre and, with "cc"
         and "ws", half the displacement. "vortex_fit" adds the pair's numbers, see
         `VortexPairFit.quantities`. Rejected vectors keep their value, or NaN if there is none.
@@ -139,8 +134,8 @@ def retrieve_wind(
     """
     chosen = method_of(method)
     images = [image1, image2, *more]
-    given = checked_input(images, dt, chosen, windows, noise, times, blur, device)
-    structure = sampling(given.pixels) if checks else no_structure(given.pixels)
+    inputs = checked_input(images, dt, chosen, windows, noise, times, blur, device)
+    structure = sampling(inputs.pixels) if checks else no_structure(inputs.pixels)
     options: dict[str, Any] = {
         "validation": validation,
         "blur": blur,
@@ -148,23 +143,23 @@ def retrieve_wind(
         "standard_errors": standard_errors,
         "device": device,
     }
-    if structure.thinned and samples_fit(given.images[0], structure, windows, blur > 0):
-        seen = None if times is None else [samples_of(t, structure) for t in times]
-        options |= {"dt": given.dt, "method": chosen, "times": seen}
-        places = centres(given.images[0], given.windows, "template")
+    if structure.thinned and samples_fit(inputs.images[0], structure, windows, blur > 0):
+        sample_times = None if times is None else [samples_of(t, structure) for t in times]
+        options |= {"dt": inputs.dt, "method": chosen, "times": sample_times}
+        places = centres(inputs.images[0], inputs.windows, "template")
         return wind_from_samples(
-            retrieve_wind, given.images, structure, windows, noise, places, **options
+            retrieve_wind, inputs.images, structure, windows, noise, places, **options
         )
-    given = given._replace(pixels=structure.masked(given.pixels))
+    inputs = inputs._replace(pixels=structure.masked(inputs.pixels))
 
-    def found() -> tuple[CleanImages, Vectors]:
+    def retrieve() -> tuple[CleanImages, Vectors]:
         remove = without_defects if checks else as_they_are
-        clean = remove(given.pixels, given.windows)
-        return clean, _vectors(chosen, given, clean, validation, settings, checks, standard_errors)
+        clean = remove(inputs.pixels, inputs.windows)
+        return clean, _vectors(chosen, inputs, clean, validation, settings, checks, standard_errors)
 
     with threads_for(image1.size):
-        clean, vectors = within_memory(found)
-    wind = pair_dataset(chosen, given, clean, vectors, validation)
+        clean, vectors = within_memory(retrieve)
+    wind = pair_dataset(chosen, inputs, clean, vectors, validation)
     if structure.spoilt or structure.thinned:
         wind["flag"] = wind["flag"] | np.int16(Flag.AT_REST)
     return wind.assign_attrs(sampling=structure.said) if structure.said else wind
@@ -172,7 +167,7 @@ def retrieve_wind(
 
 def _vectors(
     method: Method,
-    given: PairInput,
+    inputs: PairInput,
     clean: CleanImages,
     validation: VectorValidation,
     settings: MultipassSettings | VariationalSettings | None,
@@ -180,87 +175,86 @@ def _vectors(
     standard_errors: bool,
 ) -> Vectors:
     """Displacements with their errors and flags."""
-    windows = given.windows
-    # a correlation of windows would lose all that see a masked pixel
-    seen = clean.masked() if method.centred else clean.filled
-    estimate = _estimator(method, given, seen[2:], validation, settings)
-    found = estimate(*seen[:2], stride=windows.stride)
-    pair: Sequence[torch.Tensor] = seen[:2]
+    windows = inputs.windows
+    # a correlation would lose every window with a masked pixel
+    frames = clean.masked() if method.centred else clean.filled
+    estimate = _estimator(method, inputs, frames[2:], validation, settings)
+    displacement = estimate(*frames[:2], stride=windows.stride)
+    pair: Sequence[torch.Tensor] = frames[:2]
     pattern, copy, unexplained = Standing(), Copy(), False
-    tested = checks and not (given.times and method.timed)
-    if tested and len(seen) == 2 and found.quantities:
-        # how it changes the parameters is not known
-        copy = copy_at_rest(pair, found, windows)
+    tested = checks and not (inputs.times and method.timed)
+    if tested and len(frames) == 2 and displacement.quantities:
+        # its effect on the parameters is unknown
+        copy = copy_at_rest(pair, displacement, windows)
         unexplained = copy.significant
-    elif tested and len(seen) == 2:
-        again = partial(estimate, stride=windows.stride)
-        field = Displacement.medians if method.local else lambda one: one
-        raw, (found, copy, pair) = pair, without_copy(again, found, pair, windows, field)
+    elif tested and len(frames) == 2:
+        again, raw = partial(estimate, stride=windows.stride), pair
+        field = Displacement.medians if method.local else lambda d: d
+        displacement, copy, pair = without_copy(again, displacement, pair, windows, field)
         unexplained = copy.significant and pair is raw
-        found = copy.widened(found)
-    flag = clean.defects.flags(found, clean.raw, windows, method.centred)
+        displacement = copy.widened(displacement)
+    flag = clean.defects.flags(displacement, clean.raw, windows, method.centred)
     if method.local:
         blind = (flag & Flag.NON_FINITE_INPUT.value) > 0
-        found = found._replace(d=torch.where(blind, torch.nan, found.d))
-    level = 0.0 if given.noise is None else given.noise
+        displacement = displacement._replace(d=torch.where(blind, torch.nan, displacement.d))
+    level = 0.0 if inputs.noise is None else inputs.noise
     limits = validation.min_texture, validation.min_isotropy
     texture, low = low_texture(clean.filled[0], windows, *limits, level)
-    flag = flag | of_fit(found.covariance)
+    flag = flag | of_fit(displacement.covariance)
     if method.bootstrapped:
         clear, covariance = clearly_textured(texture, *limits), None
         if standard_errors:
             covariance = bootstrap_covariance(
-                pair, found, windows, estimate, method.centred, ~low, clear, given.noise
+                pair, displacement, windows, estimate, method.centred, ~low, clear, inputs.noise
             )
             flag = flag | of_bootstrap(covariance)
-        found = copy.widened(found._replace(covariance=covariance))
-    if tested and not method.local and found.covariance is not None:
-        pattern = standing(pair, found, windows)
-    # parameters that are fitted in addition to the vectors would stay biased
-    if pattern.spoils or (pattern.fraction and found.quantities):
+        displacement = copy.widened(displacement._replace(covariance=covariance))
+    if tested and not method.local and displacement.covariance is not None:
+        pattern = standing(pair, displacement, windows)
+    # parameters fitted beside the vectors would stay biased
+    if pattern.spoils or (pattern.fraction and displacement.quantities):
         flag = flag | Flag.AT_REST.value
-    # what no copy explains and no pattern either
     elif unexplained and not pattern.fraction:
         flag = flag | Flag.AT_REST.value
     else:
-        found = pattern.corrected(found)
+        displacement = pattern.corrected(displacement)
     if method.local:
-        flag = flag | _flags_among_neighbours(found.d, low, windows, validation)
+        flag = flag | _flags_among_neighbours(displacement.d, low, windows, validation)
     if checks and method.reach:
-        different = _flags_of_unrelated(clean, given, method)
-        # of images that differ the errors are large, however strong the texture
+        different = _flags_of_unrelated(clean, inputs, method)
+        # images that differ have large errors, however strong the texture
         named = (different > 0) & ~low.to(flag.device)
         flag = torch.where(named, flag & ~Flag.LOW_TEXTURE.value, flag) | different
-    if given.same:
+    if inputs.same:
         flag = flag | Flag.AT_REST.value
-    times = None if method.timed else given.times
-    when = vector_times(times, given.dt, windows, found.d.cpu().numpy(), method.centred)
+    times = None if method.timed else inputs.times
+    when = vector_times(times, inputs.dt, windows, displacement.d.cpu().numpy(), method.centred)
     reversed_time = torch.as_tensor(np.isnan(when.difference), device=flag.device)
     flag = flag | (Flag.NO_MATCH * reversed_time).to(torch.int16)
-    return Vectors(found._replace(flag=flag), texture, pattern, copy, when)
+    return Vectors(displacement._replace(flag=flag), texture, pattern, copy, when)
 
 
 def _estimator(
     method: Method,
-    given: PairInput,
+    inputs: PairInput,
     more: Sequence[torch.Tensor],
     validation: VectorValidation,
     settings: MultipassSettings | VariationalSettings | None,
 ) -> Callable[..., Displacement]:
     """The method with its options, (image1, image2, stride=...) -> Displacement."""
-    z, y = (given.images[0].coords.variables[name].values.astype(float) for name in ("z", "y"))
+    z, y = (inputs.images[0].coords.variables[name].values.astype(float) for name in ("z", "y"))
     offered = {
         "min_correlation": validation.min_correlation,
-        "noise": given.noise,
+        "noise": inputs.noise,
         "axes": (z, y),
-        "dt": given.dt,
+        "dt": inputs.dt,
         "more": more,
-        "times": given.times,
-        "blur": given.blur_px,
+        "times": inputs.times,
+        "blur": inputs.blur_px,
         "settings": settings,
         "partly": True,
     }
-    windows = given.windows
+    windows = inputs.windows
     options = {name: offered[name] for name in method.options}
     return partial(method.find, template=windows.template, search=windows.search, **options)
 
@@ -279,8 +273,8 @@ def _flags_among_neighbours(
     return (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
 
 
-def _flags_of_unrelated(clean: CleanImages, given: PairInput, method: Method) -> torch.Tensor:
+def _flags_of_unrelated(clean: CleanImages, inputs: PairInput, method: Method) -> torch.Tensor:
     """Flags where the images show different air, of a fitted field where they do everywhere."""
-    different = unrelated(clean.filled[:2], given.windows, method.reach > 1, given.noise)
+    different = unrelated(clean.filled[:2], inputs.windows, method.reach > 1, inputs.noise)
     different = different if method.local else different.all().expand_as(different)
     return (Flag.UNRELATED * different).to(torch.int16)

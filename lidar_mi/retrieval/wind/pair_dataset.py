@@ -24,7 +24,7 @@ class Vectors(NamedTuple):
 
     Attributes
     ----------
-    found : Displacement
+    displacement : Displacement
         With all flags.
     texture : Texture
         Of the templates of image 1.
@@ -34,7 +34,7 @@ class Vectors(NamedTuple):
         Of one image in the other, at rest, that was removed.
     """
 
-    found: Displacement
+    displacement: Displacement
     texture: Texture
     pattern: Standing
     copy: Copy
@@ -43,16 +43,16 @@ class Vectors(NamedTuple):
 
 def pair_dataset(
     method: Method,
-    given: PairInput,
+    inputs: PairInput,
     clean: CleanImages,
     vectors: Vectors,
     validation: VectorValidation,
 ) -> xr.Dataset:
     """The data set that `retrieve_wind` returns."""
-    found, texture, _, _, times = vectors
-    image, steps = given.images[0], spacing(given.images[0])
-    moved = found.d.cpu().numpy() * np.reshape(steps, (2, 1, 1))
-    variables = winds(found, _AXES, steps, times.difference)
+    displacement, texture, _, _, times = vectors
+    image, steps = inputs.images[0], spacing(inputs.images[0])
+    moved = displacement.d.cpu().numpy() * np.reshape(steps, (2, 1, 1))
+    variables = winds(displacement, _AXES, steps, times.difference)
     variables["time"] = field(_AXES, times.middle, "mid-time of the vector", "s")
     for axis, along in zip("yz", moved[::-1], strict=True):
         about = f"displacement along {axis}", "m"
@@ -61,56 +61,56 @@ def pair_dataset(
     slope = "weakest rms slope relative to the mean, per pixel"
     isotropy = "weakest over strongest rms slope"
     variables |= {
-        score: field(_AXES, found.score, meaning, "1"),
+        score: field(_AXES, displacement.score, meaning, "1"),
         "texture": field(_AXES, texture.slope, slope, "1"),
         "isotropy": field(_AXES, texture.isotropy, isotropy, "1"),
-        "flag": flags(found, _AXES),
+        "flag": flags(displacement, _AXES),
     }
-    coords = centres(image, given.windows, "template")
+    coords = centres(image, inputs.windows, "template")
     places = np.meshgrid(*(coords[axis][1] for axis in _AXES), indexing="ij")
     for axis, place, along in zip(_AXES, places, moved, strict=True):
         vector = place + (0.0 if method.centred else 0.5) * along
         about = f"{axis} of the vector at mid-time", "m"
         coords[f"{axis}_vector"] = field(_AXES, vector, *about)
-    attributes = _options(method, given, validation) | _remarks(given, clean, vectors)
+    attributes = _options(method, inputs, validation) | _remarks(inputs, clean, vectors)
     title = "Wind in the image plane from an image pair"
-    return dataset(variables, coords, title, attributes, found)
+    return dataset(variables, coords, title, attributes, displacement)
 
 
-def _options(method: Method, given: PairInput, validation: VectorValidation) -> dict[str, Any]:
+def _options(method: Method, inputs: PairInput, validation: VectorValidation) -> dict[str, Any]:
     """What the winds were retrieved with."""
     named = {
         "method": method.name,
-        "template": given.windows.template,
-        "search": given.windows.search,
-        "stride": given.windows.stride,
-        "dt": given.dt,
-        "images": len(given.images),
+        "template": inputs.windows.template,
+        "search": inputs.windows.search,
+        "stride": inputs.windows.stride,
+        "dt": inputs.dt,
+        "images": len(inputs.images),
         "min_texture": validation.min_texture,
         "min_isotropy": validation.min_isotropy,
         "median_size": validation.median_size,
         "median_threshold": validation.median_threshold,
         "median_epsilon": validation.median_epsilon,
     }
-    if given.blur and "blur" in method.options:
-        named["blur"] = given.blur
-    if given.times is not None:
+    if inputs.blur and "blur" in method.options:
+        named["blur"] = inputs.blur
+    if inputs.times is not None:
         named["timed"] = 1
     if "min_correlation" in method.options:
         named["min_correlation"] = validation.min_correlation
     return named
 
 
-def _remarks(given: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str, Any]:
-    """What was found in the images, of which nothing is said where there is nothing."""
+def _remarks(inputs: PairInput, clean: CleanImages, vectors: Vectors) -> dict[str, Any]:
+    """Remarks on the images, without empty ones."""
     pattern = vectors.pattern
     patterns = [str(part) for part in (clean.defects.pattern, pattern) if str(part)]
-    said = {
+    remarks = {
         "defects": str(clean.defects),
         "fixed_pattern": ", ".join(patterns),
         "standing_fraction": pattern.fraction,
         "copy_at_rest": str(vectors.copy),
-        "identical_images": given.same,
+        "identical_images": inputs.same,
         "illumination": clean.change_of_illumination,
     }
-    return {name: value for name, value in said.items() if value}
+    return {name: value for name, value in remarks.items() if value}

@@ -1,4 +1,4 @@
-"""What a retrieval from images is given, checked and as tensors."""
+"""Input of a retrieval from images, checked and as tensors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -73,23 +73,23 @@ def checked_input(
         if not np.isfinite(image.values).any():
             raise InputError(f"image{number}: no pixel is finite; expected light somewhere")
     if len(stack) > 2 and "more" not in method.options:
-        takes = ", ".join(name for name, known in METHODS.items() if "more" in known.options)
+        takes = ", ".join(name for name, taking in METHODS.items() if "more" in taking.options)
         raise InputError(
             f"more: {len(stack)} images are not allowed with method {method.name!r}; expected two, "
             f"or method {takes}"
         )
     if times is not None and len(stack) > 2:
         raise InputError(f"times: not allowed with {len(stack)} images; expected two")
-    seen = checked_times(times, stack, dt)
+    pixel_times = checked_times(times, stack, dt)
     frame, blur_px = windows.on(stack[0].shape), _in_pixels(blur, stack[0])
     pixels = [on_device(image, device) for image in stack]
-    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    sigma = on_device(level, device) if isinstance(level, xr.DataArray) else level
     same = identical(stack)
-    return PairInput(stack, pixels, frame, dt, known, seen, blur, blur_px, same)
+    return PairInput(stack, pixels, frame, dt, sigma, pixel_times, blur, blur_px, same)
 
 
 def _in_pixels(blur: float, image: xr.DataArray) -> float:
-    """From m to px."""
+    """The blur in px, from m."""
     if not 0 <= blur < np.inf:
         raise InputError(f"blur: {blur!r} m is not allowed; expected a standard deviation >= 0")
     z, y = (np.ptp(image[name].values) / (image.sizes[name] - 1) for name in ("z", "y"))

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.defects.sampling import Sampling
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.wind.options import WindowSizes
 
 
@@ -33,11 +33,11 @@ def wind_from_samples(
     Images are in the order of time; ``windows``, and the places of their centres, are those of the
     pixels.
     """
-    one, two, *more = (samples_of(image, structure) for image in images)
+    first, second, *more = (samples_of(image, structure) for image in images)
     level = samples_of(noise, structure) if isinstance(noise, xr.DataArray) else noise
     sizes = sizes_of_samples(windows, structure)
-    found = retrieve(one, two, windows=sizes, noise=level, more=more, **options)
-    return at_windows(found, places, structure, windows)
+    wind = retrieve(first, second, windows=sizes, noise=level, more=more, **options)
+    return at_windows(wind, places, structure, windows)
 
 
 def samples_of(image: xr.DataArray, structure: Sampling) -> xr.DataArray:
@@ -46,7 +46,7 @@ def samples_of(image: xr.DataArray, structure: Sampling) -> xr.DataArray:
     for name, step, first, middle in zip(
         map(str, image.dims), structure.steps, structure.first, structure.middle, strict=True
     ):
-        # without a middle a sample is one pixel of each kind, whole without the others
+        # without a middle one pixel of each kind is a whole sample
         last = image.sizes[name] - (step - 1 if middle else 0)
         parts[name] = slice(first, last, step)
         axis = image[name]
@@ -62,21 +62,21 @@ def sizes_of_samples(windows: WindowSizes, structure: Sampling) -> WindowSizes:
 
 
 def at_windows(
-    found: xr.Dataset, coords: Mapping[str, Any], structure: Sampling, windows: WindowSizes
+    sampled: xr.Dataset, coords: Mapping[str, Any], structure: Sampling, windows: WindowSizes
 ) -> xr.Dataset:
     """A wind from samples at the places of the windows of the pixels.
 
     It is interpolated linearly between vectors that are a sample or a stride apart. A vector has
     the flags of the nearest one.
     """
-    axes: Sequence[str] = [str(name) for name in found["v"].dims if name in coords]
+    axes: Sequence[str] = [str(name) for name in sampled["v"].dims if name in coords]
     at = {name: xr.DataArray(np.asarray(coords[name][1]), dims=name) for name in axes}
-    near = found["flag"].interp(at, method="nearest", kwargs={"fill_value": "extrapolate"})
-    wind = found.drop_vars("flag").interp(at)
+    near = sampled["flag"].interp(at, method="nearest", kwargs={"fill_value": "extrapolate"})
+    wind = sampled.drop_vars("flag").interp(at)
     outside = ~np.isfinite(wind["v"]) & (near == 0)
-    flag = near.where(~outside, Flag.NO_MATCH.value).astype(found["flag"].dtype)
-    wind = wind.assign(flag=flag.assign_attrs(found["flag"].attrs))
+    flag = near.where(~outside, Flag.NO_MATCH.value).astype(sampled["flag"].dtype)
+    wind = wind.assign(flag=flag.assign_attrs(sampled["flag"].attrs))
     for name in axes:
-        wind[name].attrs.update(found[name].attrs)
-    said = ", ".join(filter(None, [structure.said, found.attrs.get("sampling", "")]))
-    return wind.assign_attrs(found.attrs, stride=windows.stride, sampling=said)
+        wind[name].attrs.update(sampled[name].attrs)
+    remark = ", ".join(filter(None, [structure.said, sampled.attrs.get("sampling", "")]))
+    return wind.assign_attrs(sampled.attrs, stride=windows.stride, sampling=remark)

@@ -10,10 +10,10 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.checks import positive
 from lidar_mi.retrieval.device import device_of
 from lidar_mi.retrieval.images.common_grid import all_on_one_grid
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.threads import SMALL, in_turn, threads_for
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
@@ -53,7 +53,7 @@ def retrieve_winds(
     beam_times : sequence of xr.DataArray, optional
         When each pixel of each image was seen, as ``times`` of `retrieve_wind`.
     notice : callable, optional
-        Called with a text and the fraction done (0 to 1) for each pair, before its wind is there.
+        Called with a text and the fraction done (0 to 1) for each pair, before its retrieval.
     **options
         Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``windows``,
         ``validation`` and so on.
@@ -108,14 +108,14 @@ def retrieve_winds(
             f"noise: {len(levels)} are not allowed; expected one, or {len(images)}, one an image"
         )
     shared = all_on_one_grid(images)
-    seen = None if beam_times is None else all_on_one_grid(beam_times)
-    if any(one is not other for one, other in zip(shared, images, strict=True)):
+    pixel_times = None if beam_times is None else all_on_one_grid(beam_times)
+    if any(new is not given for new, given in zip(shared, images, strict=True)):
         # noise cannot be interpolated: its median is used
         levels = [float(n.median()) if isinstance(n, xr.DataArray) else n for n in levels]
 
     def of_pair(pair: tuple[int, int]) -> xr.Dataset | InputError:
         first, second = pair
-        when = None if seen is None else [seen[first], seen[second]]
+        when = None if pixel_times is None else [pixel_times[first], pixel_times[second]]
         step = times[second] - times[first]
         try:
             return retrieve_wind(
@@ -125,23 +125,23 @@ def retrieve_winds(
             return error
 
     pixels = shared[0].size
-    # threads share what a device other than the processor does
+    # threads would share a GPU
     side_by_side = pixels <= SMALL and device_of(options.get("device", "cpu")).type == "cpu"
-    found: list[xr.Dataset | InputError] = []
+    results: list[xr.Dataset | InputError] = []
     each = in_turn(of_pair, chosen) if side_by_side else (of_pair(pair) for pair in chosen)
     with threads_for(pixels), closing(each):
         for number, (first, second) in enumerate(chosen):
             if notice is not None:
                 notice(f"images {first}-{second}", number / len(chosen))
-            found.append(next(each))
-    winds = [wind for wind in found if isinstance(wind, xr.Dataset)]
+            results.append(next(each))
+    winds = [wind for wind in results if isinstance(wind, xr.Dataset)]
     if not winds:
-        raise InputError(f"images {chosen[0][0]}-{chosen[0][1]}: {found[0]}")
+        raise InputError(f"images {chosen[0][0]}-{chosen[0][1]}: {results[0]}")
     whole = xr.concat(
-        [_of_pair(wind, winds[0], times[a]) for (a, _), wind in zip(chosen, found, strict=True)],
+        [_of_pair(wind, winds[0], times[a]) for (a, _), wind in zip(chosen, results, strict=True)],
         "time",
         combine_attrs="drop_conflicts",
-        # also where all pairs have theirs at the windows' centres
+        # concatenated even where they are equal in all pairs
         coords=["y_vector", "z_vector"],
         compat="equals",
     )
@@ -156,12 +156,12 @@ def retrieve_winds(
             [times[b] - times[a] for a, b in chosen],
             {"long_name": "time between the images", "units": "s"},
         ),
-        remark=("time", [_remark(wind) for wind in found], {"long_name": "remark on the images"}),
+        remark=("time", [_remark(wind) for wind in results], {"long_name": "remark on the images"}),
     )
 
 
 def _unstacked(name: str, images: Sequence[xr.DataArray] | xr.DataArray) -> Sequence[xr.DataArray]:
-    """Images one by one: those of a stack along its first dimension."""
+    """A sequence of images, or those of a stack along its first dimension."""
     if not isinstance(images, xr.DataArray):
         return images
     if images.dims[1:] != ("z", "y"):
@@ -173,7 +173,7 @@ def _unstacked(name: str, images: Sequence[xr.DataArray] | xr.DataArray) -> Sequ
 
 
 def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[tuple[int, int]]:
-    """The pairs asked for, each of them within the sequence and in order."""
+    """The pairs as given or by default, checked."""
     if count < 2:
         raise InputError(f"images: {count} are not allowed; expected two or more")
     chosen = list(pairwise(range(count))) if pairs is None else list(pairs)
@@ -189,7 +189,7 @@ def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[
 
 
 def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
-    """Of each image from the first, s."""
+    """Reference time of each image from the first, s."""
     steps = list(dt) if isinstance(dt, Sequence) else [dt] * (count - 1)
     if len(steps) != count - 1:
         raise InputError(
@@ -197,7 +197,7 @@ def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
             f"{count - 1}"
         )
     whole = np.cumsum([0.0, *(positive("dt", step) for step in steps)])
-    # sums of steps such as 0.1 s have no digits of rounding
+    # rounded, so that sums of steps such as 0.1 s are exact
     return [float(f"{time:.12g}") for time in whole]
 
 
@@ -205,9 +205,9 @@ def _about(what: str) -> dict[str, str]:
     return {"long_name": f"{what}, from the first image's reference time", "units": "s"}
 
 
-def _of_pair(found: xr.Dataset | InputError, like: xr.Dataset, start: float) -> xr.Dataset:
+def _of_pair(result: xr.Dataset | InputError, like: xr.Dataset, start: float) -> xr.Dataset:
     """A pair's wind with times from the first image; without values where there is none."""
-    wind = found if isinstance(found, xr.Dataset) else _nothing(like)
+    wind = result if isinstance(result, xr.Dataset) else _nothing(like)
     wind = (
         wind.rename(time="vector_time")
         .drop_attrs(deep=False)
@@ -220,7 +220,7 @@ def _of_pair(found: xr.Dataset | InputError, like: xr.Dataset, start: float) -> 
 
 
 def _nothing(like: xr.Dataset) -> xr.Dataset:
-    """A wind without a vector on the grid of another."""
+    """A wind without vectors on the grid of another."""
     empty = {
         name: xr.full_like(values, Flag.NO_MATCH.value if name == "flag" else np.nan)
         for name, values in like.data_vars.items()
@@ -233,7 +233,7 @@ def _nothing(like: xr.Dataset) -> xr.Dataset:
     return like.assign(empty).assign_coords(places)
 
 
-def _remark(found: xr.Dataset | InputError) -> str:
-    if isinstance(found, InputError):
-        return str(found)
-    return ", ".join(str(found.attrs[name]) for name in _PER_PAIR if name in found.attrs)
+def _remark(result: xr.Dataset | InputError) -> str:
+    if isinstance(result, InputError):
+        return str(result)
+    return ", ".join(str(result.attrs[name]) for name in _PER_PAIR if name in result.attrs)

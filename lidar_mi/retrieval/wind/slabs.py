@@ -29,9 +29,9 @@ def expected_wind(
     `noise` and `device` are those of `retrieve_wind`.
     """
     (image1,), level = checked_stack([image1], noise)
-    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    sigma = on_device(level, device) if isinstance(level, xr.DataArray) else level
     with threads_for(image1.size):
-        return expected_flow(start, on_device(image1, device), known)
+        return expected_flow(start, on_device(image1, device), sigma)
 
 
 def wind_of_slab(
@@ -82,10 +82,10 @@ def wind_of_slab(
         stack = [first, second, *more]
         windows = Windows(tuple(first.shape), template, search, stride)
         near = start and next_flow(start, stack, noise, min_correlation)
-        found, flow = near or variational_and_flow(
+        displacement, flow = near or variational_and_flow(
             stack, windows, min_correlation, noise, blur, settings=settings, keep=True
         )
-        return found
+        return displacement
 
     chosen = replace(METHODS["variational"], find=find)
     wind = retrieve_wind(image1, image2, dt, chosen, checks=start is None, **options)

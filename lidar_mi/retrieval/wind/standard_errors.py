@@ -6,7 +6,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.windows import averaged
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
@@ -84,15 +84,14 @@ def standard_errors(
     if not window >= 2:
         raise InputError(f"window: {window:g} px is not allowed; expected 2 or more")
     sizes = WindowSizes(template=8, search=16, stride=1)
-    own = retrieve_wind(image1, image2, dt, noise=noise, windows=sizes, device=device)
+    variational = retrieve_wind(image1, image2, dt, noise=noise, windows=sizes, device=device)
     at = {axis: v[axis] for axis in ("z", "y")}
-    own = own.where(own["flag"] == 0)
+    variational = variational.where(variational["flag"] == 0)
     names = ("v", "w", "v_stderr", "w_stderr", "vw_correlation")
-    near = own[list(names)].interp(at).transpose("z", "y")
-    given = [one.transpose("z", "y") for one in (w, v)]
-    d = torch.stack(
-        [torch.as_tensor((one - near[name]).values) for one, name in zip(given, "wv", strict=True)]
-    )
+    near = variational[list(names)].interp(at).transpose("z", "y")
+    vectors = [component.transpose("z", "y") for component in (w, v)]
+    differences = (wind - near[name] for wind, name in zip(vectors, "wv", strict=True))
+    d = torch.stack([torch.as_tensor(difference.values) for difference in differences])
     width = _WIDTH * window / step
     use = d.isfinite().all(0)
     outlier = torch.zeros_like(use)
@@ -100,7 +99,7 @@ def standard_errors(
         outlier = outlier | _outliers(d, use, width)
         use = d.isfinite().all(0) & ~outlier
     ones = torch.ones_like(use)
-    # of a mean over a Gaussian, by windows that do not overlap; two components each
+    # independent differences in a Gaussian mean: separate windows, two components
     number = 4 * np.pi * _WIDTH**2 * 2 * averaged(use.to(d), ones, width)
     student = torch.where(number > 2 * _FEWEST, number / (number - 2), torch.nan)
     spread = _mean_square(d, use, width) * student
@@ -114,8 +113,8 @@ def standard_errors(
     on = ("z", "y")
     return xr.Dataset(
         {
-            "v": (on, given[1].values, about),
-            "w": (on, given[0].values, about),
+            "v": (on, vectors[1].values, about),
+            "w": (on, vectors[0].values, about),
             "v_stderr": (on, stderr[0], about | {"long_name": "standard error of v"}),
             "w_stderr": (on, stderr[1], about | {"long_name": "standard error of w"}),
             "vw_correlation": (on, total[0, 1] / np.prod(stderr, 0), {"units": "1"}),
@@ -129,21 +128,21 @@ def standard_errors(
 
 def _mean_square(d: torch.Tensor, use: torch.Tensor, width: float) -> torch.Tensor:
     """Local means of d d^T over the differences that are used."""
-    one = torch.where(use, d, 0.0)
-    return torch.stack([torch.stack([averaged(a * b, use, width) for b in one]) for a in one])
+    used = torch.where(use, d, 0.0)
+    return torch.stack([torch.stack([averaged(a * b, use, width) for b in used]) for a in used])
 
 
 def _outliers(d: torch.Tensor, use: torch.Tensor, width: float) -> torch.Tensor:
     """Differences farther from 0 than five standard deviations of the others around."""
-    own = torch.where(use, d, 0.0)
+    used = torch.where(use, d, 0.0)
     reach = torch.arange(-int(4 * width) - 1, int(4 * width) + 2)
     centre = 1 / float(torch.exp(-((reach / width) ** 2) / 2).sum()) ** 2
     weight = averaged(use.to(d), torch.ones_like(use), width)
-    others = _mean_square(d, use, width) * weight - centre * own[:, None] * own[None]
+    others = _mean_square(d, use, width) * weight - centre * used[:, None] * used[None]
     others = (others / (weight - centre * use).clamp(min=1e-12)).movedim((0, 1), (-2, -1))
-    # no difference at all around: whatever differs is far away
+    # where all others are 0, any difference is an outlier
     others = others + 1e-12 * torch.eye(2, dtype=d.dtype)
-    column = own.movedim(0, -1)[..., None]
+    column = used.movedim(0, -1)[..., None]
     return (column * torch.linalg.solve(others, column)).sum((-2, -1)) > _FAR**2
 
 
@@ -153,7 +152,7 @@ def _step(image: xr.DataArray, v: xr.DataArray, w: xr.DataArray) -> float:
         raise InputError(f"v, w: dims {v.dims} and {w.dims}; expected z and y")
     steps = []
     for axis in ("z", "y"):
-        places, pixels = (one[axis].values.astype(float) for one in (v, image))
+        places, pixels = (field[axis].values.astype(float) for field in (v, image))
         if not np.array_equal(places, w[axis].values) or len(places) < 3:
             raise InputError(f"v, w: not on one grid along {axis}; expected three places or more")
         gaps = np.diff(places)

@@ -23,7 +23,7 @@ _PLACES = ("y_reported", "z_reported")
 _MIXED = 0.01
 # Beams that are next to each other.
 _NEIGHBOURS = 9
-# Images of one instant that are made one from the other.
+# Rounds of advection.
 _ROUNDS = 2
 # Pixels: the wind only has to be right to a few per cent, as it counts for half a scan at most.
 _TEMPLATE, _STRIDE = 16, 4
@@ -117,10 +117,10 @@ def advected(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
 
 
 def _winds(images: Sequence[xr.Dataset], steps: Sequence[float], name: str) -> list[Wind]:
-    """Of every image: from it to the next one, of the last from the one before."""
+    """Wind of every image: from it to the next one; of the last, from the one before."""
     pairs = zip(images[:-1], images[1:], steps, strict=True)
-    found = [_wind(pair, dt, name) for *pair, dt in pairs]
-    return [*found, found[-1]]
+    winds = [_wind(pair, dt, name) for *pair, dt in pairs]
+    return [*winds, winds[-1]]
 
 
 def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
@@ -128,7 +128,7 @@ def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
     # scans by angles have nodes of their own
     pair = on_one_grid(*(_without_gaps(scan[name]) for scan in images))
     template = min(_TEMPLATE, min(pair[0].shape) // 3)
-    found = retrieve_wind(
+    wind = retrieve_wind(
         *pair,
         dt,
         "multipass",
@@ -137,17 +137,17 @@ def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
         standard_errors=False,
         checks=False,
     )
-    valid = found["flag"] == 0
-    both = np.stack([found[c].where(valid).transpose("z", "y").values for c in "vw"])
-    filled, _ = validated(torch.as_tensor(both), 2)
-    axes = found["y"].values, found["z"].values
+    valid = wind["flag"] == 0
+    components = np.stack([wind[c].where(valid).transpose("z", "y").values for c in "vw"])
+    filled, _ = validated(torch.as_tensor(components), 2)
+    axes = wind["y"].values, wind["z"].values
     low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
     known = RegularGridInterpolator(axes, filled.numpy().transpose(2, 1, 0))
     return lambda places: known(places.clip(low, high))
 
 
 def _without_gaps(image: xr.DataArray) -> xr.DataArray:
-    """The nearest value beyond the beams: vectors there fail, and not all around them."""
+    """The nearest value beyond the beams, so that only vectors there fail."""
     image = image.transpose("z", "y")
     return image.copy(data=nearest_filled(image.values))
 

@@ -10,6 +10,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.checks import checked_stack, identical, on_device, positive
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance, enough_windows
 from lidar_mi.retrieval.correlation.multipass import multipass
@@ -24,7 +25,7 @@ from lidar_mi.retrieval.device import within_memory
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, of_fit
+from lidar_mi.retrieval.images.quality import check_between, of_bootstrap, of_fit
 from lidar_mi.retrieval.images.windows import Windows, working
 from lidar_mi.retrieval.wind.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.wind.options import (
@@ -95,7 +96,7 @@ def retrieve_wind_volume(
     xr.Dataset, dims (x, z, y)
         At the windows' centres at mid-time: `u`, `v`, `w` and `u_stderr`, `v_stderr`, `w_stderr`
         (m s-1), `uv_correlation`, `uw_correlation`, `vw_correlation` of their errors,
-        `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
+        `correlation`, `flag` (bits of `flags.Flag`, 0 = valid; low texture means a standard error
         beyond half a voxel in some direction). Those of "correlation" are from `bootstrap` where
         there are enough windows. Rejected vectors keep their value, or NaN where
         there is none. `identical_images`, `sampling`, `copy_at_rest` and `defects` as of
@@ -131,7 +132,7 @@ def retrieve_wind_volume(
     stack, level = checked_stack([volume1, volume2, *more], noise, AXES, "volume")
     frame = windows.on(stack[0].shape)
     raw = [on_device(volume, device) for volume in stack]
-    known = on_device(level, device) if isinstance(level, xr.DataArray) else level
+    sigma = on_device(level, device) if isinstance(level, xr.DataArray) else level
     steps, same = spacing(stack[0]), identical(stack, "volumes")
     structure = sampling(raw) if checks else no_structure(raw)
     if structure.thinned and samples_fit(stack[0], structure, windows, False):
@@ -148,36 +149,37 @@ def retrieve_wind_volume(
             settings=settings,
             device=device,
         )
-    seen = structure.masked(raw)
-    strange = [outstanding(v) if checks else torch.zeros_like(v, dtype=torch.bool) for v in seen]
-    seen = [
-        torch.where(s, torch.nan, v) if s.any() else v for s, v in zip(strange, seen, strict=True)
+    pixels = structure.masked(raw)
+    outliers = [outstanding(v) if checks else torch.zeros_like(v, dtype=torch.bool) for v in pixels]
+    pixels = [
+        torch.where(outlier, torch.nan, volume) if outlier.any() else volume
+        for outlier, volume in zip(outliers, pixels, strict=True)
     ]
-    found, copy = within_memory(
-        lambda: _displacements(seen, known, method, frame, validation, settings, steps, checks)
+    displacement, copy = within_memory(
+        lambda: _displacements(pixels, sigma, method, frame, validation, settings, steps, checks)
     )
     if same or structure.spoilt or structure.thinned:
-        found = found._replace(flag=found.flag | Flag.AT_REST.value)
-    variables = winds(found, AXES, steps, dt)
+        displacement = displacement._replace(flag=displacement.flag | Flag.AT_REST.value)
+    variables = winds(displacement, AXES, steps, dt)
     long_name = "correlation of the volumes warped to mid-time"
-    variables["correlation"] = field(AXES, found.score, long_name, "1")
-    variables["flag"] = flags(found, AXES)
+    variables["correlation"] = field(AXES, displacement.score, long_name, "1")
+    variables["flag"] = flags(displacement, AXES)
     attributes = {
         "method": method,
         **asdict(windows),
         "dt": dt,
         "min_correlation": validation.min_correlation,
     }
-    number = sum(int(s.sum()) for s in strange)
-    said = {
+    number = sum(int(outlier.sum()) for outlier in outliers)
+    remarks = {
         "identical_images": same,
         "sampling": structure.said,
         "copy_at_rest": str(copy),
-        "defects": f"{number} voxels are replaced in {len(strange)} volumes" if number else "",
+        "defects": f"{number} voxels are replaced in {len(outliers)} volumes" if number else "",
     }
-    attributes |= {name: value for name, value in said.items() if value}
+    attributes |= {name: value for name, value in remarks.items() if value}
     coords = centres(stack[0], frame, "window")
-    return dataset(variables, coords, "Wind from two volumes", attributes, found)
+    return dataset(variables, coords, "Wind from two volumes", attributes, displacement)
 
 
 def _displacements(
@@ -204,29 +206,30 @@ def _displacements(
     if method == "variational":
         options |= {"more": volumes[2:], "spacing": steps}
     estimate = partial(METHODS[method], template=frame.template, search=frame.search, **options)
-    found, copy, unexplained = estimate(*volumes[:2], stride=frame.stride), Copy(), False
+    displacement, copy, unexplained = estimate(*volumes[:2], stride=frame.stride), Copy(), False
     if checks and len(volumes) == 2:
         bright = [volume + 1 for volume in volumes]
 
         def again(*pair: torch.Tensor) -> Displacement:
-            return estimate(*(one - 1 for one in pair), stride=frame.stride)
+            return estimate(*(volume - 1 for volume in pair), stride=frame.stride)
 
-        local = Displacement.medians if method == "correlation" else lambda one: one
-        found, copy, clean = without_copy(again, found, bright, frame, local)
+        local = Displacement.medians if method == "correlation" else lambda d: d
+        displacement, copy, clean = without_copy(again, displacement, bright, frame, local)
         unexplained = copy.significant and clean is bright
-        volumes = [one - 1 for one in clean]
-    flag = defects.flags(found, raw, frame, True) | of_fit(found.covariance)
+        volumes = [volume - 1 for volume in clean]
+    flag = defects.flags(displacement, raw, frame, True) | of_fit(displacement.covariance)
     if unexplained:
         flag = flag | Flag.AT_REST.value
     if method == "correlation":
         if enough_windows(frame):
             textured = flag & Flag.LOW_TEXTURE.value == 0
             covariance = bootstrap_covariance(
-                volumes, found, frame, estimate, True, textured=textured, noise=relative
+                volumes, displacement, frame, estimate, True, textured=textured, noise=relative
             )
-            flag, found = flag | of_bootstrap(covariance), found._replace(covariance=covariance)
+            flag = flag | of_bootstrap(covariance)
+            displacement = displacement._replace(covariance=covariance)
         outlier = median_outliers(
-            found.d,
+            displacement.d,
             validation.median_size,
             max(1, round(frame.template / 2 / frame.stride)),
             validation.median_threshold,
@@ -237,13 +240,13 @@ def _displacements(
     # shear lowers the correlation of windows as large as a volume is thick: all windows together
     if bool(unrelated(volumes, frame, False, relative).all()):
         flag = flag | Flag.UNRELATED.value
-    return copy.widened(found)._replace(flag=flag), copy
+    return copy.widened(displacement)._replace(flag=flag), copy
 
 
 def without_attenuation(
     volumes: Sequence[torch.Tensor], noise: float | torch.Tensor | None = None
 ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-    """Volumes over their own brightness c exp(a x) less 1, and the noise of the first likewise.
+    """Volumes divided by their brightness c exp(a x), less 1, and the noise of the first likewise.
 
     The brightness is fitted to the means of the gates, so that attenuation through the volume
     causes no displacement. Non-finite voxels stay so.

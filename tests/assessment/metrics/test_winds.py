@@ -6,7 +6,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.names import Source, has_no_skill
 from lidar_mi.assessment.metrics.winds import cross_flow_metrics
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 
 
 def winds(stderr, flag=0):

@@ -5,7 +5,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.experiment.stages.winds import vector_remarks
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 
 
 def winds(valid, methods=("cc",)):

@@ -9,9 +9,8 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import CombinedFlag, flag_attributes
 from lidar_mi.retrieval.along_path.vectors import counting, slab_vectors
-from lidar_mi.retrieval.combined.combine import CombinedFlag
-from lidar_mi.retrieval.combined.vectors import flag_attributes
 from lidar_mi.retrieval.common_error import with_common_error
 
 

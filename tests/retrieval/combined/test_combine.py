@@ -15,12 +15,12 @@ import xarray as xr
 
 from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
+from lidar_mi.flags import CombinedFlag, Flag
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors, scan_wind
-from lidar_mi.retrieval.combined.combine import CombinedFlag, combine
+from lidar_mi.retrieval.combined.combine import combine
 from lidar_mi.retrieval.combined.vectors import wind_from_triples
 from lidar_mi.retrieval.common_error import with_common_error
-from lidar_mi.retrieval.images.quality import Flag
 
 Y, Z = np.arange(-3, 3.1, 1.0), np.arange(-2, 2.1, 1.0)
 METRES = {"units": "m"}

@@ -13,10 +13,10 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import VectorFlag
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors, scan_wind
 from lidar_mi.retrieval.combined.vectors import (
-    LineFlag,
     solve_lines,
     wind_along_lines,
     wind_from_neighbours,
@@ -242,7 +242,7 @@ def test_lines_without_a_velocity_are_flagged():
     for found in (wind_from_triples(scan), wind_from_neighbours(scan, 5)):
         concerned = (found.lines == 31).any("corner")
         assert 1 < int(concerned.sum()) < 10
-        np.testing.assert_array_equal(found.flag, LineFlag.NO_VELOCITY * concerned)
+        np.testing.assert_array_equal(found.flag, VectorFlag.NO_VELOCITY * concerned)
         for name in ("u", "v_stderr", "uw_correlation"):
             np.testing.assert_array_equal(found[name].isnull(), concerned)
 
@@ -250,7 +250,7 @@ def test_lines_without_a_velocity_are_flagged():
 def test_neighbours_in_a_row_are_flagged():
     """In a scan three lines high and far apart, the nearest three stand beside each other."""
     found = wind_from_neighbours(scanned(rows=3, columns=9, azimuth_half="4 deg"), 3)
-    assert (found.flag == LineFlag.COPLANAR).any()
+    assert (found.flag == VectorFlag.COPLANAR).any()
     flat = found.flag.values > 0
     assert np.isnan(vectors(found)[flat]).all() and np.isfinite(vectors(found)[~flat]).all()
 

@@ -11,9 +11,9 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtri
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.correlation.weight_shift import weight_shift
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.methods import METHODS
 from lidar_mi.retrieval.wind.options import WindowSizes

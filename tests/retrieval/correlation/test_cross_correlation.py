@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.cross_correlation import correlate, cross_correlation
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from tests.support.flows import plane_waves, texture
 

@@ -14,8 +14,8 @@ import torch
 from benchmarks.cases import DT, vortex_pair_images
 from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.multipass import multipass, travelled
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import data_array, plane_waves, texture

@@ -10,8 +10,8 @@ import torch
 from scipy.ndimage import center_of_mass
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.weight_shift import mass, weight_shift
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from tests.support.flows import plane_waves, texture
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.defects.faint_pattern import Standing, standing
 from lidar_mi.retrieval.images.displacement import Displacement
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind

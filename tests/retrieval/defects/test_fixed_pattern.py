@@ -11,9 +11,9 @@ import torch
 import xarray as xr
 from scipy.stats import binom
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.defects.fixed_pattern import fixed_pattern
 from lidar_mi.retrieval.defects.rest import all_at_rest
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind

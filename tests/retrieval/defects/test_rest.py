@@ -11,9 +11,9 @@ import pytest
 import torch
 import xarray as xr
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.defects.impulses import height
 from lidar_mi.retrieval.defects.rest import all_at_rest, nothing_at_rest, saturated
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind

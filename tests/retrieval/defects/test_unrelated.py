@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import binom
 
 from benchmarks.cases import vortex_pair_images
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.defects.unrelated import unrelated
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind

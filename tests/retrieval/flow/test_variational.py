@@ -15,9 +15,9 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.cases import DT, SPACING, vortex_pair_images
 from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.flow.variational import variational
 from lidar_mi.retrieval.images.bound import displacement_bound
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.flow.components import _RATIO_OF_TWO, without_texture
 from lidar_mi.retrieval.flow.likelihood import prepared
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.flow.variational import variational
-from lidar_mi.retrieval.images.quality import Flag
 from tests.support.flows import origin, plane_waves, texture
 
 SHAPE = 100, 120

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
-from lidar_mi.retrieval.ground_vortices.dataset import VortexFlag
+from lidar_mi.flags import VortexFlag
 from lidar_mi.retrieval.ground_vortices.detection import detect
 from lidar_mi.retrieval.ground_vortices.fit import Assumptions
 from lidar_mi.retrieval.ground_vortices.radial_velocities import by_radial_velocities

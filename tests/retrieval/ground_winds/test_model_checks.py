@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import lidar_mi as lm
+from lidar_mi.flags import WindFlag
 from lidar_mi.retrieval.ground_winds.folding import unfolded
-from lidar_mi.retrieval.ground_winds.profiles import WindFlag
 from tests.support.line_winds import MEAN, directions, scan, turbulent
 
 RANGES = 105 + 30.0 * np.arange(20)

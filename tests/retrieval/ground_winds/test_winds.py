@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
-from lidar_mi.retrieval.ground_winds.profiles import WindFlag
+from lidar_mi.flags import WindFlag
 from tests.support import line_winds as made
 
 REAL = Path(__file__).parents[4] / "shared" / "data" / "lines_of_sight"

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.quality import (
-    Flag,
     clearly_textured,
     low_texture,
     non_finite,

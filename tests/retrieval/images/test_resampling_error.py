@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 from scipy.special import erf
 
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.gridding import on_nodes
-from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.images.resampling_error import (
     Variogram,
     correlation_area,

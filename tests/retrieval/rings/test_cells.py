@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.cells import annular_average, annular_sectors, pixels
+from lidar_mi.retrieval.rings.cells import annular_sectors, pixels
 
 
 @pytest.mark.parametrize("centre", [(31.4, 22.8), (-12.0, 60.5)])
@@ -63,15 +63,17 @@ def test_cells_know_their_pixels_about_any_centre():
         assert float(spread[cell]) == pytest.approx(inside.var(), abs=1e-8 * inside.mean())
 
 
-def test_annular_average_is_the_mean_of_its_pixels():
+def test_an_annulus_has_the_mean_of_its_pixels():
     rng = np.random.default_rng(3)
     images = torch.as_tensor(rng.random((2, 40, 30)))
-    r2, mean, count = annular_average(images, (10.0, 44.0), 120.0)
+    cells = annular_sectors((40, 30), (10.0, 44.0), 120.0, 1)
+    mean = cells.means(images)
     y, x = np.mgrid[:40, :30]
     true = (x - 10.0) ** 2 + (y - 44.0) ** 2
     for k, ring in enumerate(np.unique(true // 120)):
         inside = true // 120 == ring
-        assert count[k] == inside.sum() and float(r2[k]) == pytest.approx(true[inside].mean())
+        assert cells.count[k] == inside.sum()
+        assert float(cells.r2[k]) == pytest.approx(true[inside].mean())
         np.testing.assert_allclose(mean[:, k], images.numpy()[:, inside].mean(1), rtol=1e-12)
 
 

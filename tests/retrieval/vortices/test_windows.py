@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from benchmarks.cases import vortex_pair_images
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from benchmarks.cases import CORE_RADIUS, DT, vortex_pair_images
 from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.wind.bound import wind_bound
 from lidar_mi.retrieval.wind.methods import METHODS
 from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes

@@ -13,7 +13,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.series import retrieve_winds

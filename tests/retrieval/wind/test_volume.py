@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.flags import Flag
 from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.volumes import (
