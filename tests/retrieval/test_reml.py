@@ -55,10 +55,10 @@ def test_limits_and_what_is_held():
     assert rest == pytest.approx([0.3], rel=0.05)
 
 
-def test_factors_beside_what_is_held():
+def test_factors_beside_what_is_fixed():
     """Most of the variance is known: scipy finds the same, and half of absent terms come out 0.
 
-    Detects squares below what is held that count as equal to it: terms that are not there come out
+    Detects squares below what is fixed that count as equal to it: terms that are not there come out
     positive, by up to 6 % of the variance.
     """
     found = []
@@ -70,7 +70,7 @@ def test_factors_beside_what_is_held():
             ratio = squares / (held + factor * steep)
             return (4.0 * (ratio - 1 - np.log(ratio))).sum()
 
-        _, (mine,) = most_likely(squares, steep[None], UNLIMITED[:1], 4.0, held=held)
+        _, (mine,) = most_likely(squares, steep[None], UNLIMITED[:1], 4.0, fixed=held)
         other = minimize_scalar(misfit, (0.0, 1.0), bounds=(0.0, 1.0), method="bounded")
         assert mine == pytest.approx(other.x, abs=2e-3)
         found.append(mine)

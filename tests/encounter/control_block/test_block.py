@@ -380,6 +380,25 @@ def test_lost_estimates_are_counted(tmp_path, samples):
     assert abs(error) < 4 * found["gain_stderr"][k]
 
 
+def test_gusts_of_many_short_flights(samples):
+    """Cut into flights of 9 s, whose winds do not follow each other: the same model of gusts."""
+    short = [
+        replace(
+            one,
+            truth=one.truth[k : k + 90],
+            estimate=one.estimate[k : k + 90],
+            truth_before=one.truth[k - 8 : k],
+            truth_after=one.truth[k + 90 : k + 98],
+        )
+        for k in (10, 120, 230)
+        for one in samples
+    ]
+    whole, cut = control_block(samples), control_block(short)
+    # 2000 innovations: their variance is right to 3 %
+    for name in ("gust_innovations", "gust_variance"):
+        np.testing.assert_allclose(cut[name], whole[name], rtol=0.12 if "inn" in name else 0.5)
+
+
 @pytest.mark.slow
 def test_the_example_flies_along_recorded_flights(flights, block, capsys, monkeypatch):
     """Roll and load by the recorded estimates, within 10 % of the predicted variance."""

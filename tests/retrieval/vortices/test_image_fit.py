@@ -61,7 +61,7 @@ def pair_bound(image, pair, noise):
 
 @pytest.mark.slow
 def test_known_pair_at_three_percent_noise():
-    """Parameters within 4 standard errors, which are those of the bound; chi2 is 1.
+    """Parameters within 4 standard errors, which by noise are those of the bound; chi2 is 1.
 
     The bound: 2 m^2/s for each circulation, 1.4 for their mean, 0.035 m for a core radius.
     """
@@ -72,7 +72,10 @@ def test_known_pair_at_three_percent_noise():
     assert (np.abs(found.parameters - vector(*pair.vortices)) < 4 * stderr).all()
     clean = vortex_pair_images(0.0, seed=5)
     bound = pair_bound(clean.first, pair.vortices, 0.03)
-    np.testing.assert_allclose(stderr, np.sqrt(np.diag(bound)), rtol=0.15)
+    by_noise_alone = np.sqrt(np.diag(by_noise(found)) / np.diag(bound))
+    np.testing.assert_allclose(by_noise_alone[[1, 2, 3, 5, 6, 7]], 1, rtol=0.15)
+    # circulations and mean wind share the images with the gradient and the turbulence
+    assert (by_noise_alone > 0.9).all() and (by_noise_alone < 1.4).all()
     mean = np.sqrt(bound[0, 0] + bound[4, 4] - 2 * bound[0, 4]) / 2
     assert mean == pytest.approx(1.4, rel=0.1)
     assert found.chi2 == pytest.approx(1.0, abs=0.06)
@@ -90,6 +93,11 @@ def test_without_noise_only_the_method_errs():
     assert (off[[2, 3, 6, 7]] < 0.02).all() and (off[8:] < 0.02).all()
 
 
+def by_noise(found):
+    """Covariance without the part by turbulence, which calm air lacks and images do not exclude."""
+    return found.covariance - found.shared
+
+
 def reduced_errors(noise, seeds):
     true = vector(*uneven())
     reduced = []
@@ -97,7 +105,7 @@ def reduced_errors(noise, seeds):
         pair = vortex_pair_images(noise, seed=seed, vortices=uneven(), **SMALL)
         found = fit_vortices(pair.first, pair.second, DT, noise=noise, frozen=True)
         assert found.success, found.reasons
-        reduced.append((found.parameters - true) / np.sqrt(np.diag(found.covariance)))
+        reduced.append((found.parameters - true) / np.sqrt(np.diag(by_noise(found))))
     return np.array(reduced)
 
 
@@ -421,10 +429,11 @@ def test_a_disturbed_flow_is_admitted():
         reduced.append(off / np.sqrt(np.diag(found.covariance)))
         model = found.wind(images[0].y.values[None, :], images[0].z.values[:, None])
         winds.append((model["v"].values - true[0]) / model["v_stderr"].values)
-        stated.append(found.model_error)
+        stated.append(np.hypot(found.model_error, found.ambient.rms))
         noise = pair_bound(images[0], uneven(), 0.01)
         assert np.diag(found.covariance)[0] > 4 * noise[0, 0]
-    assert np.mean(stated) == pytest.approx(0.5, rel=0.3)
+    # taken for turbulence of the shortest length, 15 m, of which the images show the large eddies
+    assert 0.5 < np.mean(stated) < 0.75
     assert 0.7 < np.sqrt(np.mean(np.square(reduced))) < 1.5
     assert 0.7 < np.sqrt(np.mean(np.square(winds))) < 1.3
 
