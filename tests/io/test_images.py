@@ -141,6 +141,7 @@ def test_a_colour_image_is_the_same_to_both_commands(tmp_path, monkeypatch):
     np.testing.assert_array_equal(to_retrieve[::-1, ::-1], to_rings)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, values, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Image.fromarray(values.astype(np.uint8)).save("rings.png")
