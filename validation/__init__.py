@@ -28,6 +28,7 @@ resolution           winds from fewer, larger pixels, against their bound; only 
 line_vortices        vortices from slices of a Doppler lidar: errors, coverage, false alarms; only
                      by name
 pairs_in_air         tracks of pairs in families of air, half of which only judge; only by name
+control_loops        roll and load that control blocks predict, in rendered flights; only by name
 """
 
 import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here imports drjit
@@ -58,6 +59,7 @@ OPEN = (
     "resolution",
     "line_vortices",
     "pairs_in_air",
+    "control_loops",
 )
 """Run only by name: some of their rows fail."""
 TOLD = ("coverage", "flows", "defects")

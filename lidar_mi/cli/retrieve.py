@@ -143,7 +143,7 @@ def retrieve(
     Exit code 1: no vector is valid; the file says why.
     """
     from lidar_mi import __version__
-    from lidar_mi.experiment.own_images import retrieve_files
+    from lidar_mi.experiment.image_files import retrieve_files
     from lidar_mi.io.target import check_target
     from lidar_mi.io.wind_file import SERIES, SUFFIXES, write_wind
     from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes

@@ -53,7 +53,7 @@ def v_los(
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve the speed along the line of sight from every frame of an etalon's rings."""
-    from lidar_mi.experiment.own_frames import doppler_of, read_electrons, retrieve_v_los
+    from lidar_mi.experiment.ring_frames import doppler_of, read_electrons, retrieve_v_los
     from lidar_mi.io.netcdf import read_netcdf, write_netcdf
     from lidar_mi.io.target import check_target
     from lidar_mi.retrieval.checks import identical

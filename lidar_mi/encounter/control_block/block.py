@@ -62,7 +62,7 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
         Too few slabs; an input that is zero, as in air at rest.
     """
     one = flights[0]
-    # margins without an estimate part the flights
+    # margins without an estimate part the flights, and a row without a gust
     truth, estimate = (
         np.concatenate([_with_margins(flight, name) for flight in flights])
         for name in ("truth", "estimate")
@@ -332,7 +332,7 @@ def _spectra(fits: Sequence[FilterFit], dt: float, delay_steps: int) -> Variable
 def _with_margins(flight: SensorSamples, name: str) -> np.ndarray:
     margin = np.full((MARGIN, len(GUSTS)), np.nan)
     around = (margin, margin) if name == "estimate" else (flight.truth_before, flight.truth_after)
-    return np.concatenate([around[0], getattr(flight, name), around[1]])
+    return np.concatenate([around[0], getattr(flight, name), around[1], margin[:1]])
 
 
 def _range(one: SensorSamples) -> str:

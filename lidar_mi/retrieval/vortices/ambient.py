@@ -375,27 +375,28 @@ def _variances(
     Only one of them is there: a variance is weighted by the probability of its length.
     """
     variance = torch.as_tensor(_SPREADS**2, device=push.device)
-    local = _before_relative(_before_relative(free, here).T, here)
-    force = _before_relative(push[:, None], here)
+    local = _before_relative(_before_relative(free, here).T, here).cpu().numpy()
+    force = _before_relative(push[:, None], here).cpu().numpy()
     likelihoods = []
     for length in LENGTHS:
         root = _covariances(*blocks.shape, *blocks.steps, length, push.device)[1]
-        likelihoods.append(_log_likelihoods(root.T @ local @ root, root.T @ force))
+        likelihoods.append(_log_likelihoods(local, force, root))
     # uniform in the rms, whose nodes are logarithmic
     together = torch.as_tensor(np.stack(likelihoods) + np.log(_SPREADS), device=push.device)
     probability = (together - together.max()).exp()
     return (probability * variance).sum(1) / probability.sum()
 
 
-def _log_likelihoods(stiffness: torch.Tensor, force: torch.Tensor) -> np.ndarray:
-    """Of `_SPREADS`, of amplitudes that are independent and have this rms.
+def _log_likelihoods(stiffness: np.ndarray, force: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Of `_SPREADS`, for winds with the covariance s^2 C C' and the lower triangular root C.
 
-    (s^2 b . (1 + s^2 M)^-1 b - log det (1 + s^2 M)) / 2, with the stiffness M once in tridiagonal
-    form.
+    (s^2 b . (1 + s^2 M)^-1 b - log det (1 + s^2 M)) / 2 with b = C' force and M = C' stiffness C,
+    which is once made tridiagonal.
     """
-    matrix, turned = stiffness.cpu().numpy(), force.cpu().numpy().copy()
+    matrix, _ = lapack.dsygst(stiffness, root, itype=2, lower=1)
     # as much memory as for blocks of 64 columns
     reflectors, diagonal, beside, scales, _ = lapack.dsytrd(matrix, 1, 64 * len(matrix))
+    turned = root.T @ force
     turned[1:] = lapack.dormqr("L", "T", reflectors[1:, :-1], scales, turned[1:], 64)[0]
     found = np.empty(len(_SPREADS))
     for number, variance in enumerate(_SPREADS**2):
@@ -496,8 +497,8 @@ def _solve(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
 @lru_cache(maxsize=64)
 def _covariances(
     rows: int, columns: int, step_z: float, step_y: float, length: float, device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Covariance (2 n, 2 n) of v and w of unit variance, averaged over blocks; a root of it."""
+) -> tuple[torch.Tensor, np.ndarray]:
+    """Covariance (2 n, 2 n) of v and w of unit variance, averaged over blocks; its lower root."""
     lag_z, lag_y = np.arange(1 - rows, rows) * step_z, np.arange(1 - columns, columns) * step_y
     total = np.zeros((3, len(lag_z), len(lag_y)))
     for apart_z, weight_z in zip(_APART, (0.25, 0.5, 0.25), strict=True):
@@ -508,9 +509,8 @@ def _covariances(
     at = row[:, None] - row + rows - 1, column[:, None] - column + columns - 1
     vv, vw, ww = total[:, *at]
     plane = np.block([[vv, vw], [vw, ww]])
-    strength, patterns = np.linalg.eigh(plane)
-    root = patterns * np.sqrt(strength.clip(min=0))
-    return torch.as_tensor(plane, device=device), torch.as_tensor(root, device=device)
+    # in the order of columns, as LAPACK reads it
+    return torch.as_tensor(plane, device=device), np.asfortranarray(np.linalg.cholesky(plane))
 
 
 @lru_cache(maxsize=64)

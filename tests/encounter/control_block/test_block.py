@@ -170,6 +170,7 @@ def test_gusts_are_what_the_wing_feels():
     np.testing.assert_allclose(gusts(28.9, linear), [2, -1, 3, 0.1])
 
 
+@pytest.mark.slow
 def test_lift_and_moment_per_gust_are_those_of_the_loads(flights):
     samples = samples_of(flights_in(flights)[0])
     aircraft = aircraft_of(experiment().encounter)
@@ -328,6 +329,7 @@ def test_predicted_roll_agrees_with_flights(block, weather, forward, lost):
     assert abs(np.mean(found) / predicted - 1) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", [0.0, 1.0])
 @pytest.mark.parametrize("run", [1, 3])
 def test_predicted_variances_with_losses_agree_with_flights(block, samples, run, hold):
@@ -346,6 +348,7 @@ def test_predicted_variances_with_losses_agree_with_flights(block, samples, run,
     np.testing.assert_allclose(found, predicted, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_a_few_lost_estimates_raise_the_load_much(block):
     """The residual without losses is small: 3 % in runs of 3 add half of its variance.
 
@@ -380,6 +383,25 @@ def test_lost_estimates_are_counted(tmp_path, samples):
     assert abs(error) < 4 * found["gain_stderr"][k]
 
 
+def test_gusts_of_many_short_flights(samples):
+    """Cut into flights of 9 s, whose winds do not follow each other: the same model of gusts."""
+    short = [
+        replace(
+            one,
+            truth=one.truth[k : k + 90],
+            estimate=one.estimate[k : k + 90],
+            truth_before=one.truth[k - 8 : k],
+            truth_after=one.truth[k + 90 : k + 98],
+        )
+        for k in (10, 120, 230)
+        for one in samples
+    ]
+    whole, cut = control_block(samples), control_block(short)
+    # 2000 innovations: their variance is right to 3 %
+    for name in ("gust_innovations", "gust_variance"):
+        np.testing.assert_allclose(cut[name], whole[name], rtol=0.12 if "inn" in name else 0.5)
+
+
 @pytest.mark.slow
 def test_the_example_flies_along_recorded_flights(flights, block, capsys, monkeypatch):
     """Roll and load by the recorded estimates, within 10 % of the predicted variance."""
@@ -407,6 +429,7 @@ def test_a_range_of_few_slabs_does_not_hide_the_others(tmp_path):
     assert [path.name for path in paths] == ["block_150m.npz", "block_150m.mat", "blocks.json"]
 
 
+@pytest.mark.slow
 def test_folders_without_what_is_needed_are_refused(tmp_path, flights):
     with pytest.raises(InputError, match="holds no finished flight with the lidar; expected the"):
         lm.export_control(tmp_path)

@@ -105,6 +105,7 @@ def test_noise_that_the_flow_absorbs_is_counted(level, unbiased, monkeypatch):
     assert np.mean(residuals) < 0.97 or level < 0.05
 
 
+@pytest.mark.slow
 def test_noise_told_by_a_map_stays_where_it_is(monkeypatch):
     """It grows five times along y: variance by columns to 35 %, in the mean to 25 %.
 
@@ -166,6 +167,7 @@ def slices(through, seed, level):
     return [image / pair[0].std() + level * random.standard_normal(image.shape) for image in pair]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("through", [pytest.param(0.1, marks=pytest.mark.slow), 0.3])
 def test_motion_through_the_plane_is_found(through, monkeypatch):
     """The mean of two pairs to 15 % of the displacement, without replaced texture."""

@@ -61,7 +61,7 @@ def pair_bound(image, pair, noise):
 
 @pytest.mark.slow
 def test_known_pair_at_three_percent_noise():
-    """Parameters within 4 standard errors, which are those of the bound; chi2 is 1.
+    """Parameters within 4 standard errors, which by noise are those of the bound; chi2 is 1.
 
     The bound: 2 m^2/s for each circulation, 1.4 for their mean, 0.035 m for a core radius.
     """
@@ -72,7 +72,10 @@ def test_known_pair_at_three_percent_noise():
     assert (np.abs(found.parameters - vector(*pair.vortices)) < 4 * stderr).all()
     clean = vortex_pair_images(0.0, seed=5)
     bound = pair_bound(clean.first, pair.vortices, 0.03)
-    np.testing.assert_allclose(stderr, np.sqrt(np.diag(bound)), rtol=0.15)
+    by_noise_alone = np.sqrt(np.diag(by_noise(found)) / np.diag(bound))
+    np.testing.assert_allclose(by_noise_alone[[1, 2, 3, 5, 6, 7]], 1, rtol=0.15)
+    # circulations and mean wind share the images with the gradient and the turbulence
+    assert (by_noise_alone > 0.9).all() and (by_noise_alone < 1.4).all()
     mean = np.sqrt(bound[0, 0] + bound[4, 4] - 2 * bound[0, 4]) / 2
     assert mean == pytest.approx(1.4, rel=0.1)
     assert found.chi2 == pytest.approx(1.0, abs=0.06)
@@ -90,6 +93,11 @@ def test_without_noise_only_the_method_errs():
     assert (off[[2, 3, 6, 7]] < 0.02).all() and (off[8:] < 0.02).all()
 
 
+def by_noise(found):
+    """Covariance without the part by turbulence, which calm air lacks and images do not exclude."""
+    return found.covariance - found.shared
+
+
 def reduced_errors(noise, seeds):
     true = vector(*uneven())
     reduced = []
@@ -97,7 +105,7 @@ def reduced_errors(noise, seeds):
         pair = vortex_pair_images(noise, seed=seed, vortices=uneven(), **SMALL)
         found = fit_vortices(pair.first, pair.second, DT, noise=noise, frozen=True)
         assert found.success, found.reasons
-        reduced.append((found.parameters - true) / np.sqrt(np.diag(found.covariance)))
+        reduced.append((found.parameters - true) / np.sqrt(np.diag(by_noise(found))))
     return np.array(reduced)
 
 
@@ -124,6 +132,7 @@ def changed_pair(seed, fraction, gradient=0.0):
     return pair.first, second * (1 + gradient * pair.first["y"] / float(pair.first["y"].max()))
 
 
+@pytest.mark.slow
 def test_air_that_changes_and_light_that_varies():
     """10 % of the texture is replaced, image 2 is brighter to one side: found, within errors.
 
@@ -169,6 +178,7 @@ def test_unlike_images_hold_no_pair():
         assert not fit_vortices(*changed_pair(seed, 1.0), DT).success
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_profile_gain_offset_and_unlike_spacings(profile):
     """A pair advected along by 6 and -3 m/s, on oblong pixels, the second image brighter."""
@@ -344,6 +354,7 @@ def simulated(texture_rms, noise):
     return truth, fit_vortices(*images, DT, noise=level)
 
 
+@pytest.mark.slow
 def test_simulated_wake_with_texture():
     """Circulation to 5 %, places to 0.5 m: 440 and 438 m^2/s, y = +-23.4 m, z = -0.5 m."""
     truth, found = simulated(0.1, 0.01)
@@ -421,10 +432,11 @@ def test_a_disturbed_flow_is_admitted():
         reduced.append(off / np.sqrt(np.diag(found.covariance)))
         model = found.wind(images[0].y.values[None, :], images[0].z.values[:, None])
         winds.append((model["v"].values - true[0]) / model["v_stderr"].values)
-        stated.append(found.model_error)
+        stated.append(np.hypot(found.model_error, found.ambient.rms))
         noise = pair_bound(images[0], uneven(), 0.01)
         assert np.diag(found.covariance)[0] > 4 * noise[0, 0]
-    assert np.mean(stated) == pytest.approx(0.5, rel=0.3)
+    # taken for turbulence of the shortest length, 15 m, of which the images show the large eddies
+    assert 0.5 < np.mean(stated) < 0.75
     assert 0.7 < np.sqrt(np.mean(np.square(reduced))) < 1.5
     assert 0.7 < np.sqrt(np.mean(np.square(winds))) < 1.3
 
@@ -462,6 +474,7 @@ def oblique_images(angle, distance, fraction):
     return images, vector(*wake.vortices(0.0, 0.0))
 
 
+@pytest.mark.slow
 def test_motion_along_oblique_beams():
     """Change of the circulations by half of the motion along x: as by their derivatives, to 30 %.
 

@@ -12,6 +12,7 @@ from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices import vector_fit
 from lidar_mi.retrieval.vortices.model import wind
+from lidar_mi.retrieval.vortices.robust_fit import residual_after
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
 from tests.support.flows import data_array
 from tests.support.vortex_pairs import uneven, vector
@@ -19,10 +20,13 @@ from tests.support.vortex_pairs import uneven, vector
 
 @pytest.mark.slow
 @pytest.mark.parametrize("standard_errors", [0.7, 1.5])
-@pytest.mark.parametrize("index", [0, 1, 3, 8])
+@pytest.mark.parametrize("index", [0, 1, 3])
 def test_a_fit_that_stops_short_is_believed_within_its_errors(monkeypatch, index, standard_errors):
     """The last step missed by so many standard errors of one parameter, as if derivatives had been
-    too noisy to find it: below one it is believed and counted as an error, above it is not."""
+    too noisy to find it: below one it is believed and counted as an error, above it is not.
+
+    Not of the mean wind: turbulence takes a part of a step of it, and the rest is what is found.
+    """
     true = vector(*uneven(), mean=(1.0, -0.5))
     y, z = (np.arange(n) * 2.0 - (n - 1) for n in (33, 23))
     v, w = wind(
@@ -41,20 +45,19 @@ def test_a_fit_that_stops_short_is_believed_within_its_errors(monkeypatch, index
     whole = fit_vortices_to_wind(vectors)
     assert whole.success
     errors = np.sqrt(np.diag(whole.covariance))
-    fit, runs = vector_fit.fit, []
+    in_ambient_wind, step = vector_fit.in_ambient_wind, torch.zeros(14, dtype=torch.float64)
+    step[index] = standard_errors * errors[index]
 
-    def stopped(evaluate, parameters, limits, flow_variance, iterations, tolerance):
-        found = fit(evaluate, parameters, limits, flow_variance, 30, 1e-8)
-        runs.append(iterations)
-        if iterations == 30:  # the starts
-            return found
-        short = found.parameters.clone()
-        short[index] += standard_errors * errors[index]
-        return fit(evaluate, short, limits, flow_variance, 0, tolerance)
+    def stopped(*given):
+        ambient = in_ambient_wind(*given)
+        reached = ambient.solution
+        misfit = reached.misfit._replace(residual=residual_after(reached.misfit, step))
+        parameters = reached.parameters + step
+        short = reached._replace(parameters=parameters, misfit=misfit, converged=False)
+        return ambient._replace(solution=short)
 
-    monkeypatch.setattr(vector_fit, "fit", stopped)
+    monkeypatch.setattr(vector_fit, "in_ambient_wind", stopped)
     found = fit_vortices_to_wind(vectors)
-    assert len(runs) > 3
     off = (found.parameters - whole.parameters)[index] / errors[index]
     assert off == pytest.approx(standard_errors, abs=0.05)
     assert ("did not converge" in found.reasons) == (standard_errors > 1)
@@ -78,6 +81,7 @@ def vectors(noise, seed=1, spacing=1.0, columns=60, rows=44, vortices=None):
     )
 
 
+@pytest.mark.slow
 def test_vectors_give_the_pair_and_its_errors():
     reduced = []
     for seed in range(5):
