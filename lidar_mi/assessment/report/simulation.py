@@ -71,11 +71,7 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
     samples, enough = metrics[_SAMPLES], _sufficient_samples(experiment, metrics)
     allowed = experiment.render.monte_carlo_fraction
     if experiment.render.samples_per_beam == "auto" and experiment.detector:
-        times = (
-            f"; expected {float(f'{enough / samples:.2g}'):g} times as many"
-            if enough
-            else ""
-        )
+        times = f"; expected {float(f'{enough / samples:.2g}'):g} times as many" if enough else ""
         return f"render.max_samples: {text}{times}"
     # it is known to two digits
     expected = f"{float(f'{enough:.2g}'):.0f} or more" if enough else "more"
