@@ -30,7 +30,7 @@ PAGES = (
     (
         "wind",
         "Wind from images",
-        ("retrieval", "experiment.own_images"),
+        ("retrieval", "experiment.image_files"),
         "[images](../guide/images.md), [methods](../guide/methods.md)",
     ),
     (
@@ -43,7 +43,7 @@ PAGES = (
     (
         "rings",
         "Rings of an etalon",
-        ("retrieval.rings", "experiment.own_frames"),
+        ("retrieval.rings", "experiment.ring_frames"),
         "[rings](../guide/rings.md)",
     ),
     (

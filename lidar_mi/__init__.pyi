@@ -9,9 +9,9 @@ from .encounter.jsbsim_in_air import JSBSimInAir
 from .encounter.lidar.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
-from .experiment.own_frames import calibrate_etalon, retrieve_v_los
-from .experiment.own_images import retrieve_files
+from .experiment.image_files import retrieve_files
 from .experiment.results import Run
+from .experiment.ring_frames import calibrate_etalon, retrieve_v_los
 from .experiment.run import run
 from .experiment.truth.extinction import make_truth
 from .flags import Flag

@@ -121,6 +121,7 @@ def test_angles_of_flights_in_degrees():
     assert plot_flights(series, name="x").get_ylabel() == "way / m"
 
 
+@pytest.mark.slow
 def test_matplotlib_is_loaded_by_the_first_plot():
     program = (
         "import sys, lidar_mi as lm; lm.retrieve_wind; lm.read_scan; import lidar_mi.plots; "

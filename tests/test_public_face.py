@@ -29,6 +29,7 @@ def test_import_loads_nothing_heavy():
     assert modules_after("import lidar_mi").isdisjoint(HEAVY)
 
 
+@pytest.mark.slow
 def test_light_names_load_no_renderer():
     """Where a retrieval or an experiment file is all that is asked, Mitsuba is not loaded."""
     code = "import lidar_mi as lm; lm.experiments(); lm.read_image; lm.InputError"

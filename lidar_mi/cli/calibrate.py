@@ -66,7 +66,7 @@ def calibrate(
     """
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.calibration import draw_calibration
-    from lidar_mi.experiment.own_frames import calibrate_etalon, doppler_of, read_electrons
+    from lidar_mi.experiment.ring_frames import calibrate_etalon, doppler_of, read_electrons
     from lidar_mi.io.netcdf import write_netcdf
     from lidar_mi.io.png import write_png
     from lidar_mi.io.target import check_target

@@ -143,7 +143,7 @@ def retrieve(
     Exit code 1: no vector is valid; the file says why.
     """
     from lidar_mi import __version__
-    from lidar_mi.experiment.own_images import retrieve_files
+    from lidar_mi.experiment.image_files import retrieve_files
     from lidar_mi.io.target import check_target
     from lidar_mi.io.wind_file import SERIES, SUFFIXES, write_wind
     from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
@@ -264,9 +264,7 @@ def _statistics(wind: "xr.Dataset", form: str = ".3g") -> tuple[float, list[tupl
         values = wind[name].where(valid)
         error = wind[f"{name}_stderr"].where(valid) if f"{name}_stderr" in wind else values * np.nan
         statistics = (values.mean(), np.sqrt((values**2).mean()), error.mean())
-        mean, rms, stderr = (
-            "-" if np.isnan(number) else f"{float(number):{form}}" for number in statistics
-        )
+        mean, rms, stderr = ("-" if np.isnan(x) else f"{float(x):{form}}" for x in statistics)
         columns.append((mean, rms, stderr))
     return float(valid.mean()), columns
 

@@ -54,10 +54,13 @@ def read_timed_table(
     path = Path(path)
     expected = {TIME: "s", **units} if axis == TIME else dict(units)
     read = _netcdf if path.suffix in (".nc", ".nc4", ".cdf") else _csv
-    columns = read(path, expected)
+    columns, heads = read(path, expected)
     if axis not in columns or len(columns) == 1:
         missing = axis if axis not in columns else f"all of {', '.join(units)}"
-        raise InputError(f"{path}: {missing} missing; expected columns {', '.join(expected)}")
+        there = ", ".join(repr(head.strip()[:40]) for head in heads[:8])
+        raise InputError(
+            f"{path}: {missing} missing; expected columns {', '.join(expected)}, not {there}"
+        )
     table = {}
     for name, (values, unit) in columns.items():
         bad = np.flatnonzero(~np.isfinite(values))
@@ -92,7 +95,12 @@ def _factor(unit: str | None, target: str, name: str, path: Path) -> float:
         raise InputError(f"{path}: {name}: unit {unit!r} is not allowed; {allowed}") from None
 
 
-def _csv(path: Path, expected: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
+_Columns = dict[str, tuple[np.ndarray, str | None]]
+"""Values and units of the columns that are expected, by name."""
+
+
+def _csv(path: Path, expected: Mapping[str, str]) -> tuple[_Columns, list[str]]:
+    """The columns, and the heads of all of the table's."""
     text = read_text(path, "a table, CSV or NetCDF")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     try:
@@ -117,7 +125,7 @@ def _csv(path: Path, expected: Mapping[str, str]) -> dict[str, tuple[np.ndarray,
         if name in expected:
             cells = enumerate((row[index] for row in rows[1:]), 1)
             columns[name] = np.array([_number(cell, name, row, path) for row, cell in cells]), unit
-    return columns
+    return columns, rows[0]
 
 
 def _number(cell: str, name: str, row: int, path: Path) -> float:
@@ -129,9 +137,11 @@ def _number(cell: str, name: str, row: int, path: Path) -> float:
         ) from None
 
 
-def _netcdf(path: Path, expected: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
-    columns = {}
+def _netcdf(path: Path, expected: Mapping[str, str]) -> tuple[_Columns, list[str]]:
+    """The columns, and the names of all variables."""
+    columns: _Columns = {}
     with open_netcdf(path) as data:
+        heads = [str(name) for name in data.variables]
         for name in expected:
             if name not in data.variables:
                 continue
@@ -151,4 +161,4 @@ def _netcdf(path: Path, expected: Mapping[str, str]) -> dict[str, tuple[np.ndarr
         raise InputError(
             f"{path}: {', '.join(columns)} have {sorted(sizes)} values; expected equally many"
         )
-    return columns
+    return columns, heads

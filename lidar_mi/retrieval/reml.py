@@ -28,6 +28,7 @@ def most_likely(
     squares : np.ndarray, shape (squares,)
         Above 0 somewhere.
     terms : np.ndarray, shape (terms, squares)
+        There may be none.
     limits : np.ndarray, shape (terms,)
         Above 0; may be infinite.
     number : np.ndarray or float
@@ -58,7 +59,7 @@ def most_likely(
 
     factors = np.minimum(0.5, most)
     reached = misfit(factors)
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS if len(terms) else 0):
         weight = np.sqrt(number) / variances(factors)
         wanted = (observed - known) * weight
         step = lsq_linear((scaled * weight).T, wanted, (0.0, most), method="bvls").x - factors

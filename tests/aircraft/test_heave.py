@@ -221,6 +221,7 @@ def transfer(omega, density):
     return -(omega**2) * h / g
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("omega", [0.5, 1.0, 2.0, 4.0])
 def test_transfer_function_of_a_gust(omega):
     """Against the resolvent of its equations (0.2 %), and the solution with true delays."""

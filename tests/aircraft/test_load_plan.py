@@ -95,6 +95,7 @@ def least_load_factor(aircraft, loads, duration=8.0):
     return found.fun
 
 
+@pytest.mark.slow
 def test_the_plan_is_near_the_best_possible():
     """Largest load factor: below half of that without control, a third above the least."""
     loads = gust_on(heave())
@@ -106,6 +107,7 @@ def test_the_plan_is_near_the_best_possible():
     assert 0.98 * least < ours < 1.35 * least and ours < 0.45 * off
 
 
+@pytest.mark.slow
 def test_bending_falls_with_the_load_factor():
     loads = gust_on(heave())
     off, ours, fixed = (
@@ -223,6 +225,7 @@ def test_equations_of_jsbsim(boeing):
     assert -equations.motion[2, 2] * inertia == pytest.approx(43 * unit, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_elevator_of_jsbsim_alleviates(boeing):
     """It has no symmetric ailerons; its bending follows the load factor."""
     loads = gust_on(boeing(), largest=6.0)

@@ -106,6 +106,7 @@ def broken(found):
     return {name: faults for name, faults in found.items() if faults}
 
 
+@pytest.mark.slow
 def test_figures_of_a_run(ran):
     found, _ = ran
     assert found and broken(found) == {}
@@ -161,6 +162,7 @@ def flown(tmp_path_factory):
     return figures, texts
 
 
+@pytest.mark.slow
 def test_figures_of_a_flight(flown):
     assert flown[0] and broken(flown[0]) == {}
 
@@ -198,6 +200,7 @@ CAMPAIGNS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CAMPAIGNS)
 def test_campaigns(kind):
     with figure_rules.judged_figures() as found:

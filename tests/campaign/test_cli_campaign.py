@@ -29,6 +29,7 @@ def command(monkeypatch):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["design_map", "which_knob", "luck", "scan_patterns", "airport_design"]
 )

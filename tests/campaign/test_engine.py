@@ -92,6 +92,7 @@ def test_a_sweep_of_retrievals_renders_two_images(tmp_path, client):
     same(found, open_campaign(tmp_path / "out"))
 
 
+@pytest.mark.slow
 def test_a_detector_and_a_pulse_energy_need_no_new_images(tmp_path, client):
     sweep = {"lidar.pulse_energy": ["1 mJ", "9 mJ"], "sky": {"day": {"detector": {}}, "none": {}}}
     path = described(tmp_path, sweep=sweep)
@@ -200,6 +201,7 @@ def test_a_scheduler_that_does_not_answer_and_a_worker_of_another_version(
         pass
 
 
+@pytest.mark.slow
 def test_a_lifetime_that_is_too_short_begins_nothing(tmp_path, client):
     path = described(tmp_path, sweep={"retrieval.template": [6, 8]})
     ready = prepare_campaign(path, tmp_path / "out")

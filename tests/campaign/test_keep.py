@@ -21,6 +21,7 @@ from tests.support.campaigns import described
 from tests.support.experiments import leave_out_figures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "keep", ["metrics", pytest.param("estimates", marks=pytest.mark.slow), "everything"]
 )

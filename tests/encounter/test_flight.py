@@ -34,6 +34,7 @@ def flights(experiment, lidar):
     return simulate_flights(experiment, silent, lidar=lidar)
 
 
+@pytest.mark.slow
 def test_all_meet_the_same_wake(flights, experiment):
     """On the nominal path the rolling moment is that of the wings level, whatever steers."""
     assert list(flights.series["flight"].values) == ["off", "autopilot", "feedforward", "perfect"]
@@ -143,6 +144,7 @@ def test_the_work_of_the_autopilot_is_not_the_lidars(experiment, how, first):
     assert verdict.startswith(first) and "it meets" not in verdict
 
 
+@pytest.mark.slow
 def test_only_what_a_mode_needs_is_flown(experiment):
     class Unused:
         def step(self, *_):
@@ -171,6 +173,7 @@ def test_an_upset_is_a_result():
     assert perfect.sizes["time"] == flights.series.sizes["time"]
 
 
+@pytest.mark.slow
 def test_an_aircraft_that_rises_in_a_gust():
     """With the true wind its load factor changes by half as much; rolling is as without a gust."""
     gust = {"gradient": "50 m", "start": "150 m", "speed": "8 m/s"}

@@ -70,6 +70,7 @@ def test_folder_holds_the_flight(tmp_path):
         lm.fly(one, tmp_path / "other", notice=silent)
 
 
+@pytest.mark.slow
 def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     monkeypatch.setattr("lidar_mi.encounter.report.draw_all", lambda *_: [])
     monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.RATE", 2)
@@ -161,6 +162,7 @@ def flown(tmp_path_factory):
     return in_process("fly", "encounter", "--mode", "off", *sets, "-o", folder), folder
 
 
+@pytest.mark.slow
 def test_the_command_flies(flown):
     done, folder = flown
     assert done.returncode == 0, done.stderr

@@ -36,6 +36,7 @@ def flown(tmp_path_factory):
         return lm.fly(experiment(), folder, lidar=lidar, notice=silent), folder
 
 
+@pytest.mark.slow
 def test_the_same_controller_flies_the_same_flight(flown):
     first, folder = flown
     again = lm.fly(experiment(), replay=folder, notice=silent)
@@ -63,6 +64,7 @@ def test_estimates_are_those_of_the_flight(flown):
     assert WakeTracker(lidar, 0.1, 7.5).lidar is lidar
 
 
+@pytest.mark.slow
 def test_another_controller_has_the_same_estimates(flown):
     first, folder = flown
 

@@ -51,6 +51,7 @@ def test_fog_is_recovered_by_inverting_the_renderer(capsys):
     assert f"optical depth {depth:g}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_example_runs_from_the_command_line(tmp_path, monkeypatch, capsys):
     image = tmp_path / "slab.png"
     options = ["--steps", "1", "--samples", "4", "--out", str(image)]

@@ -122,6 +122,7 @@ def test_all_winds_and_vortices_of_a_run_are_retrieved_there(computed):
     assert done.scans[0].attrs["variant"] == mi.variant() == "llvm_ad_mono_polarized"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_the_wind_of_a_flight_is_retrieved_there(computed):
     retrieval = {"methods": ["variational", "vortex_fit"]}

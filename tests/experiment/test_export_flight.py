@@ -27,6 +27,7 @@ def flight(folder):
     return folder
 
 
+@pytest.mark.slow
 def test_tables_have_the_values_of_the_flight(flight):
     names = [path.name for path in lm.export(flight, "csv")]
     assert names == ["flight.csv", "track.csv", "slab_winds.csv"]
@@ -48,6 +49,7 @@ def test_tables_have_the_values_of_the_flight(flight):
     assert row["v"] == pytest.approx(float(there))
 
 
+@pytest.mark.slow
 def test_points_are_the_vortices(flight):
     results = dict(flight_results(flight, placed=True))
     truth, track = results["vortices_truth"], made_up_flights().track.sel(source="truth")

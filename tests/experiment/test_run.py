@@ -30,6 +30,7 @@ def done(tmp_path_factory):
         return lm.run(experiment, notice=lambda text, fraction: None)
 
 
+@pytest.mark.slow
 def test_a_run_without_a_folder_writes_nothing(done):
     assert [path.name for path in sorted(done.experiment.folder.iterdir())] == [
         "mine.nc",

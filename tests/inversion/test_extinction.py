@@ -150,6 +150,7 @@ def test_oblique_beams_share_the_profile(variant, signal):
     assert rms(found["extinction"].values) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

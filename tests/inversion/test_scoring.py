@@ -61,6 +61,7 @@ def retrieved(profile, depth, brightest, calibration, seed):
     return np.log(mean / true) / error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", [plumes, layers, noise])
 @pytest.mark.parametrize(
     ("depth", "brightest", "calibration"),

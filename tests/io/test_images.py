@@ -126,8 +126,8 @@ def test_a_colour_image_is_the_same_to_both_commands(tmp_path, monkeypatch):
         raise InputError("that was it")
 
     monkeypatch.setattr(rings, "analyse_rings", stop)
-    own_images = importlib.import_module("lidar_mi.experiment.own_images")
-    monkeypatch.setattr(own_images, "retrieve_wind", stop)
+    image_files = importlib.import_module("lidar_mi.experiment.image_files")
+    monkeypatch.setattr(image_files, "retrieve_wind", stop)
     for command in (
         ["rings", "colours.png"],
         ["retrieve", "colours.png", "colours.png", "--dt", "1", "--spacing", "1"],
@@ -141,6 +141,7 @@ def test_a_colour_image_is_the_same_to_both_commands(tmp_path, monkeypatch):
     np.testing.assert_array_equal(to_retrieve[::-1, ::-1], to_rings)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, values, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Image.fromarray(values.astype(np.uint8)).save("rings.png")

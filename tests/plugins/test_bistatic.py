@@ -41,6 +41,7 @@ def slab(world, to_world, gates, size=(1, 1), orders=1, phase="rayleigh_polarize
     )
 
 
+@pytest.mark.slow
 def test_a_beam_that_crosses_the_field_of_view(world):
     """A laser 10 m beside the telescope meets its axis at 115 m: the lidar equation along it."""
     g, base, fov, aperture = 0.5, 10.0, 10e-3, 0.01
@@ -71,6 +72,7 @@ def test_a_beam_that_crosses_the_field_of_view(world):
     assert (error[seen] < 0.02 * expected.max()).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("offset", "tilt"), [(0.5, 0.0), (0.0, 1.0), (0.1, 0.1)], ids=["offset", "tilt", "both"]
 )
@@ -111,6 +113,7 @@ def test_a_turned_laser_emits_turned_polarisation(world):
     assert s1 / s0 == pytest.approx(math.cos(2 * math.pi / 3), abs=2e-3)
 
 
+@pytest.mark.slow
 def test_fields_of_view_of_one_telescope(world):
     """A pixel for each, in one rendering: each is what it is alone."""
     fields = (0.25e-3, 1e-3, 5e-3)
@@ -133,6 +136,7 @@ def test_fields_of_view_of_one_telescope(world):
     np.testing.assert_array_less(abs(found.mean(0) - expected), 4 * error)
 
 
+@pytest.mark.slow
 def test_what_is_refused(world):
     with pytest.raises(RuntimeError, match="'2 numbers' is not allowed; expected one, or 1"):
         slab(world, pose(), (110.0, 120.0), fov_half_mrad="1, 2")

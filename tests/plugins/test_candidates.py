@@ -22,6 +22,7 @@ VIEW = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [1e-4, 0.02, 0.3, 1.0, 5.0, 300.0])
 def test_ranges_have_the_distribution_of_gate_and_pulse(sigma):
     """Weighted fractions below each of 40 places against differences of normal integrals."""
@@ -85,6 +86,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_expectation_is_that_of_one_candidate(world, case):
     spp = 4000
@@ -118,6 +120,7 @@ def test_noise_of_pulses_and_of_what_the_field_cuts_off_falls(world, case):
     assert (many**2).mean() < (one**2).mean() / 8
 
 
+@pytest.mark.slow
 def test_gradients_have_one_candidate(world):
     found = []
     for candidates in (1, 16):
@@ -133,6 +136,7 @@ def test_gradients_have_one_candidate(world):
     assert np.abs(found[0]).max() > 0
 
 
+@pytest.mark.slow
 def test_open_surfaces_have_one_candidate(world):
     """Behind them the medium is known from the one in front alone."""
     at = mi.ScalarTransform4f().translate([499, 0, 0]).rotate([0, 1, 0], -90).scale(200)

@@ -82,6 +82,7 @@ def neighbours(rng, incident, side):
     return np.concatenate([near, tilted]).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1, -1], ids=["forward", "backward"])
 @pytest.mark.parametrize("phase", PHASES, ids=str)
 def test_density_follows_the_value_at_the_poles(optics, phase, side):

@@ -35,6 +35,7 @@ def assert_standard(found):
     assert z.std() > 0.9 - 5 / np.sqrt(2 * len(z))
 
 
+@pytest.mark.slow
 def test_single_scattering():
     assert_standard(deviations(range(12)))
 
@@ -100,6 +101,7 @@ def layered(where, order=1, samples=4096):
     return image[0], image[4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [0, 200, 245, 488])
 def test_a_thin_layer_anywhere_on_the_path(where):
     clear, clear_error = layered(None)

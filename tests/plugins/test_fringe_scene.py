@@ -168,6 +168,7 @@ EVERY_WAY = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "estimator", "shape", "lens"),
     [
@@ -321,6 +322,7 @@ def test_two_etalons_see_the_same_frequency(estimator, statistics):
 # --- polarisation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["camera", "forward", "analog"])
 def test_stokes_vector_of_the_source_arrives_about_the_horizontal_axis(estimator):
     """Through an etalon that knows no polarisation; then through Mitsuba's own polariser."""
@@ -344,6 +346,7 @@ def test_stokes_vector_of_the_source_arrives_about_the_horizontal_axis(estimator
     np.testing.assert_allclose(total, 0.25 * np.array([1, -1, 0, 0]), atol=noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["camera", "forward"])
 @pytest.mark.parametrize(
     ("centre", "stokes_index"), [((-80.0, 15.5), 1), ((-60.0, -60.0), 2), ((-60.0, 91.0), 2)]
@@ -534,6 +537,7 @@ def test_rays_into_the_scene_are_those_that_arrive():
 # --- Mitsuba
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"], indirect=True)
 def test_mitsuba_s_own_integrator_sees_the_same_rings(statistics):
     """`path` follows both lobes of the plates; the source is an environment to it."""
@@ -598,6 +602,7 @@ def test_passes_and_seeds():
         assert np.std(parts[0] - whole[0]) == pytest.approx(np.sqrt(2 * (error**2).mean()), rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "message"),
     [

@@ -91,6 +91,7 @@ class TestAnalogAgreesWithGated:
         self.compare(world, statistics, seed=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["gated", "gated, half in view", "analog"])
 def test_standard_error_is_correct(world, statistics, case):
     """100 seeds x 100 equal beams: z-scores have unit variance, in all, per seed, per beam.
@@ -154,6 +155,7 @@ def test_standard_error_is_correct_in_a_thin_textured_slab(world, statistics, ph
 
 
 class TestVariants:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "variant",
         [
@@ -196,6 +198,7 @@ class TestVariants:
 
 
 class TestPasses:
+    @pytest.mark.slow
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     @pytest.mark.parametrize("at_once", [1, 7, 50, 70])
     def test_samples_per_pass_do_not_change_the_result(self, world, estimator, at_once):
@@ -299,6 +302,7 @@ class TestKernels:
         assert kernels(parameters.update) & first == set()  # the update's own, small ones
         assert kernels(lambda: dr.eval(mi.render(scene, seed=4, spp=64))) <= first
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "integrator", [{}, {"orders": True}, {"estimator": "analog"}, {"candidates": 4}], ids=str
     )
@@ -408,6 +412,7 @@ class TestOpaqueTargets:
             wall=wall,
         )
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     @pytest.mark.parametrize("x", [300.0, 495.0])
     def test_no_light_from_behind_a_wall(self, world, estimator, x):
@@ -538,6 +543,7 @@ class TestCovariance:
         found = np.stack([np.array(mi.render(scene, spp=spp, seed=s)) for s in range(seeds)])
         return {name: found[..., k].astype(float) for k, name in enumerate(names)}
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     def test_is_that_over_seeds(self, world, estimator):
         if not mi.is_polarized:

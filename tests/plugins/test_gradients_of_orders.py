@@ -130,6 +130,7 @@ def case(name):
     return reference.loaded(values, mueller()), DATA, random.uniform(0, 1, (*SHAPE, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -227,26 +228,31 @@ class TestRefused:
         (line,) = str(error.value).splitlines()
         return line
 
+    @pytest.mark.slow
     def test_what_has_no_gradient(self):
         scene = reference.loaded(reference.extinction(1.0, False))
         line = self.refused(scene, DATA, "sensor.fov_half_mrad")
         assert "'sensor.fov_half_mrad' is not allowed; expected extinction coefficients" in line
 
+    @pytest.mark.slow
     def test_phase_functions_without_parameters_that_have_one(self):
         scene = reference.loaded(reference.extinction(1.0, False))
         phase = f"{MEDIUM}.phase_function.depolarization"
         assert f"'{phase}' is not allowed" in self.refused(scene, phase)
 
+    @pytest.mark.slow
     def test_tables_of_mitsuba(self):
         scene = reference.loaded(
             reference.extinction(1.0, False), {"type": "tabphase", "values": "1, 2, 3"}
         )
         assert "values' is not allowed" in self.refused(scene, f"{MEDIUM}.phase_function.values")
 
+    @pytest.mark.slow
     def test_no_parameter(self):
         scene = reference.loaded(reference.extinction(1.0, False))
         assert "'no parameter' is not allowed; expected dr.enable_grad of" in self.refused(scene)
 
+    @pytest.mark.slow
     def test_analog_samples(self):
         scene = reference.loaded(reference.extinction(1.0, False))
         scene.integrator().estimator = "analog"

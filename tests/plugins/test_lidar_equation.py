@@ -96,6 +96,7 @@ def slab_scene(world, size=(219, 139), gate=(500.0, 502.5), slab=None, low=490.0
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("medium", ["homogeneous", "grid"])
 def test_slab_in_an_environment(world, statistics, medium):
     """The paper's 30 441 beams, 256 samples each; slab of 0.02 / m from 490 m, gate at 500 m.
@@ -179,6 +180,7 @@ class TestMajorants:
             [560, 562.5], secants(scene, self.SIZE[::-1]), [(0, 1e-4), (500, self.SIGMA)]
         )[0]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("raise_", [None, 1, 4, 20])
     def test_gated(self, world, statistics, raise_):
         photons = 20_000
@@ -186,6 +188,7 @@ class TestMajorants:
         stokes, error = world.render(scene, seed=3, spp=photons)
         statistics.assert_agree(stokes[0, 0], error[0], self.truth(scene), photons, bias=TRUNCATION)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("raise_", [None, 1, 4, pytest.param(20, marks=pytest.mark.slow)])
     def test_analog(self, world, raise_):
         """Compared over the whole scan: one photon in 70 collides in the gate."""
@@ -198,6 +201,7 @@ class TestMajorants:
         assert abs(ratio.mean() - 1) < 4 * sigma
 
 
+@pytest.mark.slow
 def test_varying_grid(world, statistics):
     """A valley of extinction along x: linear between cell centres, so known in closed form.
 
@@ -251,6 +255,7 @@ class TestGates:
                     stokes[gate, 0], error[gate], truth[gate], photons, bias=TRUNCATION
                 )
 
+    @pytest.mark.slow
     def test_many_gates_are_the_single_gates_one_by_one(self, world, statistics):
         """And their sum is the signal of one gate over all of them."""
         photons, gates = 1000, 8

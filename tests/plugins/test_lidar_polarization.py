@@ -50,6 +50,7 @@ def scan(world, emitted, phase, environment=None, **parameters):
     return world.render(scene, seed=1, spp=256)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EMITTED)
 @pytest.mark.parametrize("phase", ["rayleigh_polarized", "mueller"])
 def test_backscatter_turns_the_signs_of_u_and_v(world, name, phase):
@@ -80,6 +81,7 @@ def test_depolarisation_ratios(world, depolarization):
     assert (i + v) / (i - v) == pytest.approx(2 * linear / (1 - linear), abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("phase", "value"),
     [
@@ -117,6 +119,7 @@ def test_unpolarised_variants_carry_intensity_only(world, variant):
     assert (stokes[0] > 0).all() and (stokes[1:] == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("direction", "roll"),
     [((0, 0, 1), 0), ((0, 0, -1), 0), ((1e-3, 2e-3, 1), 0), ((1, 0, 0), 30), ((1, 0.3, 0.2), 77)],

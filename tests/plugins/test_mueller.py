@@ -220,6 +220,7 @@ def edited(change):
     return table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "message"),
     [

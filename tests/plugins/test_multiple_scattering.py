@@ -56,6 +56,7 @@ def agree(found, mean, error, sigmas=3.5):
     assert (z**2).mean() < 1 + 3 * np.sqrt(2 / len(z)), z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [RAYLEIGH, FORWARD], ids=["rayleigh", "forward"])
 @pytest.mark.parametrize("estimator", ["gated", "analog"])
 def test_dense_slab_agrees_with_an_independent_simulation(world, truth, case, estimator):
@@ -71,6 +72,7 @@ def test_dense_slab_agrees_with_an_independent_simulation(world, truth, case, es
     np.testing.assert_allclose(orders[3:], reference[3:], rtol=high)
 
 
+@pytest.mark.slow
 def test_depolarisation_by_multiple_scattering(world, truth):
     mean, error = truth[RAYLEIGH]
     found = gates(dense(world, RAYLEIGH), spp=1_000_000, seed=6)
@@ -83,6 +85,7 @@ def test_depolarisation_by_multiple_scattering(world, truth):
     assert degree[0] > 0.95 and degree[-1] < 0.75
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peak", [1e-4, 2.0])
 @pytest.mark.parametrize("case", [RAYLEIGH, FORWARD], ids=["rayleigh", "forward"])
 def test_a_wrong_forward_peak_guides_without_bias(world, truth, monkeypatch, case, peak):
@@ -102,6 +105,7 @@ def test_orders_sum_to_the_total_and_the_first_is_single_scattering(world):
     np.testing.assert_allclose(found[:, 5], single[:, 0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_orders_of_millions_of_samples_keep_their_digits(world):
     """In one gate: a running sum of so many terms is off by 4e-6, or more with longer runs."""
     case = Case(gates=(500.0, 510.0))
@@ -137,6 +141,7 @@ def test_standard_error_is_correct(world):
     assert np.abs(variance - 1).max() < 4.5 * np.sqrt(2 / 19)
 
 
+@pytest.mark.slow
 def test_environment_and_slab_scatter_together(world):
     """Vertices before the slab count as well: both estimators agree in an environment."""
     environment = world.homogeneous(5e-3, "rayleigh_polarized")
@@ -163,6 +168,7 @@ def test_environment_and_slab_scatter_together(world):
     assert abs(second[0] / second[1] - 1) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb"], indirect=True)
 def test_unpolarised_variants_agree(world, truth, variant):
     mean, error = truth[FORWARD]

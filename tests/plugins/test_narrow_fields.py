@@ -77,6 +77,7 @@ def test_samples_lost_to_rounding_are_counted_and_said_once(world):
         mi.render(loaded, spp=1000, seed=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES[:2])
 def test_nor_its_derivative_by_extinction(world, case):
     loaded = pencil(world, case)
@@ -96,6 +97,7 @@ def test_nor_its_derivative_by_extinction(world, case):
     assert abs(np.mean(slopes) - expected * slope / case.extinction) < 4 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [1e-5, 1e-4, 1e-3, 1e-2])
 @pytest.mark.parametrize("excess", [1e-4, 1e-2, 1.0])
 def test_paths_close_along_the_direction_from_the_telescope(angle, excess):

@@ -114,6 +114,7 @@ def one_round(case, rng, number):
     return stokes.mean(1), stokes.std(1) / math.sqrt(number)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "pose"),
     [pytest.param(name, "as it is", marks=[pytest.mark.slow] * (name in RARE)) for name in CASES]

@@ -24,6 +24,7 @@ def test_horizontal_axis_is_horizontal_perpendicular_and_unit(optics):
     assert np.array(horizontal_axis(mi.Vector3f(1, 0, 0))).ravel() == pytest.approx([0, 1, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_horizontal_axis_of_vertical_light_is_y(up):
     assert np.array(horizontal_axis(mi.Vector3f(0, 0, up))).ravel() == pytest.approx([0, 1, 0])
@@ -51,6 +52,7 @@ def test_transverse_is_the_perpendicular_part(optics):
     assert np.abs(found - optics.normalized(part)).max() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 1.0, np.pi - 1e-4, np.pi])
 def test_scattering_angle_keeps_its_digits_at_both_ends(angle):
     """An arc cosine would be wrong by 3e-4 rad there."""

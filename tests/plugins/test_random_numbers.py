@@ -70,6 +70,7 @@ def channels(scene, seed=1, samples=16):
     return {name: image[..., k] for k, name in enumerate(names)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "seeds"), [(1, 60), pytest.param(4, 200, marks=pytest.mark.slow)]
 )
@@ -94,6 +95,7 @@ def test_expectation_and_errors_are_those_of_independent_numbers(world, order, s
     assert shared > 3 and np.abs(drawn.mean(0) / (drawn.std(0) / np.sqrt(seeds))).max() < 4
 
 
+@pytest.mark.slow
 def test_beams_of_the_same_air_have_the_same_error(world):
     """Spread over the beams of relative errors, over their standard error: 1 if independent."""
     thin = {"order": 1, "extinction": 1e-3, "varies": 0}
@@ -107,6 +109,7 @@ def test_beams_of_the_same_air_have_the_same_error(world):
     assert found["common"] < 0.5 * found["independent"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", ["common", "independent"])
 def test_passes_do_not_change_the_numbers(world, numbers):
     """Passes of a few beams, and of a few samples of a beam."""
@@ -117,6 +120,7 @@ def test_passes_do_not_change_the_numbers(world, numbers):
             np.testing.assert_allclose(parts[name], whole[name], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_finite_differences_of_common_numbers_are_the_gradient(world):
     """Of one seed, in air so thin that the random estimate of the transmittance does not count."""
     scene = scan(world, "common", 1, extinction=1e-4)
@@ -150,6 +154,7 @@ def test_free_flights_have_independent_numbers(world):
         scan(world, "common", estimator="analog")
 
 
+@pytest.mark.slow
 def test_beams_of_other_directions_have_the_same_error(world):
     """Uniform air that scatters again and again, spherical gates: all beams have the same signal.
 

@@ -71,6 +71,7 @@ def test_every_plugin_is_announced_by_its_name():
     assert entry_points() == expected
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_plugins_serve_mitsuba_3_10(tmp_path):
     done = python(AS_MITSUBA_3_10, *entry_points().values())

@@ -110,6 +110,7 @@ def same_scene(world):
     )
 
 
+@pytest.mark.slow
 def test_xml_and_dictionary_give_the_same_image_in_every_variant(world, scene_file):
     """Back and forth between variants, in one process."""
     images = {}
@@ -274,6 +275,7 @@ def test_cone_of_beams_from_a_table():
         assert np.abs(np.stack([s1, s2]) / s0).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scalar", ["hg", "isotropic"])
 def test_blend_with_an_unpolarised_part_is_refused_where_it_would_be_wrong(world, scalar):
     """And accepted among its own kind, and without polarisation, where it is right."""

@@ -49,6 +49,7 @@ def assert_stated(values, stated):
     assert low < ratio < high, (ratio, low, high)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["rayleigh_polarized", {"type": "hg", "g": 0.6}])
 def test_of_each_component(world, phase):
     found = images(world, "1, 0.3, 0.5, 0.7", phase)

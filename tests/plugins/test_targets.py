@@ -54,6 +54,7 @@ def expected(tilt=0.0, extinction=EXTINCTION):
     return lambertian * math.pi * (APERTURE / RANGE) ** 2 * math.exp(-2 * extinction * RANGE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["gated", "analog"])
 @pytest.mark.parametrize("tilt", [0.0, 40.0])
 @pytest.mark.parametrize(
@@ -71,6 +72,7 @@ def test_return_of_a_wall(world, variant, estimator, tilt):
     np.testing.assert_allclose(found[:, 5], found[:, 0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_pulse_spreads_it_over_gates(world):
     duration = 3e-8
     scene = target(world, gates=10, laser={"pulse_duration": duration}, wall=wall())
@@ -107,6 +109,7 @@ def test_gated_and_analog_agree_with_air_before_and_behind(world):
     assert gated[2, 5] > 3 * gated[1, 5] and analog[2, 4] < 0.1 * analog[2, 0]
 
 
+@pytest.mark.slow
 def test_faces_that_are_dark(world):
     away = wall(180.0)
     facing = wall(180.0, bsdf={"type": "twosided", "bsdf": wall()["bsdf"]})

@@ -127,6 +127,7 @@ class TestHomogeneousSlab:
         length = (plan.gate_stop - plan.gate_start) * slant
         return self.SIGMA * BACKSCATTER * np.trapezoid(value, r, axis=0) / length
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("gates", ["planar", "spherical"])
     def test_normalised_image_is_flat(self, gates):
         """Both scans, 30 441 beams: 0.2 % flat in planar gates, and as the closed form says."""
@@ -255,6 +256,7 @@ class TestScans:
                 plane(1e-3 * rng.uniform(0.5, 1.5, (len(Z), len(Y)))), plans[0], BackscatterLidar()
             )
 
+    @pytest.mark.slow
     def test_a_moved_scene_gives_the_image_of_a_new_one(self):
         """The second and third scan from the first's scene, and each rendered alone."""
         plans = self.plans((0.0, 15.0, 30.0))

@@ -74,6 +74,7 @@ def rendered(scene, path=None, passes=None):
     return np.array(mi.render(scene, seed=5)), made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "estimator"),
     [
@@ -98,6 +99,7 @@ def test_a_killed_image_resumes_where_it_was(variant, tmp_path, monkeypatch, mak
     np.testing.assert_array_equal(image.view(np.uint32), whole.view(np.uint32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "estimator", "other"),
     [(ring_scene, "camera", 700), pytest.param(lidar_scene, "gated", 15, marks=pytest.mark.slow)],

@@ -73,6 +73,7 @@ def fine_image(camera, etalon, line, v_los):
     return image.reshape(camera.height, 4, camera.width, 4).sum((1, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("etalon", "camera"),
     [
@@ -164,6 +165,7 @@ def test_image_and_header_survive_the_file(tmp_path):
         read_fringes(write_only)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["camera", "analog"])
 def test_scene_file_that_ships_renders(tmp_path, estimator):
     """Whole chain of `lidar-mi render`: four rings and the radii that the description has."""
@@ -213,6 +215,7 @@ def test_lens_and_field_fit_any_camera():
     assert np.all(np.array(source.radiance(-direction)) == 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("call", "message"),
     [

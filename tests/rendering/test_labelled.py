@@ -42,6 +42,7 @@ def lidar(rows, columns, **changes):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_axes_are_the_places_of_the_beams():
     """In the middle of the gates, 102 m ahead: 102 tan(angle), port (+4 degrees) first."""
@@ -59,6 +60,7 @@ def test_axes_are_the_places_of_the_beams():
             assert np.array_equal(layer, rows[..., 5 * gate + k]), name
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_backscatter_is_that_of_the_air():
     """beta exp(-2 sigma r), r the middle of the first gate; beta is 1.5 sigma / (4 pi)."""
@@ -72,6 +74,7 @@ def test_backscatter_is_that_of_the_air():
     assert float(scan["Y"][0, 0]) == pytest.approx(expected, rel=4 * stderr + 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_rings_of_a_camera():
     import mitsuba as mi

@@ -93,6 +93,7 @@ def renderer(**settings):
     return ScanRenderer(air, plan, lidar, 1e-4, phase, 1.0, asked), air, plan
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_full_memory_makes_smaller_passes_of_the_same_image(monkeypatch):
     """The same random numbers: single precision apart."""
@@ -126,6 +127,7 @@ class Integrator:
     samples_per_pass = 1 << 20
 
 
+@pytest.mark.slow
 def test_memory_that_stays_full_is_one_line():
     integrator = Integrator()
 

@@ -10,6 +10,7 @@ from lidar_mi.rendering.settings import VARIANTS
 from lidar_mi.rendering.variant import has_cuda, use_variant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [v for v in VARIANTS if v.startswith("llvm")])
 def test_every_llvm_variant_can_be_set(variant, name):
     use_variant(name)
@@ -17,6 +18,7 @@ def test_every_llvm_variant_can_be_set(variant, name):
     assert mi.load_dict({"type": "rayleigh_polarized"}) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_magic", "", "LLVM_AD_RGB"])
 def test_others_are_refused(variant, name):
     with pytest.raises(InputError) as error:

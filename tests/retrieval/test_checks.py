@@ -38,6 +38,7 @@ def test_images_that_are_the_same_are_named():
     assert identical([other, np.nextafter(other, 9)]) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("checks", [True, False])
 @pytest.mark.parametrize("method", ["cc", "ws", "multipass", "variational", "vortex_fit"])
 def test_one_image_given_twice_has_no_valid_wind(method, checks):

@@ -125,6 +125,7 @@ def test_volume_shows_the_planes_in_the_gate(tmp_path, quick):
             assert one["w"].values[valid].mean() == pytest.approx(5.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_true_wind_is_as_strong_as_it_is(tmp_path, quick):
     """A uniform wind of 10 and 5 m/s: an error of as much is no skill."""
     data = small()

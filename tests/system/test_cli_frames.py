@@ -42,6 +42,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tif", "ome", "imagej", "fits", "npy", "pgm", "im7"])
 def test_a_file_of_two_frames_is_a_pair(here, lidar_mi, kind):
     images = np.stack(exposures())
@@ -66,6 +67,7 @@ def test_a_file_of_two_frames_is_a_pair(here, lidar_mi, kind):
     assert v == pytest.approx(5, abs=0.3) and w == pytest.approx(-2.5, abs=0.3)
 
 
+@pytest.mark.slow
 def test_frames_are_named(here, lidar_mi):
     pages("stack.tif", exposures(4))
     code, _, err = lidar_mi("retrieve", "stack.tif", *OPTIONS)
@@ -112,6 +114,7 @@ def test_what_is_ambiguous_is_refused(here, lidar_mi, arguments, says):
     assert not (here / "wind.nc").exists()
 
 
+@pytest.mark.slow
 def test_identical_images_are_remarked_on(here, lidar_mi):
     images = exposures()
     pages("same.tif", [images[0], images[0]])
@@ -128,6 +131,7 @@ def test_identical_images_are_remarked_on(here, lidar_mi):
         assert f"frames 0 and 1 {words}" in lidar_mi("rings", "same.tif", option)[1]
 
 
+@pytest.mark.slow
 def test_depth_of_colour_does_not_change_the_wind(here, lidar_mi):
     """12 bits in 16-bit colour: the wind of the grey images, digit by digit."""
     images = exposures(scale=600)
@@ -142,6 +146,7 @@ def test_depth_of_colour_does_not_change_the_wind(here, lidar_mi):
     xr.testing.assert_identical(of_file()[1], grey)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["csv", "mat", "vtk", "flo"])
 def test_the_name_says_the_format(here, lidar_mi, suffix):
     pages("pair.tif", exposures())

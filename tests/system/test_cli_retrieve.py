@@ -66,6 +66,7 @@ def test_order_is_not_judged_where_the_gates_followed_the_air(tmp_path):
     assert steps_of([tmp_path / "0.exr", tmp_path / "1.exr"]) == [0.1]
 
 
+@pytest.mark.slow
 def test_time_step_and_statistics(here, lidar_mi):
     code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", *OPTIONS)
     assert code == 0 and "dt 0.1 s, by the headers" in words_of(out)
@@ -86,6 +87,7 @@ def test_time_step_and_statistics(here, lidar_mi):
     assert f"{float(valid.mean()):.1%} valid" in out
 
 
+@pytest.mark.slow
 def test_contradictions_are_said(here, lidar_mi):
     code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", "--dt", 100, *OPTIONS)
     assert code == 0 and "warning: dt is 100 s as given, but 0.1 s by the headers" in words_of(out)
@@ -135,6 +137,7 @@ def test_many_images_pair_by_pair(here, lidar_mi):
         assert code == 2 and words in err and len(err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_images_of_a_detector_come_first(here, lidar_mi):
     """Y_noisy before Y; which was taken is said; images of both kinds are not mixed unasked."""
     for number in (0, 1):
@@ -200,6 +203,7 @@ def photographs(tmp_path, monkeypatch):
         Image.fromarray(grey[:, start : start + 48]).save(name)
 
 
+@pytest.mark.slow
 def test_pixels_are_those_of_the_wind_in_metres(photographs, lidar_mi):
     assert lidar_mi("retrieve", "a.png", "b.png", *OPTIONS)[0] == 2
     files = "retrieve", "a.png", "b.png", "--stride", "4"
@@ -221,6 +225,7 @@ def test_pixels_are_those_of_the_wind_in_metres(photographs, lidar_mi):
     assert code == 2 and "pixels, spacing" in err
 
 
+@pytest.mark.slow
 def test_a_picture_of_the_vectors(photographs, lidar_mi, tmp_path):
     files = "retrieve", "a.png", "b.png", "--pixels", "--stride", "4"
     code, out, _ = lidar_mi(*files, "-o", "w.nc")

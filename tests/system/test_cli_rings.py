@@ -66,6 +66,7 @@ def test_frames_of_cubes_and_pages(tmp_path):
         np.testing.assert_array_equal(read_frames(tmp_path / name), frames[:1])
 
 
+@pytest.mark.slow
 def test_the_gap_of_a_lamp(call):
     """The mean of two frames: 0.885 mm within 4 of the standard errors that are printed."""
     write_pages("lamp.tif", exposures())
@@ -103,6 +104,7 @@ def test_a_series_as_a_table(call):
     assert rows[2]["note"].split()[0] in out
 
 
+@pytest.mark.slow
 def test_refused(call):
     write_pages("two.tif", exposures())
     Image.fromarray(exposures(1)[0][:180].astype(np.uint16)).save("low.png")

@@ -103,6 +103,7 @@ def test_names_are_no_markup(there, lidar_mi):
     assert code == 2 and "[b]x: is no run folder" in err and "Traceback" not in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "output"),
     [

@@ -35,6 +35,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_vortices_of_two_scans(folder, tmp_path):
     files = [folder / f"rhi_{k}.csv" for k in (0, 1)]
     done = in_process(
@@ -75,6 +76,7 @@ def test_bad_input_is_one_line(folder, arguments, message):
     assert done.stderr.count("\n") <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "elevation", "code", "message"),
     [

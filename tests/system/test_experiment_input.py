@@ -51,6 +51,7 @@ def test_gates_that_reach_beyond_the_wake(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_beams_wider_than_a_template_are_reported(tmp_path, quick):
     """At 5 km the paper's beam is 10 m wide, a template 4 m: nothing is left to follow, as the
     report states."""

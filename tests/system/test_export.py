@@ -136,6 +136,7 @@ def assert_same_at(places, values, truth):
         np.testing.assert_allclose(at[name], found[name], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_winds_and_volumes_in_vtk_are_those_of_the_run(folder):
     paths = {path.name: path for path in lm.export(folder)}
     assert {n for n in paths if n.startswith("wind")} == {
@@ -222,6 +223,7 @@ def test_matlab_has_arrays_units_and_reasons(folder):
     assert list(found["flag_meanings"]["flag"]) == ["rim", "faint", "outlier"]
 
 
+@pytest.mark.slow
 def test_export_refuses_in_one_line(folder, tmp_path, monkeypatch, lidar_mi):
     monkeypatch.chdir(tmp_path)
     for args, words in (

@@ -85,6 +85,7 @@ def assert_one_run(found, left, where):
     assert results.items() <= content(whose).items(), where
 
 
+@pytest.mark.slow
 def test_some_faults_at_some_places(tmp_path):
     """And that nothing is written past them: whatever lies there at the end came by a rename."""
     fresh, over = faults(tmp_path, every=SOME)

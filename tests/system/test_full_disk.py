@@ -60,6 +60,7 @@ def test_a_wind_that_has_no_room(disk, there, lidar_mi):
     assert (disk / "w.nc").read_bytes().startswith(b"\x89HDF")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "left",
     [

@@ -44,12 +44,14 @@ DESCRIBING = {"numpy", "scipy"}
 """Loaded by an experiment file."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [("--help",), ("run", "--help"), ("check", "--help")])
 def test_help(arguments):
     found = modules_of_command(*arguments) & (COMPUTING | READING | DESCRIBING)
     assert not found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["check", "run", "fly"])
 @pytest.mark.parametrize("text", ["wakes: {}", "wake: {vortex_pair: {circulation: 1e9}}"])
 def test_a_fault_of_an_experiment_file(tmp_path, command, text):
@@ -58,6 +60,7 @@ def test_a_fault_of_an_experiment_file(tmp_path, command, text):
     assert not loaded & (COMPUTING | READING) and "pydantic" in loaded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["wake_backscatter", "wake_sensor", "fringes_paper", "airport", "encounter"]
 )
@@ -75,6 +78,7 @@ def test_list():
 
 
 # a wavelength is shown in nm by pint, which loads what it finds of two others
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "rare"),
     [
@@ -89,6 +93,7 @@ def test_keys(tmp_path, arguments, rare):
     assert not loaded & (COMPUTING | READING - rare) and "pydantic" in loaded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["spheroids", "molecules"])
 def test_info_of_a_scatterer(what):
     loaded = modules_of_command("info", what)
@@ -104,12 +109,14 @@ def test_info_of_an_image(tmp_path):
     assert not modules_of_command("info", tmp_path / "a.exr") & (COMPUTING | READING)
 
 
+@pytest.mark.slow
 def test_info_of_a_run_folder(tmp_path):
     (tmp_path / "experiment.yaml").write_text("experiment: {name: a, seed: 3}\nversions: {}\n")
     (tmp_path / "metrics.json").write_text(json.dumps({"backscatter.mc_relative_error": 0.1}))
     assert not modules_of_command("info", tmp_path) & (COMPUTING | READING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "name"), [("run", "wake_sensor"), ("fly", "encounter")])
 def test_what_is_loaded_before_a_run_says_that_it_starts(tmp_path, command, name):
     """The first line of progress comes as soon as the experiment file is read."""

@@ -101,6 +101,7 @@ def succeeds(call, *arguments):
 QUICK = ("blanks", "latin1", "newline", "dash", "dollar", "brackets", "long")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in NAMES]
 )
@@ -184,6 +185,7 @@ def test_definitions_that_a_scene_takes_for_parameters(command):
     assert code == 2 and "without $, which stands for a parameter" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "environment",
     [

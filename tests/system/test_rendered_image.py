@@ -74,6 +74,7 @@ def test_blur_by_beam_keeps_even_and_linear_air(rough):
     np.testing.assert_allclose(blurred.values[6:-6, 6:-6], linear.values[6:-6, 6:-6], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_image_is_the_blurred_extinction_within_its_standard_errors():
     """Single scattering by the textured wake against theory, at both times, pixel by pixel.
 

@@ -61,6 +61,7 @@ def test_a_rerun_uses_the_images(tmp_path, quick):
     assert without_timing(after) == without_timing(before)
 
 
+@pytest.mark.slow
 def test_a_missing_image_is_rendered_again_and_identical(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
@@ -115,6 +116,7 @@ def test_a_changed_wake_file_is_another_experiment(tmp_path, quick):
         run(check(data), tmp_path / "run", beside=tmp_path)
 
 
+@pytest.mark.slow
 def test_overwriting_leaves_nothing_of_the_old_run(tmp_path, quick):
     """Stopped right after it began, the folder must not show the old winds as its own."""
     folder = tmp_path / "run"
@@ -144,6 +146,7 @@ def test_a_file_in_the_folders_place_is_refused(tmp_path):
         run(check(small()), tmp_path / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "step",
     [
@@ -204,6 +207,7 @@ def test_the_seed_decides(tmp_path, quick):
     assert runs["one"][0] != runs["other"][0]
 
 
+@pytest.mark.slow
 def test_a_failed_run_is_recorded_in_its_log(tmp_path, quick, monkeypatch):
     """And one that is stopped does not; see `test_stopped_anywhere_it_resumes`."""
     folder = tmp_path / "run"

@@ -90,6 +90,7 @@ def whole(tmp_path_factory):
         return folder, run(changed(), folder).metrics
 
 
+@pytest.mark.slow
 def test_the_whole_chain(whole):
     folder, metrics = whole
     lines = xr.open_dataset(folder / "lines_of_sight.nc", engine="h5netcdf")
@@ -397,6 +398,7 @@ def test_an_error_common_to_all_lines_is_stated_apart():
     assert float(alone["u_systematic"].median()) == pytest.approx(0.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_fraction_of_noise_is_between_those_of_draws_and_of_the_lines():
     """Mean square error less that without noise, over 8 draws: no less than the variance of u over
     the draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than

@@ -108,6 +108,7 @@ def test_faults_name_the_variant(file, variants, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
     leave_out_figures(monkeypatch)
@@ -280,6 +281,7 @@ def test_shipped_experiments_are_documented():
     assert {path.stem for path in (SCENES / "campaigns").glob("*.yaml")} <= pages
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(
     ("name", "one"),

@@ -78,6 +78,7 @@ def limits(independent):
     return chi2.ppf([3.2e-5, 1 - 3.2e-5], independent) / independent
 
 
+@pytest.mark.slow
 def test_winds_within_their_stated_errors(whole):
     """Of both lidars: mean square of as many errors as windows that do not overlap."""
     found = xr.open_dataset(whole[0] / "wind3d.nc")
@@ -113,6 +114,7 @@ def test_lines_of_sight_within_their_stated_errors(whole):
     assert np.ptp(lines["time"].values) == pytest.approx(0.09 * 14 / 15, rel=0.1)
 
 
+@pytest.mark.slow
 def test_files_have_the_time_of_every_beam(whole):
     for number, reference in ((1, 0.0), (2, DT)):
         scan = lm.read_scan(whole[0] / f"image_t{number}.exr")

@@ -147,6 +147,7 @@ def test_vortex_pair(tmp_path):
         assert metrics[f"backscatter.cc.outside_cores.rmse_{name}"] < 1.0
 
 
+@pytest.mark.slow
 def test_extinction_from_speed_and_spherical_gates(tmp_path, quick):
     data = small(extinction={"source": "speed"}, texture={"rms": 0})
     data |= {"scan": {"gates": "spherical"}, "scattering": {"phase": "rayleigh"}}

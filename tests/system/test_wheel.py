@@ -66,6 +66,7 @@ def _files(folder):
     return {name for name in packed if name.startswith("lidar_mi/")}
 
 
+@pytest.mark.slow
 def test_holds_every_file(wheel):
     expected = {
         (Path(there) / path.relative_to(ROOT / here)).as_posix()

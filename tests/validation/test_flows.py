@@ -64,6 +64,7 @@ SPECTRA = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPECTRA)
 def test_spectrum_along_a_line(name):
     """Six realisations, bands of 8 wave numbers, 4.5 standard errors from their scatter."""
@@ -193,6 +194,7 @@ def test_wakes_of_turbines_turn_either_way():
 # --- families
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
 def test_flow_is_drawn_by_the_seed_and_air_returns(family):
     """Back from where it came from: the second image is reversible."""

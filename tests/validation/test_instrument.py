@@ -15,6 +15,7 @@ from validation.instrument import CASES, INSTRUMENT, Outcome, Retrieved
 SMALL = INSTRUMENT.binned(4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [

@@ -91,6 +91,7 @@ TEXTURED = (
     "jet",
     "simulated wake, x = 25 to 30 m",
     "wake of a light aircraft, strong turbulence",
+    "wake of a medium aircraft, strong turbulence",
 )
 """Families that are seen with all textures."""
 

@@ -19,7 +19,7 @@ from lidar_mi.retrieval.channels.model import (
     parameter_vector,
     variance,
 )
-from lidar_mi.retrieval.rings.bound import fisher_matrix, standard_deviations
+from lidar_mi.retrieval.fisher import Fits, Limits, fisher_matrix, scoring, standard_deviations
 from lidar_mi.retrieval.rings.model import PixelNoise
 
 ITERATIONS = 60
@@ -96,17 +96,16 @@ def fit_channels(
     counts = _checked(counts, model)
     expected = parameter_vector(model, 0.0, 1.0, temperature, aerosol)
     parameters = _start(model, counts, noise, expected)
-    parameters, mean, jacobian, spread = _scoring(
+    parameters, fisher, squares = _scoring(
         model, counts, parameters, noise, indices, known, expected
     )
     std = torch.zeros_like(parameters)
-    std[:, indices] = standard_deviations(fisher_matrix(jacobian, 1 / spread, indices) + known)
+    std[:, indices] = standard_deviations(fisher)
     freedom = counts.shape[1] - len(indices) + len(prior)
     chi_square = torch.full_like(parameters[:, 0], math.nan)
     if freedom > 0:
         off = (parameters - expected)[:, indices]
-        chi_square = ((counts - mean) ** 2 / spread).sum(1) + ((off @ known) * off).sum(1)
-        chi_square = chi_square / freedom
+        chi_square = (squares + ((off @ known) * off).sum(1)) / freedom
         worst = max(max_chi_square, 1 + SIGNIFICANT * math.sqrt(2 / freedom))
         for k, misfit in enumerate(chi_square.tolist()):
             if not misfit <= worst:
@@ -168,8 +167,8 @@ def _scoring(
     indices: list[int],
     known: torch.Tensor,
     expected: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Fisher scoring: weighted least squares, its weights from the mean of the step before."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Parameters, Fisher matrices and squared misfits of the most probable parameters."""
     low, high = model.span
     # a step of more than a radian of the highest harmonic leaves the linear range
     longest = torch.full_like(parameters[0], math.inf)
@@ -177,31 +176,25 @@ def _scoring(
     longest[2], longest[3] = 20.0, 0.2
     longest = longest[indices]
     floor = model.background + 1e-6 * parameters[:, 1, None]
-    converged = torch.zeros(len(counts), dtype=torch.bool)
-    for _ in range(ITERATIONS):
+
+    def expanded(parameters: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         mean, jacobian = mean_and_jacobian(model, parameters)
         spread = variance(model, noise, torch.maximum(mean, floor))
-        if converged.all():
-            return parameters, mean, jacobian, spread
         fisher = fisher_matrix(jacobian, 1 / spread, indices) + known
         score = (jacobian[:, indices] @ ((counts - mean) / spread)[:, :, None])[:, :, 0]
-        score = score - (parameters - expected)[:, indices] @ known
-        unit = fisher.diagonal(dim1=1, dim2=2).rsqrt()
-        normal = fisher * unit[:, :, None] * unit[:, None, :]
-        step = torch.linalg.solve_ex(normal, score * unit)[0] * unit
-        if not torch.isfinite(step).all():
-            bad = int((~torch.isfinite(step)).any(1).nonzero()[0])
-            raise InputError(f"counts[{bad}]: the fit fails; expected signals of the model")
-        converged = (step.abs() <= CLOSE * standard_deviations(fisher)).all(1)
+        misfit = ((counts - mean) ** 2 / spread).sum(1)
+        return fisher, score - (parameters - expected)[:, indices] @ known, misfit
+
+    def advanced(parameters: torch.Tensor, step: torch.Tensor) -> tuple[torch.Tensor, None]:
         parameters = parameters.clone()
-        parameters[:, indices] += step.clamp(-longest, longest)
+        parameters[:, indices] += step
         parameters[:, 0] = parameters[:, 0].clamp(low, high)
         parameters[:, 1] = parameters[:, 1].clamp(min=1e-9)
         if len(model.temperatures) > 1:
             first, last = model.temperatures[[0, -1]]
             parameters[:, 2] = parameters[:, 2].clamp(first, last)
-    bad = int((~converged).nonzero()[0])
-    raise InputError(
-        f"counts[{bad}]: the fit does not converge; expected a speed between {low:.4g} and "
-        f"{high:.4g} m/s and signals as in the model"
-    )
+        return parameters, None
+
+    speeds = f"a speed between {low:.4g} and {high:.4g} m/s and signals as in the model"
+    fits = Fits("counts", 0, ("signals of the model", speeds))
+    return scoring(expanded, advanced, parameters, Limits(longest, CLOSE, ITERATIONS), fits)

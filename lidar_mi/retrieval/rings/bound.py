@@ -5,16 +5,9 @@ from collections.abc import Sequence
 import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.fisher import fisher_matrix, standard_deviations
 from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, parameter_vector, pixel_waves
 from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
-
-
-def fisher_matrix(
-    jacobian: torch.Tensor, weight: torch.Tensor, free: Sequence[int] | None = None
-) -> torch.Tensor:
-    """sum_i w_i J_i J_i^T over the free parameters (all if None), (images, free, free)."""
-    part = jacobian if free is None else jacobian[:, list(free)]
-    return (part * weight[:, None]) @ part.transpose(1, 2)
 
 
 def prior_information(
@@ -23,24 +16,6 @@ def prior_information(
     """1 / variance of the model's priors on these parameters; 0 where it has none."""
     variances = [model.priors[name][1] ** -2 if name in model.priors else 0.0 for name in names]
     return torch.tensor(variances, dtype=torch.float64, device=device)
-
-
-# Of a matrix with a unit diagonal, in double precision: beyond, its inverse is rounding.
-_WORST_CONDITION = 1e13
-
-
-def standard_deviations(fisher: torch.Tensor) -> torch.Tensor:
-    """Roots of the diagonal of the inverse, NaN where there is none, shape (images, free).
-
-    Matrices that only rounding makes invertible have none.
-    """
-    scale = fisher.diagonal(dim1=1, dim2=2).rsqrt()
-    scaled = fisher * scale[:, :, None] * scale[:, None, :]
-    inverse, info = torch.linalg.inv_ex(scaled)
-    condition = torch.linalg.matrix_norm(scaled, 1) * torch.linalg.matrix_norm(inverse, 1)
-    deviation = inverse.diagonal(dim1=1, dim2=2).sqrt() * scale
-    determined = (info == 0) & (condition < _WORST_CONDITION)
-    return torch.where(determined[:, None], deviation, torch.nan)
 
 
 def free_names(model: RingModel, free: Sequence[str] | None) -> list[str]:

@@ -21,12 +21,8 @@ import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.bound import (
-    fisher_matrix,
-    free_names,
-    prior_information,
-    standard_deviations,
-)
+from lidar_mi.retrieval.fisher import fisher_matrix, standard_deviations
+from lidar_mi.retrieval.rings.bound import free_names, prior_information
 from lidar_mi.retrieval.rings.cells import annular_sectors
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import MOST_SPOTS, checked, inside, patches, spots

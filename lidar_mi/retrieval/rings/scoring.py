@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.bound import fisher_matrix, prior_information, standard_deviations
+from lidar_mi.retrieval.fisher import Fits, Limits, fisher_matrix, scoring
+from lidar_mi.retrieval.rings.bound import prior_information
 from lidar_mi.retrieval.rings.mean_image import Waves, mean_and_jacobian, reach
 from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
 
@@ -20,6 +20,7 @@ CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converg
 # Cells beyond so many standard deviations hold hot pixels or dust and are masked, unless more
 # than this fraction is: then the model is wrong, and chi-square shall say so.
 OUTLIER, MOST_OUTLIERS = 5.0, 0.03
+_FEWEST = "two rings or more as in the model"
 POOR = 1.2  # chi-square of a fit that something is wrong with
 
 
@@ -107,6 +108,7 @@ def _scoring(
 
     The fit that has converged is the maximum of the likelihood times the priors.
     """
+    fits = Fits("images", number, ("rings that the model describes", _FEWEST))
     columns = [PARAMETERS.index(name) for name in names]
     parameters = parameters.clone()
     # a background that is not fitted is 0, and the level takes its part of the light
@@ -114,14 +116,13 @@ def _scoring(
         place, level = PARAMETERS.index("background"), PARAMETERS.index("level")
         parameters[:, level] += parameters[:, place]
         parameters[:, place] = 0
-    limit = _step_limits(model, names, parameters.device)
+    longest = _step_limits(model, names, parameters.device)
     information = prior_information(model, names, parameters.device)
     middle = model.start(parameters.device)[:, columns]
     # between rings a mean near 0 would give single cells nearly all of the weight
     floor = 1e-3 * means[0].mean(1, keepdim=True)
-    freedom = sum(part.shape[1] for part in means) - len(names)
-    converged = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
-    for _ in range(ITERATIONS):
+
+    def expanded(parameters: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         fisher = torch.diag(information).repeat(len(parameters), 1, 1)
         score = information * (middle - parameters[:, columns])
         chi_square = torch.zeros_like(score[:, 0])
@@ -132,41 +133,30 @@ def _scoring(
             fisher = fisher + fisher_matrix(jacobian, weight)
             score = score + (jacobian @ (weight * (part - mean))[:, :, None])[:, :, 0]
             chi_square = chi_square + (weight * (part - mean) ** 2).sum(1)
-        if converged.all():
-            lost = torch.stack([(~use).sum(1) for use in used]).sum(0)
-            return Scored(
-                parameters,
-                fisher,
-                chi_square / (freedom - lost),
-                freedom,
-                lost / (freedom + len(names)),
-                used,
-            )
-        std = standard_deviations(fisher)
-        # px, K and electrons differ by powers of ten: solved with a unit diagonal
-        unit = fisher.diagonal(dim1=1, dim2=2).rsqrt()
-        normal = fisher * unit[:, :, None] * unit[:, None, :]
-        step = torch.linalg.solve_ex(normal, score * unit)[0] * unit
-        if not torch.isfinite(step).all():
-            bad = number + int((~torch.isfinite(step)).any(1).nonzero()[0])
-            raise InputError(
-                f"images[{bad}]: the fit fails; expected rings that the model describes"
-            )
-        converged = (step.abs() <= CLOSE * std).all(1)
-        parameters[:, columns] += step.clamp(-limit, limit)
+        return fisher, score, chi_square
+
+    def advanced(parameters: torch.Tensor, step: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        parameters = parameters.clone()
+        parameters[:, columns] += step
         if "temperature" in names:
             place = PARAMETERS.index("temperature")
             parameters[:, place] = parameters[:, place].clamp(*model.temperatures[[0, -1]])
         # beyond, the waves are not exact: the cells move first
+        near, ended = 3 * reach(model), torch.zeros_like(step[:, 0], dtype=torch.bool)
         for name in ("x", "y"):
             place = PARAMETERS.index(name)
-            far = parameters[:, place].abs() > 3 * reach(model)
-            parameters[:, place] = parameters[:, place].clamp(-3 * reach(model), 3 * reach(model))
-            converged |= far & (step.abs() <= 0.1 * limit).all(1)
-    bad = number + int((~converged).nonzero()[0])
-    raise InputError(
-        f"images[{bad}]: the fit does not converge; expected two rings or more as in the model"
+            far = parameters[:, place].abs() > near
+            parameters[:, place] = parameters[:, place].clamp(-near, near)
+            ended |= far & (step.abs() <= 0.1 * longest).all(1)
+        return parameters, ended
+
+    end, fisher, chi_square = scoring(
+        expanded, advanced, parameters, Limits(longest, CLOSE, ITERATIONS), fits
     )
+    freedom = sum(part.shape[1] for part in means) - len(names)
+    lost = torch.stack([(~use).sum(1) for use in used]).sum(0)
+    outliers = lost / (freedom + len(names))
+    return Scored(end, fisher, chi_square / (freedom - lost), freedom, outliers, used)
 
 
 def _step_limits(model: RingModel, names: Sequence[str], device: torch.device) -> torch.Tensor:

@@ -17,6 +17,7 @@ from tests.support.encounter_results import made_up_flights
 SPAN = 28.9
 
 
+@pytest.mark.slow
 def test_all_are_drawn(tmp_path):
     found = made_up_flights()
     drawn = draw_all(tmp_path, found.series, found.track, found.slabs, SPAN, Log())
@@ -46,6 +47,7 @@ def test_loads_of_the_air_are_drawn(tmp_path):
     assert imread(drawn[-1].path).std() > 0.05
 
 
+@pytest.mark.slow
 def test_loads_of_an_aircraft_that_rises_are_drawn(tmp_path):
     alone = made_up_flights().series.sel(flight=["off"])
     changed = {

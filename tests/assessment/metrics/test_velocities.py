@@ -51,6 +51,7 @@ def test_measures_by_hand():
     )
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_repeated_experiments():
     """500 sets of 3 speeds x 4 normal errors: bias and std scatter as stated."""
     rng = np.random.default_rng(1)

@@ -170,6 +170,7 @@ def test_gusts_are_what_the_wing_feels():
     np.testing.assert_allclose(gusts(28.9, linear), [2, -1, 3, 0.1])
 
 
+@pytest.mark.slow
 def test_lift_and_moment_per_gust_are_those_of_the_loads(flights):
     samples = samples_of(flights_in(flights)[0])
     aircraft = aircraft_of(experiment().encounter)
@@ -328,6 +329,7 @@ def test_predicted_roll_agrees_with_flights(block, weather, forward, lost):
     assert abs(np.mean(found) / predicted - 1) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", [0.0, 1.0])
 @pytest.mark.parametrize("run", [1, 3])
 def test_predicted_variances_with_losses_agree_with_flights(block, samples, run, hold):
@@ -346,6 +348,7 @@ def test_predicted_variances_with_losses_agree_with_flights(block, samples, run,
     np.testing.assert_allclose(found, predicted, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_a_few_lost_estimates_raise_the_load_much(block):
     """The residual without losses is small: 3 % in runs of 3 add half of its variance.
 
@@ -426,6 +429,7 @@ def test_a_range_of_few_slabs_does_not_hide_the_others(tmp_path):
     assert [path.name for path in paths] == ["block_150m.npz", "block_150m.mat", "blocks.json"]
 
 
+@pytest.mark.slow
 def test_folders_without_what_is_needed_are_refused(tmp_path, flights):
     with pytest.raises(InputError, match="holds no finished flight with the lidar; expected the"):
         lm.export_control(tmp_path)

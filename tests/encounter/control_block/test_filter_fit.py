@@ -31,6 +31,7 @@ def simulated(random, number=600):
     return output, value
 
 
+@pytest.mark.slow
 def test_errors_are_as_stated():
     """Of 50 records: the mean of normalised errors within 1, as much as half of their own is bias;
     their variance, with a standard error of 0.2, within 0.3 and 1.9."""

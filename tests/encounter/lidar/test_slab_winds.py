@@ -57,6 +57,7 @@ def here(drifting):
     return winds_of(InThisProcess(ImageMethod.VARIATIONAL, WINDOWS), drifting)
 
 
+@pytest.mark.slow
 def test_each_wind_starts_from_the_last_one(here, drifting):
     """Over a drift of two core radii: errors as from nothing, known to 3 %."""
     near, far = [], []
@@ -116,6 +117,7 @@ def test_a_fault_surfaces_with_the_result(drifting, form):
         future.result()
 
 
+@pytest.mark.slow
 def test_what_limits_the_wind_of_most_vectors_is_said(drifting):
     """A pattern at rest as strong as the texture, and unrelated images."""
     images, random = drifting[0][0], np.random.default_rng(5)

@@ -91,6 +91,7 @@ def test_flights(monkeypatch):
     assert flight_seconds(lm.load_experiment("encounter"), {}, 0) < 30
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_check_shows_the_cost(tmp_path):
     found = dict(sections(small_one(), tmp_path, timed=True))

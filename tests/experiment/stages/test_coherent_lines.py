@@ -149,6 +149,7 @@ def test_vortices_come_back_from_the_lines():
     assert (found["circulation_5_15_true"].values[0] < 0).tolist() == [True, False]
 
 
+@pytest.mark.slow
 def test_winds_come_back_from_the_lines():
     scan = {"kind": "ppi", "rate": "30 deg/s", "accumulation": "0.5 s", "count": 2}
     scan |= {"repeat": "20 s"}
@@ -179,6 +180,7 @@ def test_circulation_over_rings():
     assert ring_fraction(np.array(4.0), "lamb_oseen") == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_run_writes_files_that_are_read_again(tmp_path):
     given = experiment(SMALL)
     done = lm.run(given, tmp_path / "run")

@@ -53,6 +53,7 @@ def budget_of(asked):
     return budgets(asked, truth, scans, cores=[], flagged=True)["multipass"]
 
 
+@pytest.mark.slow
 def test_a_gyroscope_that_drifts_is_all_of_the_error():
     """Yaw that drifts by 2 mrad/s feigns a wind of 501.25 m x 2 mrad/s = 1.0 m/s along y."""
     found = budget_of(experiment(reported={"drift": {"yaw": f"{RATE} rad/s"}}))
@@ -63,6 +64,7 @@ def test_a_gyroscope_that_drifts_is_all_of_the_error():
     assert abs(found["scan_time.fraction"]) < 0.1 and abs(found["monte_carlo.fraction"]) < 0.05
 
 
+@pytest.mark.slow
 def test_a_telescope_that_shakes():
     """Jitter of 0.5 mrad misplaces every pixel by 0.25 m of 0.5 m, with perfect navigation."""
     found = budget_of(experiment(motion={"scanner_jitter": "0.5 mrad"}))

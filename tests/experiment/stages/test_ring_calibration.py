@@ -59,6 +59,7 @@ def retrieved(asked):
     return speeds_to_laser(frames, laser, doppler, assumed, noises, "annular", "free"), assumed
 
 
+@pytest.mark.slow
 def test_calibrated_instrument():
     """Biased with the wrong instrument; with the calibrated one within the stated errors."""
     before, _ = retrieved(
@@ -99,6 +100,7 @@ def test_camera_that_is_tilted_out_of_focus_and_distorts():
     assert assumed.model.blur == pytest.approx((25 / 29.6) ** 2, rel=0.05)
 
 
+@pytest.mark.slow
 def test_hot_and_dead_pixels_are_masked():
     """0.1 % hot, 0.1 % dead: hot ones are left out, and speeds are right within their errors."""
     ccd = {"full_well": 1e7, "hot_pixels": 0.001, "dead_pixels": 0.001}
@@ -136,6 +138,7 @@ def test_frames_of_the_calibration_drift():
     assert found[1] == pytest.approx(walk.std(ddof=1) * math.sqrt(9 / 8), rel=0.1)
 
 
+@pytest.mark.slow
 def test_calibration_of_a_file(tmp_path):
     asked = experiment(calibration={"file": "etalon.nc"})
     rings = ring_instrument(asked.doppler)

@@ -106,6 +106,7 @@ def test_the_stated_fraction_is_that_of_other_random_numbers(prepared, number):
     assert 0.75 * asked_for < stated < 1.05 * asked_for
 
 
+@pytest.mark.slow
 def test_an_image_of_chosen_samples_is_that_of_the_number_alone(prepared, number, monkeypatch):
     """So its mean is that of independent samples whose number another, independent image chose."""
     seeds = []
@@ -236,6 +237,7 @@ def test_common_numbers_state_the_error_that_images_do_not_share(prepared):
     assert fewer.reached and fewer.number < number.number / 5
 
 
+@pytest.mark.slow
 def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(prepared):
     for samples, expected in ((4, True), ("auto", False)):
         asked = newcomer(render={"samples_per_beam": samples})

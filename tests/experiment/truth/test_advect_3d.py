@@ -62,6 +62,7 @@ def uniform(x, y, z):
     return {"u": 8.0, "v": -5.0, "w": 7.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", ["plane", pytest.param("volume", marks=pytest.mark.slow)])
 def test_uniform_wind_displaces_the_volume(tmp_path, depth):
     """The image at t2 is that at t1 of a file whose air is displaced."""
@@ -107,6 +108,7 @@ def test_solid_rotation_about_an_axis_in_the_plane(tmp_path, depth):
     assert np.abs(first - expected).max() > 0.1
 
 
+@pytest.mark.slow
 def test_mass_in_a_wind_without_divergence(tmp_path):
     """Of the blobs, which are away from the edges; in-plane advection does not keep it."""
 
@@ -132,6 +134,7 @@ def test_mass_in_a_wind_without_divergence(tmp_path):
     assert abs(change["advect"]) > 1e-2
 
 
+@pytest.mark.slow
 def test_without_wind_along_x_it_is_in_plane_advection(tmp_path):
     """Of air that is uniform along x, without and with texture."""
 
@@ -154,6 +157,7 @@ def test_without_wind_along_x_it_is_in_plane_advection(tmp_path):
         assert np.abs(along[1] - along[0]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_texture_moves_with_the_wind_in_the_plane(tmp_path):
     """The same at all u, and the true wind is the mean over the gates."""
     file = written(tmp_path, lambda x, y, z: np.ones_like(x), uniform)
@@ -199,6 +203,7 @@ def test_the_state_that_the_simulation_stored_is_nearer(tmp_path):
     assert 0.5 < (off["advect_3d"] / off["advect"]) ** 2 < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wake", "said"),
     [
@@ -232,6 +237,7 @@ NOT_THERE = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", ["plane", "volume"])
 @pytest.mark.parametrize(("wind", "x", "wake", "message"), NOT_THERE)
 def test_a_file_without_the_air_of_the_gates(tmp_path, depth, wind, x, wake, message):
@@ -252,6 +258,7 @@ def test_the_plane_of_a_volume_is_to_be_said(tmp_path):
     lm.make_truth(experiment(tmp_path, file, x=None, depth="volume"))
 
 
+@pytest.mark.slow
 def test_gates_that_move_with_the_air_need_less_of_it(tmp_path):
     """At 8 m/s they see no motion along x: 2.25 m on either side are enough."""
     short = written(tmp_path, blobs, uniform, X[10:23])

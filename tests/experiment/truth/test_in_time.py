@@ -97,6 +97,7 @@ def test_states_from_the_largest_displacement(experiment, carried):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["wake_backscatter", "wake_changing"])
 def test_the_air_of_the_reference_times_is_the_truth(name):
     """Also of a wake with a second state, where the first scan ends as the second begins."""

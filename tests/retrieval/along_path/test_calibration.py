@@ -50,6 +50,7 @@ def judged(flights):
         yield np.mean(inside), expected, np.std(inside, ddof=1) / np.sqrt(len(inside))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma", "length", "noise", "resolution", "options"),
     [

@@ -35,6 +35,7 @@ def normalised_errors(method, side, pairs):
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", "multipass"])
 def test_one_window_states_no_error(method):
     assert not normalised_errors(method, 17, 5).size

@@ -9,6 +9,7 @@ from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.turning import displacement, turning_pair
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "method", "template", "allowed"),
     [

@@ -37,6 +37,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "everywhere", "beyond"),
     [
@@ -54,6 +55,7 @@ def test_errors_are_below_the_best_window_deformation(noise, everywhere, beyond)
         assert rms(component[far]) < beyond
 
 
+@pytest.mark.slow
 @pytest.mark.xfail(
     reason="errors of the cores enter the means around them: 78 to 80 % within one", strict=True
 )
@@ -175,6 +177,7 @@ def test_bad_input_is_named(change, message):
         multipass(**pair | change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", "multipass", "variational"])
 def test_particle_images(method):
     """Gaussian particles of 3.2 px (1/e^2), 0.05 a pixel, in a plane shear; exact positions."""

@@ -59,6 +59,7 @@ def test_noise_is_no_motion():
     assert all(found(0.0, 0.03, seed) < 0.06 for seed in range(4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "family", "condition"),
     [

@@ -117,6 +117,7 @@ def test_too_little_to_tell():
     assert not copy_at_rest(images, true._replace(d=0.01 * true.d), windows).significant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.02, 0.2, -0.1])
 def test_wind_is_that_of_the_air(fraction):
     wind = retrieved(pair(460, fraction))
@@ -128,6 +129,7 @@ def test_wind_is_that_of_the_air(fraction):
     assert "at rest" in wind.attrs["copy_at_rest"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["multipass", "cc"])
 def test_windows_give_the_wind_of_the_air(method):
     """With 20 % of image 1 in image 2 they were 20 % too slow, stated 3 % and 10 %."""
@@ -139,6 +141,7 @@ def test_windows_give_the_wind_of_the_air(method):
     assert fraction == pytest.approx(0.2, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["multipass", "cc"])
 def test_windows_without_a_copy_have_none(method):
     """Three pairs; where an offset of each column is new in each image as well."""
@@ -150,6 +153,7 @@ def test_windows_without_a_copy_have_none(method):
         assert "copy_at_rest" not in retrieved(images, method).attrs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "fraction"), [("lag of volumes", 0.080), ("clean volumes", 0.0)])
 def test_windows_in_volumes_give_the_wind_of_the_air(name, fraction):
     """With 8 % of volume 1 in volume 2 nearly all vectors were beyond four stated errors."""

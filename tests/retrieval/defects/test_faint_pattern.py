@@ -95,6 +95,7 @@ def retrieved(pair, method):
     )
 
 
+@pytest.mark.slow
 def test_standard_errors_hold_with_a_pattern():
     """Without the correction the normalised errors have a variance of 3."""
     wind = retrieved(images(74, 0.05), "variational")
@@ -108,6 +109,7 @@ def test_standard_errors_hold_with_a_pattern():
     assert np.mean(score**2) < 1.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pattern", "method"),
     [pytest.param(0.1, "variational", marks=pytest.mark.slow), (0.05, "vortex_fit")],

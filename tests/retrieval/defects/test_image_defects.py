@@ -58,6 +58,7 @@ def test_hot_pixels_do_not_hold_the_air(counts, fraction, noise, method):
         assert np.median(stated) < 1.5 * np.median(clean[f"{name}_stderr"].values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (0.05, 0.1), (0.3, -0.4), (2.2, -1.4)])
 def test_air_is_no_defect_however_slow(seed, moved):
@@ -78,6 +79,7 @@ def test_counts_of_few_photons_are_no_defect():
     assert not structure.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_defect_changes_no_valid_vector(seed):
     assert check(seed, methods=("multipass", "variational")) is None

@@ -17,6 +17,7 @@ def rms(values):
     return float(np.sqrt(np.nanmean(np.square(values))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["texture", "particles"])
 @pytest.mark.parametrize(
     "template", [16, *(pytest.param(px, marks=pytest.mark.slow) for px in (8, 32))]

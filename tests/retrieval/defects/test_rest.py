@@ -53,6 +53,7 @@ def ratio(wind, off, good):
     return np.sqrt(np.mean((off / wind.v_stderr.values)[good] ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("length", "noise"), [(1.8, 0.0), pytest.param(2.6, 0.05, marks=pytest.mark.slow), (5.0, 0.02)]
 )
@@ -63,6 +64,7 @@ def test_nothing_is_at_rest_in_moving_air(length, noise):
         assert not bool(found.structure.any()) and not bool(found.saturated.any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 5])
 def test_dense_particles_are_not_at_rest(seed):
     """Some lie where another one was: by chance, and where shear hides their motion."""
@@ -71,6 +73,7 @@ def test_dense_particles_are_not_at_rest(seed):
     assert not found.structure.any() and not found.saturated.any() and not str(found.pattern)
 
 
+@pytest.mark.slow
 def test_images_known_to_be_good_need_no_checks():
     images, _ = pair(64)
     wind = retrieved(images, "multipass")
@@ -91,6 +94,7 @@ def test_images_known_to_be_good_need_no_checks():
     assert not (blind.flag & Flag.UNRELATED.value).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [
@@ -133,6 +137,7 @@ def test_an_area_that_saturates_in_one_image_alone():
     assert ratio(wind, errors(wind, v), good) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "ws", "variational")] + ["multipass"],
@@ -208,6 +213,7 @@ def test_saturation_is_found_by_how_much_of_8_bits_is_clipped(fraction, least):
     assert np.mean(seen) >= least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "least"),
     [("dead", 0.9), pytest.param("bright", 0.9, marks=pytest.mark.slow), ("dirt", 0.25)],
@@ -252,6 +258,7 @@ def test_saturated_voxels():
     assert not bool(((wind.flag & Flag.NON_FINITE_INPUT.value) > 0).any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mean", [(-9.0, 5.0), (2.0, -3.0)])
 @pytest.mark.parametrize("thin", ["mast", "border"])
 def test_thin_structure_is_found_as_a_whole(thin, mean):

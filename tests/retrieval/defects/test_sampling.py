@@ -54,6 +54,7 @@ def wind(images, method="variational"):
     return good.mean(), (np.abs(error) > 4 * stated).any(0).mean() if good.any() else 0.0, error, x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("levels", [None, 300, 30, 8])
 def test_independent_samples_have_no_structure(levels):
     """60 pairs, of whole numbers as well: at the rate of false alarms of each test, none."""
@@ -74,6 +75,7 @@ def test_air_at_rest_in_noise_is_not_copied():
     assert not found(images).said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side, part", [(8, 0.05), (16, 0.15)])
 def test_copied_blocks_are_found_and_the_others_keep_the_wind(side, part):
     one, two = (np.round(100 * image) for image in pair(5))
@@ -88,6 +90,7 @@ def test_copied_blocks_are_found_and_the_others_keep_the_wind(side, part):
     assert "copied from image 1" in x.attrs["sampling"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [2, 3])
 def test_repeated_pixels_give_the_wind_of_their_samples(factor):
     """Half a pixel of displacement at the wrong place would be 10 standard errors in shear."""
@@ -155,6 +158,7 @@ def test_gates_on_a_grid_are_flagged():
     assert found(images).spoilt and wind(images, "multipass")[0] == 0
 
 
+@pytest.mark.slow
 def test_borders_without_a_picture_are_masked():
     images = pair(100)
     images[0][:12], images[0][:, :9], images[1][:9], images[1][:, :13] = 0, 0, 0, 0

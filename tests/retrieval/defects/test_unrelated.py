@@ -34,6 +34,7 @@ def images(seed, columns, rows, length, noise=0.0, number=2):
     return [data_array(1 + air, *axes(columns, rows)) for air in smooth + noises]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "cases", "repeats"),
     [
@@ -72,6 +73,7 @@ def test_rate_of_false_alarms():
     assert observed < number * 0.05 + 4 * np.sqrt(number * 0.05 * 0.95)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.06])
 def test_related_images_lose_no_vector(noise):
     """Vortices, noise of up to 1/3 of the texture: every vector is where images are related."""

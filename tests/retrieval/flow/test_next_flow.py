@@ -56,6 +56,7 @@ def learnt(slabs):
     return variational_and_flow(tensors(slabs[0]), WINDOWS, noise=0.03, keep=True)
 
 
+@pytest.mark.slow
 def test_what_is_kept_changes_nothing(slabs, learnt):
     alone = variational(*tensors(slabs[0]), noise=0.03)
     torch.testing.assert_close(learnt[0].d, alone.d, rtol=1e-9, atol=1e-12)
@@ -100,6 +101,7 @@ def test_the_same_images_again_give_the_same_flow(slabs, learnt):
     assert bool((found.flag == learnt[0].flag).float().mean() > 0.999)
 
 
+@pytest.mark.slow
 def test_the_next_slabs_are_as_accurate_as_from_nothing(slabs, learnt):
     flow, far, near = learnt[1], [], []
     for images in slabs[1:]:
@@ -118,6 +120,7 @@ def test_the_next_slabs_are_as_accurate_as_from_nothing(slabs, learnt):
         assert abs(covered - cold) < 0.06
 
 
+@pytest.mark.slow
 def test_a_flow_that_has_moved(slabs, learnt):
     """Structure 3 px further: the flow there is that from before, and so are weights and prior."""
     still = torch.zeros(2, 90, 130, dtype=torch.float64)

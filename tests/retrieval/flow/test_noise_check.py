@@ -47,6 +47,7 @@ def errors(images):
     return ((found.d - true) / stated)[:, valid].numpy(), stated[:, valid].numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("amplitude", "size"), [(0.01, 2.0), (0.03, 2.0), (0.03, 3.0)])
 def test_errors_of_correlated_noise_are_stated_or_flagged(amplitude, size):
     normalised, _ = errors(pair(3, correlated(amplitude, size)))

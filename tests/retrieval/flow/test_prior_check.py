@@ -72,6 +72,7 @@ class Model:
         return self.solve(linear, self.mesh, zero, self.prior, SETTINGS, 0), linear
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0.25, 1.0, 4.0])
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_ratio_is_that_of_the_true_bias_to_the_expected_one(solver, wrong):

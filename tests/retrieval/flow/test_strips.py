@@ -65,6 +65,7 @@ def systems():
     return [steps[k] for k in (-5, -1)]
 
 
+@pytest.mark.slow
 def test_flow_is_that_of_the_whole_system(systems):
     for step, whole in systems:
         found = strips.solved(*step)

@@ -77,6 +77,7 @@ def test_errors_and_coverage_over_five_seeds(noise, everywhere, beyond):
         check_coverage(found)
 
 
+@pytest.mark.slow
 def test_standard_errors_cover_the_errors_and_beat_the_bound_of_a_window():
     """Beyond the cores, within 1.5 of what any method could get from a window of 16 px."""
     pairs = [vortex_pair_images(0.03, seed) for seed in (1, 2)]
@@ -164,6 +165,7 @@ def grid(rows, columns):
     return np.meshgrid(np.arange(float(rows)), np.arange(float(columns)), indexing="ij")
 
 
+@pytest.mark.slow
 def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
     """Air 20 times as bright goes out, so means and contrasts differ by more than the dark noise.
 
@@ -420,6 +422,7 @@ def test_areas_without_values_leave_numbers_elsewhere(noise):
     assert rms(errors.numpy()) < 0.03 and float((errors.square() / variance).mean()) < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [None, 0.01])
 @pytest.mark.parametrize("kind", ["constant", "one constant", "noise", "two values", "not finite"])
 def test_images_without_texture_give_no_valid_vector(kind, noise):

@@ -61,6 +61,7 @@ def smoke(seed, through):
     return images
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 @pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_smooth_smoke_tells_no_wind(seed, noise):

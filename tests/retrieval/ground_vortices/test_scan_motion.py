@@ -47,6 +47,7 @@ def errors(found):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sweep", [0.0, 1.0])
 def test_a_beam_that_stands_is_told_from_one_that_sweeps(tmp_path, sweep):
     """Lines 1 degree apart, 10 m at 600 m. All valid, rms of the normalised errors below 2.

@@ -24,6 +24,7 @@ SLOPE = DURATION / (SIZE[0] * SIZE[1] - 1) * np.array([1.0, SIZE[0]]) / 0.5
 LONGER = 1 / (1 - SLOPE @ [V, W])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pattern", "method"), [("raster", "multipass"), ("serpentine", "variational")]
 )
@@ -85,6 +86,7 @@ def test_a_serpentine_is_averaged_over_the_template():
     np.testing.assert_allclose(found.middle - smooth, 0, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", "ws", "multipass"])
 def test_times_of_zero_change_nothing(method):
     images, _ = uniform_wind("photograph", 4.0, 3.0, (50, 40))

@@ -29,6 +29,7 @@ def scattered(px, seed=1):
     return NODES + px * SPACING * np.random.default_rng(seed).standard_normal(NODES.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [(0.3, 0.2), (0.5, 0.5)])
 def test_displacement_of_a_known_shift(offset):
     """Beams a known part of a pixel off their nodes: what they see is where it is.
@@ -45,6 +46,7 @@ def test_displacement_of_a_known_shift(offset):
         assert float(wind[f"displacement_{axis}"].std()) < 0.01 * SPACING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("px", [0.1, 0.4])
 def test_values_between_scattered_beams(px):
     """To 1 % of the contrast, for structure of 3 px."""
@@ -67,6 +69,7 @@ def test_linear_fields_and_times_are_exact():
     )
 
 
+@pytest.mark.slow
 def test_noise_follows_the_weights():
     """Of 200 draws of white noise: 4 sigma in the mean variance over the image."""
     places, sigma = scattered(0.3), 0.1 + 0.05 * np.abs(np.sin(NODES[0]))
@@ -84,6 +87,7 @@ def test_noise_follows_the_weights():
     assert 0.6 < float(half["Y_noise_std"].mean()) < 0.8
 
 
+@pytest.mark.slow
 def test_beams_on_their_nodes_do_not_change():
     """Bit by bit, in single precision, whatever the neighbours do."""
     random = np.random.default_rng(4)
@@ -103,6 +107,7 @@ def test_beams_on_their_nodes_do_not_change():
     )
 
 
+@pytest.mark.slow
 def test_film_order_does_not_matter():
     """The same beams in another order, as those of a curve."""
     places = scattered(0.2)
@@ -113,6 +118,7 @@ def test_film_order_does_not_matter():
     np.testing.assert_allclose(one["Y"], other["Y"], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_value_beyond_the_beams():
     places = NODES + np.reshape([2.2 * SPACING, 0.0], (2, 1, 1))
     found = on_nodes(scan(places, texture(WAVES, *places)))["Y"]

@@ -53,6 +53,7 @@ def test_pixels_for_an_error():
     assert correlation_area(grid, nodes).mean() == pytest.approx(6, rel=0.33)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "px"), [(3.0, 0.3), (3.0, 0.6), (2.5, 0.6)])
 def test_error_stated_is_the_one_made(length, px):
     """In sums over 7 x 7 nodes, of texture with 5 % of noise: not too small by more than 4 sigma.

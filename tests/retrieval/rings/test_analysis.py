@@ -34,6 +34,7 @@ def split_rings(shape, centre, spacing, fractions, finesse=60.0, ellipticity=0.0
     return sum(1 / (1 + finesse * np.sin(np.pi * (order - f)) ** 2) for f in fractions)
 
 
+@pytest.mark.slow
 def test_rings_of_the_emitted_laser():
     """0.02 px: what quarter-pixel sectors and a Gaussian for Airy's peak leave."""
     found = analyse_rings(reference.ring_image(0.0, temperature=None))
@@ -120,6 +121,7 @@ def test_laboratory_images():
     assert split.misfit < 0.01 and not single.misfit > 0.01
 
 
+@pytest.mark.slow
 def test_given_centre_stays():
     image = split_rings((500, 640), (300.3, 262.8), 20000.0, (0.5,))
     found = analyse_rings(image, (300.3, 262.8))
@@ -157,6 +159,7 @@ def images():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [pytest.param(k, marks=[pytest.mark.slow] * (k == "unequal")) for k in images()]
 )

@@ -44,6 +44,7 @@ def found():
     return calibrate_rings(laser_frames(5, 1, defects), laser_model(), NOISE)
 
 
+@pytest.mark.slow
 def test_the_instrument_is_recovered(found):
     errors = normalised_errors(found)
     assert max(map(abs, errors.values())) < 5, errors
@@ -211,6 +212,7 @@ def test_one_ring():
     refused(laser_frames(3, 12, Defects(), 5e5, small), "ring", model=model)
 
 
+@pytest.mark.slow
 def test_wrong_focal_length():
     """By 30 %: the nominal instrument is another one."""
     refused(laser_frames(2, 13, replace(DEFECTS, focal_length=1.3)), "check focal length")

@@ -52,6 +52,7 @@ def lines():
     return line(LASER, 1), line(MERCURY, 1)
 
 
+@pytest.mark.slow
 def test_the_whole_order(lines):
     """17 orders from the nominal gap's."""
     found = both(lines)

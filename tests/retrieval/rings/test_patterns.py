@@ -67,6 +67,7 @@ def test_zeeman_series(kind):
         check_frame(rings, fraction, splitting)
 
 
+@pytest.mark.slow
 def test_the_shorter_spacing_wins():
     """Two lines of one height half an order apart are one line of half the spacing; a known
     spacing says which."""
@@ -91,6 +92,7 @@ def test_a_series_has_one_spacing():
     assert "fractional orders" in repr(series)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [0.05, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_faint_line(height):
     """Down to 5 % of the other line, crests of 400 photons: found, with its standard error."""
@@ -102,6 +104,7 @@ def test_faint_line(height):
     assert found.fraction_std.max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frame",
     [Frame(**SMALL), pytest.param(Frame(**SMALL, plates=0.03, patch=25.0), marks=pytest.mark.slow)],

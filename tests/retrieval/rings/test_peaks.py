@@ -52,6 +52,7 @@ def paper_velocity(received, emitted, method="ca", coordinate="r", centre=None, 
     return velocity_from_radii(*radii, *OPTICS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param("still", marks=pytest.mark.slow), "emitted"])
 def test_centres_without_noise(rendered, kind):
     image = rendered[kind]

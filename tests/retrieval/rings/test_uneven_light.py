@@ -104,6 +104,7 @@ def test_any_light_any_mask_any_defect():
     assert len(found["right"]) >= 108, {key: found[key] for key in found if key != "right"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("background", "hiding", "defect"),
     [
@@ -163,6 +164,7 @@ def test_frames_without_their_centre(where):
         analyse_rings(np.random.default_rng(1).poisson(image) if where == "outside" else image)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("background", BACKGROUNDS)
 @pytest.mark.parametrize("hiding", ["half", "bar"])
 def test_the_start_of_the_centre(background, hiding):

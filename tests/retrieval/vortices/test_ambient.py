@@ -152,6 +152,7 @@ def vectors(seed, gradient=(0.0, 0.0, 0.0), rms=0.0, length=60.0, inner=0.0, noi
 TRUE = np.array([350.0, np.log(3.0), 15.0, 0.0, -350.0, np.log(3.0), -15.0, 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradient", [(0, 0.08, 0), (-0.03, 0.02, 0.06)])
 def test_a_gradient_is_no_circulation(gradient):
     found = fit_vortices_to_wind(vectors(1, gradient))
@@ -162,6 +163,7 @@ def test_a_gradient_is_no_circulation(gradient):
     assert found.covariance[0, 0] ** 0.5 < 15
 
 
+@pytest.mark.slow
 def test_a_pair_within_the_pair_is_refused():
     found = fit_vortices_to_wind(vectors(2, inner=120.0))
     assert any("more than two vortices" in reason for reason in found.reasons)

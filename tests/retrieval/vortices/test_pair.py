@@ -66,6 +66,7 @@ def test_errors_of_quantities_and_wind_against_drawn_parameters():
         assert fit.quantities[name].stderr == pytest.approx(np.std(values), rel=0.32), name
 
 
+@pytest.mark.slow
 def test_the_pair_drifts_on_and_its_errors_grow():
     """Alike vortices sink by Gamma t/(2 pi b) and go with the mean wind; errors as drawn ones."""
     pair = vortex_pair(400.0, 40.0, 3.0)

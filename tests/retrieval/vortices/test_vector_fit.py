@@ -81,6 +81,7 @@ def vectors(noise, seed=1, spacing=1.0, columns=60, rows=44, vortices=None):
     )
 
 
+@pytest.mark.slow
 def test_vectors_give_the_pair_and_its_errors():
     reduced = []
     for seed in range(5):

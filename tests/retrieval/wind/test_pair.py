@@ -85,6 +85,7 @@ def test_cc_of_a_vortex_pair(pairs):
     assert good < 0.95 * everywhere and fraction > 0.95
 
 
+@pytest.mark.slow
 def test_ws_of_a_vortex_pair(pairs):
     """No better than reporting no wind, but better than the 5.4 m/s of matching centres alone.
 
@@ -143,6 +144,7 @@ def test_sign_and_axis(v, w):
     assert float(good.w.mean()) == pytest.approx(w, abs=0.2)
 
 
+@pytest.mark.slow
 def test_unequal_spacings():
     images = moved(5.0, 8.0, spacing_y=0.4, spacing_z=0.8)
     dataset = retrieve_wind(*images, DT, windows=WindowSizes(template=7, search=14, stride=3))
@@ -188,6 +190,7 @@ def test_blob_moved_by_one_and_a_half_metres():
         assert int(at_blob.flag) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", list(METHODS))
 def test_constant_images_are_flagged_throughout(method):
     y, z = axes(50, 40)
@@ -200,6 +203,7 @@ def test_constant_images_are_flagged_throughout(method):
         assert (dataset.flag & Flag.NO_MATCH.value > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [
@@ -231,6 +235,7 @@ def test_beyond_the_search_range_no_vector_is_valid():
     assert not (np.abs(dataset.v) > 17.5).any()
 
 
+@pytest.mark.slow
 def test_data_set_is_cf_and_survives_a_file(tmp_path):
     pair = moved(6.0, -3.0)
     for method, score in (("cc", "correlation"), ("ws", "mismatch")):
@@ -336,6 +341,7 @@ def burst(number, noise, seed=7):
         yield data_array(rendered, y, z)
 
 
+@pytest.mark.slow
 def test_more_images_of_a_burst_lower_the_error():
     """N images in uniform wind hold N (N^2 - 1) / 6 times the information of two: 10 for four.
 

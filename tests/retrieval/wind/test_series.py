@@ -44,6 +44,7 @@ def mean(winds, name="v"):
     return winds[name].where(winds["flag"] == 0).mean(("z", "y")).values
 
 
+@pytest.mark.slow
 def test_each_pair_has_its_wind_and_time(images):
     said = []
     winds = retrieve_winds(
@@ -61,6 +62,7 @@ def test_each_pair_has_its_wind_and_time(images):
         np.testing.assert_array_equal(winds[name][1], alone[name])
 
 
+@pytest.mark.slow
 def test_pairs_as_asked_for(images):
     winds = retrieve_winds(images, 0.1, [(0, 2), (1, 3)], windows=WindowSizes(stride=4))
     np.testing.assert_allclose(mean(winds), (2.5, 2.5), atol=0.05)
@@ -127,6 +129,7 @@ def test_one_image_is_too_few(images):
         retrieve_winds(images[:1], 0.1)
 
 
+@pytest.mark.slow
 def test_a_stack_of_pairs_has_the_winds_of_one_after_the_other(images, two_threads):
     """Bit for bit, by two threads, and with the images' noise as a stack."""
     stack = xr.concat(images, "pair")
@@ -140,6 +143,7 @@ def test_a_stack_of_pairs_has_the_winds_of_one_after_the_other(images, two_threa
             np.testing.assert_array_equal(winds[name].values[number], one[name].values)
 
 
+@pytest.mark.slow
 def test_pairs_are_retrieved_side_by_side(images, two_threads, monkeypatch):
     """Each of two waits for the other: one after the other they would wait for ever."""
     both = threading.Barrier(2, timeout=60)

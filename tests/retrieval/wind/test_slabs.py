@@ -17,6 +17,7 @@ def slabs():
     return [drifting_pair_images(uneven(), noise=0.03, seed=seed, **SIZES) for seed in (1, 2)]
 
 
+@pytest.mark.slow
 def test_the_first_slab_is_that_of_retrieve_wind_and_the_second_starts_from_it(slabs):
     first, second = ((slab.first, slab.second) for slab in slabs)
     wind, flow = wind_of_slab(*first, DT, noise=0.03)
@@ -31,6 +32,7 @@ def test_the_first_slab_is_that_of_retrieve_wind_and_the_second_starts_from_it(s
     np.testing.assert_allclose(near["v"], far["v"], atol=6 * float(far["v_stderr"].mean()))
 
 
+@pytest.mark.slow
 def test_other_air_is_retrieved_from_nothing(slabs):
     _, flow = wind_of_slab(slabs[0].first, slabs[0].second, DT, noise=0.03)
     wind, _ = wind_of_slab(slabs[0].first, slabs[1].second, DT, flow, noise=0.03)

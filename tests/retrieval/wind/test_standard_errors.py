@@ -55,6 +55,7 @@ def vectors(step, sigma, seed=7):
     ]
 
 
+@pytest.mark.slow
 def test_the_wind_is_what_the_images_show(pair):
     """Else all that follows tests nothing: the sense of the rotation, 0.05 px."""
     found = lm.retrieve_wind(*pair, DT, windows=lm.WindowSizes(stride=4))
@@ -64,6 +65,7 @@ def test_the_wind_is_what_the_images_show(pair):
         assert float(np.sqrt((error**2).mean())) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [(0.2, 0.2), (0.5, 0.1)])
 def test_stated_errors_are_those_that_were_added(pair, sigma):
     """221 vectors, independent (windows as wide as their step); means of 35 are known to 12 %."""
@@ -86,6 +88,7 @@ def test_stated_errors_are_those_that_were_added(pair, sigma):
     assert np.mean(np.abs(z) < 1) == pytest.approx(0.68, abs=0.08)
 
 
+@pytest.mark.slow
 def test_outliers_are_flagged_and_count_for_nothing(pair):
     v, w = vectors(4, (0.2, 0.2))
     clean = lm.standard_errors(*pair, v, w, DT, window=4)
@@ -97,6 +100,7 @@ def test_outliers_are_flagged_and_count_for_nothing(pair):
     assert np.nanmax(ratio) < 1.2
 
 
+@pytest.mark.slow
 def test_missing_vectors_and_too_few(pair):
     """A single known vector is no evidence; where there is none, there is no error."""
     v, w = vectors(4, (0.2, 0.2))

@@ -35,6 +35,7 @@ def scan(time, y, z, at, v=V, w=W):
     return xr.Dataset({name: data_array(field, Y, Z) for name, field in fields.items()})
 
 
+@pytest.mark.slow
 def test_wind_of_a_curve_that_crosses_itself():
     """Air moves by 2 px during the scan: values of one place are of different air.
 
@@ -62,6 +63,7 @@ def test_wind_of_a_curve_that_crosses_itself():
     assert float(off.mean()) > 1.0
 
 
+@pytest.mark.slow
 def test_scans_by_angles_from_a_platform_that_moves():
     """Nodes of the second scan are 3 % nearer to each other."""
     first, second = scan(*lissajous(0.09), 0.0), scan(*lissajous(0.09), DT)
@@ -78,6 +80,7 @@ def test_scans_by_angles_from_a_platform_that_moves():
         assert abs(float(valid.mean()) - true) < 3 * float(valid.std()) / np.sqrt(independent)
 
 
+@pytest.mark.slow
 def test_the_clock_does_not_matter():
     """Times from any zero that is the same in both scans."""
     scans = [scan(*lissajous(0.09), at) for at in (0.0, DT)]
@@ -99,6 +102,7 @@ def test_times_that_are_linear_in_place_are_not_mixed():
     assert not mixes_times(curve.drop_vars("beam_time"), DT)
 
 
+@pytest.mark.slow
 def test_scans_that_mix_no_times_are_only_resampled():
     y, z = np.meshgrid(Y, Z)
     time = 0.05 * (np.arange(SIZE).reshape(y.shape) / SIZE - 0.5)

@@ -44,6 +44,7 @@ def rms(values):
 SHIFT = np.array([0.37, -1.21, 1.74])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(
     "moved",
@@ -63,6 +64,7 @@ def test_displacements_are_not_drawn_to_whole_voxels(axis, moved):
         assert abs(np.mean(off[name])) < 0.01, (name, np.mean(off[name]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "moved",
     [0.5, pytest.param(1, marks=pytest.mark.slow), pytest.param(1.75, marks=pytest.mark.slow)],
@@ -94,6 +96,7 @@ def test_rigid_shift(method):
     assert 0.6 < rms(normalised) < 1.25, normalised
 
 
+@pytest.mark.slow
 def test_standard_errors_know_how_the_components_err_together():
     """Waves nearly along (0, 1, 1): little is known along (0, 1, -1)."""
     x, z, y = nodes((12, 16, 16))

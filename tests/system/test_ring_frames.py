@@ -18,7 +18,7 @@ from PIL import Image
 
 from lidar_mi.cli.app import main
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.own_frames import doppler_of
+from lidar_mi.experiment.ring_frames import doppler_of
 from lidar_mi.io.exr import QUANTITIES, write_fringes
 from tests.support.command_line import words_of
 from validation.fringe_reference import (
