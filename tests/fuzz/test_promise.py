@@ -4,6 +4,7 @@ Detects input that ends in a traceback, a signal or a wait without end, in more 
 line that a terminal obeys, or with something left behind. ``make fuzz`` tries much more.
 """
 
+from inspect import signature
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 from tests.support.cases import Case, fault
 from tests.support.hostile import KINDS, RENDERED
+from tests.support.hostile_calls import annotations, functions
 from tests.support.sandbox import Sandbox
 
 CORPUS = sorted((Path(__file__).parents[1] / "corpus").glob("*.json"))
@@ -54,6 +56,15 @@ def test_former_failures_stay_fixed(path, sandbox):
 def test_cases_come_back_from_their_files():
     case = Case("exr", ("info", "a.exr"), {"a.exr": bytes(range(256)), "b": b"text\n"}, ("c",))
     assert Case.from_text(case.to_text()) == case
+
+
+@pytest.mark.parametrize("name", sorted(functions()))
+def test_every_public_function_can_be_called_with_hostile_arguments(name):
+    """Types that cannot be evaluated ended `make fuzz`, at a draw that few runs reach."""
+    assert set(annotations(functions()[name])) <= {
+        *signature(functions()[name]).parameters,
+        "return",
+    }
 
 
 def double(number):

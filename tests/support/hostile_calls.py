@@ -172,12 +172,17 @@ def candidates(annotation: typing.Any) -> tuple[str, ...]:
     return tuple(text for part in typing.get_args(annotation) for text in candidates(part))
 
 
+def annotations(function: typing.Callable[..., typing.Any]) -> dict[str, typing.Any]:
+    """Those of a public function; xarray's are in quotes where a module loads it late."""
+    return typing.get_type_hints(function, localns={"xr": xr})
+
+
 @st.composite
 def calls(draw: st.DrawFn) -> Case:
     """A public function with one or two arguments that are unusual or wrong."""
     name = draw(st.sampled_from(sorted(functions())))
     function = functions()[name]
-    hints = typing.get_type_hints(function)
+    hints = annotations(function)
     parameters = inspect.signature(function).parameters
     given = {}
     for key, one in parameters.items():
