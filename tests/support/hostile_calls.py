@@ -163,6 +163,9 @@ def functions() -> dict[str, Callable]:
 def candidates(annotation: typing.Any) -> tuple[str, ...]:
     """Expressions for what a parameter is annotated with, right ones first."""
     origin = typing.get_origin(annotation)
+    # the arguments of a callable
+    if isinstance(annotation, list):
+        return ()
     if annotation in BY_TYPE:
         return BY_TYPE[annotation]
     if origin is typing.Literal:
