@@ -193,15 +193,11 @@ def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder
     if (folder / RECORD).is_file():
         existing = open_folder(folder)
         old = read_yaml(folder / RECORD, "the record of a campaign")
-        differing = next((key for key, value in record.items() if old.get(key) != value), None)
-        if differing:
-            difference = (
-                f"version {old.get(differing)}"
-                if differing == "version"
-                else f"another {differing}"
-            )
+        changed = next((key for key, value in record.items() if old.get(key) != value), None)
+        if changed:
+            text = f"version {old.get(changed)}" if changed == "version" else f"another {changed}"
             raise InputError(
-                f"{folder}: holds a campaign with {difference}; expected another folder (-o DIR)"
+                f"{folder}: holds a campaign with {text}; expected another folder (-o DIR)"
             )
         return existing
     rows = _checked(points, notice)

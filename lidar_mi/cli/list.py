@@ -11,9 +11,7 @@ def list_shipped() -> None:
 
     flown = flights()
     groups = {
-        "experiments: lidar-mi run NAME": [
-            shipped for shipped in experiments() if shipped not in flown
-        ],
+        "experiments: lidar-mi run NAME": [each for each in experiments() if each not in flown],
         "flights: lidar-mi fly NAME": flown,
         "campaigns: lidar-mi campaign run NAME": campaigns(),
     }

@@ -12,11 +12,9 @@ from lidar_mi.errors import InputError
 def starting(incomplete: str, names: Iterable[str], *patterns: str) -> list[str]:
     """Completions for a shell: names, then files of some patterns and folders here."""
     folder = incomplete.rpartition("/")[0]
-    shown_folder = Path(folder or ("/" if incomplete.startswith("/") else "."))
-    paths = sorted(
-        path for pattern in patterns for path in shown_folder.glob(pattern) if path.is_file()
-    )
-    paths += sorted(p for p in shown_folder.glob("*/") if p.is_dir()) if patterns else []
+    inside = Path(folder or ("/" if incomplete.startswith("/") else "."))
+    paths = sorted(path for pattern in patterns for path in inside.glob(pattern) if path.is_file())
+    paths += sorted(p for p in inside.glob("*/") if p.is_dir()) if patterns else []
     files = [f"{path}/" if path.is_dir() else str(path) for path in paths]
     return [name for name in (*names, *files) if name.startswith(incomplete)]
 

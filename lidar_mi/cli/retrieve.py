@@ -264,9 +264,7 @@ def _statistics(wind: "xr.Dataset", form: str = ".3g") -> tuple[float, list[tupl
         values = wind[name].where(valid)
         error = wind[f"{name}_stderr"].where(valid) if f"{name}_stderr" in wind else values * np.nan
         statistics = (values.mean(), np.sqrt((values**2).mean()), error.mean())
-        mean, rms, stderr = (
-            "-" if np.isnan(number) else f"{float(number):{form}}" for number in statistics
-        )
+        mean, rms, stderr = ("-" if np.isnan(x) else f"{float(x):{form}}" for x in statistics)
         columns.append((mean, rms, stderr))
     return float(valid.mean()), columns
 

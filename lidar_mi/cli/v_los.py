@@ -70,19 +70,17 @@ def v_los(
         check_target(out, inputs, overwrite=overwrite, suffixes=(".nc",))
     experiment = load(experiment_file(instrument), list(changes or []))
     ccd, counts = doppler_of(experiment, "--instrument").ccd, not electrons
-    etalon = None
+    fit = None
     if calibration is not None:
         try:
-            etalon = calibration_of(read_netcdf(calibration))
+            fit = calibration_of(read_netcdf(calibration))
         except InputError as error:
             raise InputError(f"{calibration}: {error}") from None
     air = read_electrons(frames, ccd, counts=counts, layer=layer)
     if same := identical(air, "frames", start=0):
         output.print(f"warning: {same}")
     laser = read_electrons(reference, ccd, counts=counts, layer=layer) if reference else None
-    speeds = retrieve_v_los(
-        air, laser, experiment, calibration=etalon, max_chi_square=max_chi_square
-    )
+    speeds = retrieve_v_los(air, laser, experiment, calibration=fit, max_chi_square=max_chi_square)
     rows: list[tuple[str, ...]] = []
     for k in range(speeds.sizes["frame"]):
         frame = speeds.isel(frame=k)
@@ -100,7 +98,7 @@ def v_los(
     heads: tuple[str, ...] = ("frame", "v_los, m/s", "systematic", "chi-square", "refused")
     if not refused:
         rows, heads = [row[:-1] for row in rows], heads[:-1]
-    note = "" if etalon else "No calibration: the nominal instrument is taken as true."
+    note = "" if fit else "No calibration: the nominal instrument is taken as true."
     print_table(Table("line-of-sight speeds", rows, heads, note))
     if out is not None:
         write_netcdf(speeds, out)

@@ -124,24 +124,21 @@ def _show(winds: "xr.Dataset") -> None:
 
     valid = (winds["flag"] == 0).values
     profile = int(np.argmax(valid.any(1)))
-    profile_winds = winds.isel(time=profile)
+    wind = winds.isel(time=profile)
     heights = np.flatnonzero(valid[profile])
     step = max(1, -(-heights.size // _ROWS))
     chosen = heights[::step]
     rows = [
         (
-            f"{float(profile_winds['height'][k]):.0f}",
-            *(
-                with_error(float(profile_winds[c][k]), float(profile_winds[f"{c}_stderr"][k]))
-                for c in "uvw"
-            ),
-            f"{float(profile_winds['residual'][k]):.2f}",
-            str(int(profile_winds["lines"][k])),
+            f"{float(wind['height'][k]):.0f}",
+            *(with_error(float(wind[c][k]), float(wind[f"{c}_stderr"][k])) for c in "uvw"),
+            f"{float(wind['residual'][k]):.2f}",
+            str(int(wind["lines"][k])),
         )
         for k in chosen
     ]
     heads = ("height, m", "u (east), m/s", "v (north), m/s", "w (up), m/s", "residual", "lines")
-    time = str(profile_winds["time"].values)[:19].replace("T", " ")
+    time = str(wind["time"].values)[:19].replace("T", " ")
     number = valid.shape[0]
     profiles = f"{number} profile{'s' if number > 1 else ''}"
     note = f"{int(valid.sum())} of {valid.size} winds are valid, of {profiles}."

@@ -83,9 +83,8 @@ class Footprint:
             With what it would take.
         """
         gates, each = self.scan.gate_count, self._layers_per_gate()
-        most = (
-            MOST_LAYERS - 3
-        ) // each  # three layers do not belong to a gate: Y, with noise, and its error
+        # three layers do not belong to a gate: Y, with noise, and its error
+        most = (MOST_LAYERS - 3) // each
         if gates > most:
             raise InputError(
                 f"scan.gate_count: {gates} is not allowed with {each} layers each; expected at "

@@ -54,10 +54,9 @@ def run(
     refuse_strangers(folder, STUDY, "study's folder")
     # faults of the last one are reported before the first one is run
     ready = {
-        key: experiment.prepare(variant, beside, _of(key, notice))
-        for key, variant in variants.items()
+        key: experiment.prepare(each, beside, _of(key, notice)) for key, each in variants.items()
     }
-    settings = {key: settings_of(variant) for key, variant in variants.items()}
+    settings = {key: settings_of(each) for key, each in variants.items()}
     make_folder(folder)
     with locked(folder):
         refuse_strangers(folder, STUDY, "study's folder")
@@ -73,9 +72,7 @@ def run(
         log(f"comparing {', '.join(variants)}")
         drawn = draw_comparison(folder / FIGURES, rows, log) if rows else []
         merged = {
-            f"{key}.{name}": value
-            for key, variant in metrics.items()
-            for name, value in variant.items()
+            f"{key}.{name}": value for key, each in metrics.items() for name, value in each.items()
         }
         write_json(folder / METRICS, merged)
         write_text(folder / REPORT, page(name, settings, metrics, drawn, answers))

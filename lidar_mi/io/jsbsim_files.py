@@ -37,14 +37,10 @@ def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
         reactions = ElementTree.SubElement(top, "external_reactions")
     for kind in ("force", "moment"):
         for axis in AXES:
-            reaction = ElementTree.SubElement(
-                reactions, kind, name=f"wake-{kind}-{axis}", frame="BODY"
-            )
+            node = ElementTree.SubElement(reactions, kind, name=f"wake-{kind}-{axis}", frame="BODY")
             if kind == "force":
-                _vector(reaction, "location", "000", unit="IN")
-            _vector(
-                reaction, "direction", ["1" if axis == direction else "0" for direction in AXES]
-            )
+                _vector(node, "location", "000", unit="IN")
+            _vector(node, "direction", ["1" if axis == a else "0" for a in AXES])
     tree.write(path)
 
 

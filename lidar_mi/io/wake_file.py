@@ -445,11 +445,9 @@ def _read(
         along = {dims_of[name][theirs]: file_nodes[theirs] for theirs in dims}
         nodes = [along.get(d, axes[d]) for d in "xyz"]
         values = _numbers(variable, path).reshape([n.size for n in nodes]) * scale
-        nonnegative = name in needed and name in ("tracer", "aerosol")
+        tracer = name in needed and name in ("tracer", "aerosol")
         where = dict(zip("xyz", nodes, strict=True))
-        _check_values(
-            values, where, table[name], path, not nonnegative, valid_range(variable, path)
-        )
+        _check_values(values, where, table[name], path, not tracer, valid_range(variable, path))
         low, high = values.min(), values.max()
         values, errors[name] = interpolated(values, nodes, [axes[d] for d in "xyz"])
         if name in ("tracer", "aerosol"):

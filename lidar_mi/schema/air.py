@@ -89,15 +89,13 @@ class Gust(Section):
 
     @model_validator(mode="after")
     def _one_source_of_the_speed(self) -> Self:
-        sources = [
+        keys = [
             name
             for name in ("speed", "alleviation", "maximum_altitude")
             if getattr(self, name) is not None
         ]
-        if len(sources) > 1:
-            raise ValueError(
-                f"{sources[1]}: has no effect beside {sources[0]}; expected one of them"
-            )
+        if len(keys) > 1:
+            raise ValueError(f"{keys[1]}: has no effect beside {keys[0]}; expected one of them")
         # the regulation's range, rounded to metres
         if self.speed is None and not 9 <= self.gradient <= 107:
             raise ValueError(

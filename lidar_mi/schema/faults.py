@@ -99,6 +99,11 @@ def _steps(
         yield part, field, section, tagged is not None
 
 
+def _field_at(model: type[BaseModel], location: tuple[int | str, ...]) -> Any:
+    """The field of the key at a location; None: there is none."""
+    return next((field for _, field, _, _ in reversed([*_steps(model, location)])), None)
+
+
 def _key(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """A fault's location without the kinds of value that pydantic tried there."""
     kinds = ("literal[", "function-")
@@ -111,7 +116,7 @@ def _key(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
 
 def _metadata_at(model: type[BaseModel], location: tuple[int | str, ...], kind: type) -> Any:
     """Metadata of a type in the annotation of the key at a location; None without any."""
-    field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
+    field = _field_at(model, location)
     pending = [field.annotation, *field.metadata] if field else []
     while pending:
         part = pending.pop()
@@ -123,7 +128,7 @@ def _metadata_at(model: type[BaseModel], location: tuple[int | str, ...], kind: 
 
 def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:
     """How many values a list at a location has; 1: any number."""
-    field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
+    field = _field_at(model, location)
     annotation: Any = field.annotation if field else None
     for kind in (annotation, *get_args(annotation)):
         if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
@@ -133,7 +138,7 @@ def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:
 
 def _words_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """The words allowed in the list at a location; empty: its members are no words."""
-    field = next((f for _, f, _, _ in reversed([*_steps(model, location)])), None)
+    field = _field_at(model, location)
     members = get_args(field.annotation) if field else ()
     kind = members[0] if members else None
     words: tuple[Any, ...] = tuple(kind) if isinstance(kind, enum.EnumType) else ()

@@ -70,10 +70,8 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
     path = experiment_file(name)
     variants = load_variants(path)
     if variant not in (variants or (None,)):
-        expected = (
-            f"one of {', '.join(variants)}" if variants else f"none, as {name} has no variants"
-        )
-        raise InputError(f"variant: {variant!r} is not allowed; expected {expected}")
+        choice = f"one of {', '.join(variants)}" if variants else f"none, as {name} has no variants"
+        raise InputError(f"variant: {variant!r} is not allowed; expected {choice}")
     experiment = variants[str(variant)] if variants else load(path)
     if changes:
         # keys that the file lacks remain defaults: checks distinguish them from set ones

@@ -91,10 +91,8 @@ class Assumed(Section):
         """A part of the instrument with the assumed values in place of its own."""
         assumed = self.model_dump(exclude_none=True)
         # etalon and camera each have some of the assumed values
-        fitting = {
-            name: value for name, value in assumed.items() if name in type(part).model_fields
-        }
-        return part.model_copy(update=fitting)
+        update = {name: value for name, value in assumed.items() if name in type(part).model_fields}
+        return part.model_copy(update=update)
 
 
 class RingCalibration(Section):

@@ -322,16 +322,14 @@ def _check_memory() -> Check:
 
 
 def _check_disk() -> Check:
-    folder = Path.cwd()
-    free = shutil.disk_usage(folder).free
-    if not os.access(folder, os.W_OK):
-        detail = f"{folder} cannot be written to"
+    cwd = Path.cwd()
+    free = shutil.disk_usage(cwd).free
+    if not os.access(cwd, os.W_OK):
+        detail = f"{cwd} cannot be written to"
         return Check("disk", False, detail, "lidar-mi run EXPERIMENT.yaml -o A_WRITABLE_FOLDER")
     ok = free >= DISK_NEEDED
-    detail = f"{free / GIB:.1f} GiB free in {folder} (needs {DISK_NEEDED // GIB})"
-    return Check(
-        "disk", ok, detail, "" if ok else f'du -sh "{folder}"/outputs/*   (remove old runs)'
-    )
+    detail = f"{free / GIB:.1f} GiB free in {cwd} (needs {DISK_NEEDED // GIB})"
+    return Check("disk", ok, detail, "" if ok else f'du -sh "{cwd}"/outputs/*   (remove old runs)')
 
 
 def _check_exr_tools() -> Check:

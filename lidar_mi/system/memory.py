@@ -30,10 +30,8 @@ def gpu_memory() -> int:
     device = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0] or "0"
     query = ["nvidia-smi", "-i", device, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
     try:
-        output = subprocess.run(
-            query, check=True, capture_output=True, text=True, timeout=20
-        ).stdout
-        return int(output.split()[0]) << 20
+        text = subprocess.run(query, check=True, capture_output=True, text=True, timeout=20).stdout
+        return int(text.split()[0]) << 20
     except (OSError, subprocess.SubprocessError, ValueError, IndexError):
         import torch
 

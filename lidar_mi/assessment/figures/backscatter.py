@@ -154,9 +154,7 @@ def draw_all(
                 ),
             ),
         )
-    drawn = [
-        (name, title, captioned) for name, title, captioned in figures if captioned is not None
-    ]
+    drawn = [(name, title, fig) for name, title, fig in figures if fig is not None]
     return save_all(folder, drawn, log)
 
 

@@ -26,9 +26,9 @@ def draw_calibration(calibration: Calibration) -> Figure:
         title=f"Blocks of {calibration.block} px; chi-square {calibration.chi_square:.3f}",
     )
     left.legend(loc="upper right", fontsize="small")
-    number = np.arange(len(calibration.frame_speed))
+    k = np.arange(len(calibration.frame_speed))
     right.errorbar(
-        number, calibration.frame_speed, calibration.frame_speed_std, fmt="o", ms=3, color="0.2"
+        k, calibration.frame_speed, calibration.frame_speed_std, fmt="o", ms=3, color="0.2"
     )
     right.axhline(0, color="0.7", lw=0.8)
     right.set(

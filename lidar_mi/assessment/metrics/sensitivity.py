@@ -131,17 +131,9 @@ def sobol_indices(
     cube, table = cube[finite], table[finite]
     count, needed = len(table), _POINTS_PER_KNOB * len(knobs)
     unknown, interval = np.full(len(knobs), np.nan), np.full((len(knobs), 2), np.nan)
-    between_members = _member_fraction(table)
+    fraction = _member_fraction(table)
     none = SobolIndices(
-        tuple(knobs),
-        unknown,
-        unknown,
-        interval,
-        interval,
-        np.nan,
-        between_members,
-        count,
-        reason="",
+        tuple(knobs), unknown, unknown, interval, interval, np.nan, fraction, count, reason=""
     )
     if count < needed:
         few = f"{count} points with a value; {needed} are needed for {len(knobs)} knobs"

@@ -63,12 +63,10 @@ class Process:
         spectrum /= np.sqrt(rng.chisquare(5, (_FEATURES, 1)) / 5)
         phases = rng.uniform(0, 2 * np.pi, _FEATURES)
         weights = std * np.sqrt(2 / _FEATURES) * rng.standard_normal((_FEATURES, count))
-        prior, prior_there = (
-            np.cos(x @ spectrum.T + phases) @ weights for x in (self.points, places)
-        )
+        prior, sampled = (np.cos(x @ spectrum.T + phases) @ weights for x in (self.points, places))
         prior += std * np.sqrt(noise) * rng.standard_normal(prior.shape)
         gain = _matern(places, self.points, lengths) @ inverse
-        return np.asarray(mean + prior_there + gain @ (self.values[:, None] - mean - prior))
+        return np.asarray(mean + sampled + gain @ (self.values[:, None] - mean - prior))
 
 
 def processes(points: Array, values: Array, count: int, rng: np.random.Generator) -> list[Process]:

@@ -58,11 +58,9 @@ def coverage(wind: xr.Dataset) -> dict[str, float]:
         if f"{name}_stderr" not in wind:
             continue
         error = (wind[name] - wind[f"{name}_true"]).values
-        statistics = error_statistics(
-            error, wind[f"{name}_stderr"].values, wind["flag"].values == 0
-        )
+        parts = error_statistics(error, wind[f"{name}_stderr"].values, wind["flag"].values == 0)
         for key in ("coverage_68", "coverage_95"):
-            metrics |= {f"{key}_{name}": statistics[key]} if key in statistics else {}
+            metrics |= {f"{key}_{name}": parts[key]} if key in parts else {}
     return metrics
 
 

@@ -56,11 +56,7 @@ def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged 
     """
     simulated = simulation_sentence(experiment, metrics)
     lines = [simulated] if simulated else []
-    lines += [
-        *_wind(experiment, metrics),
-        *_misstatements(experiment, metrics),
-        *_vortices(metrics),
-    ]
+    lines += [*_wind(experiment, metrics), *_wrong(experiment, metrics), *_vortices(metrics)]
     lines += _scatterers(metrics)
     speed = experiment.platform.speed if experiment.imaged_wake else 0.0
     lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
@@ -164,7 +160,7 @@ def _rings(doppler: Doppler, metrics: Mapping[str, float]) -> Iterator[str]:
         )
 
 
-def _misstatements(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
+def _wrong(experiment: Experiment, metrics: Mapping[str, float]) -> Iterator[str]:
     """Sentences on wrong standard errors of the winds that the answer names."""
     if "sensor.vectors" in metrics:
         yield from _misstated("both lidars", metrics, "sensor.", "uvw")
@@ -209,15 +205,11 @@ def _vortices(metrics: Mapping[str, float]) -> Iterator[str]:
             continue
         true = [metrics[key] for key in truth]
         fitted = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
-        departure = max(
+        ratio = max(
             abs(metrics[key] - expected) / metrics.get(f"{key}_stderr", math.inf)
             for key, expected in zip(keys, true, strict=True)
         )
-        beyond = (
-            f", off by up to {departure:.2g} standard errors"
-            if departure > _LEAST_DEPARTURE
-            else ""
-        )
+        beyond = f", off by up to {ratio:.2g} standard errors" if ratio > _LEAST_DEPARTURE else ""
         yield (
             f"Vortex pair: circulations {fitted[0]} and {fitted[1]} m²/s, true "
             f"{true[0]:.0f} and {true[1]:.0f} m²/s{beyond}."

@@ -53,11 +53,7 @@ def _by_age(vortices: xr.Dataset) -> NumberTable:
 
     def line(name: str, unit: str, key: str, scale: float) -> tuple[str, str, list[str]]:
         values = [row[key] for row in rows]
-        return (
-            name,
-            unit,
-            ["-" if math.isnan(value) else f"{scale * value:.3g}" for value in values],
-        )
+        return (name, unit, ["-" if math.isnan(x) else f"{scale * x:.3g}" for x in values])
 
     return (
         "By age of the wake: medians of the sizes of the errors",
@@ -82,9 +78,7 @@ def _peer(metrics: Mapping[str, float]) -> NumberTable:
         ("valid_fraction", "slices with valid vortices"),
     ):
         values = [metrics.get(f"{start}{key}") for start in columns]
-        rows.append(
-            (label, "%", ["-" if value is None else f"{100 * value:.3g}" for value in values])
-        )
+        rows.append((label, "%", ["-" if x is None else f"{100 * x:.3g}" for x in values]))
     heads = ("fit to each slice", "all slices together", "method of radial velocities")
     return "Compared with the method of radial velocities", heads, rows
 

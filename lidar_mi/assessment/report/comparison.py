@@ -97,9 +97,7 @@ def page(
 
     changed = [
         (key, "", [setting(value) for value in values])
-        for key, values in differences(
-            {key: flat(variant) for key, variant in settings.items()}
-        ).items()
+        for key, values in differences({key: flat(each) for key, each in settings.items()}).items()
     ]
     legend = (
         "Errors are those of valid vectors against the truth; an error near the true wind's own "
@@ -110,7 +108,7 @@ def page(
         version=__version__,
         variants=list(settings),
         answers=answers,
-        images=[picture(variant) for variant in drawn],
+        images=[picture(each) for each in drawn],
         stacking=script("panels.js"),
         tables=[
             ("Results", legend, list(results(metrics))),

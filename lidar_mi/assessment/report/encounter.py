@@ -111,10 +111,7 @@ def encounter_summary(
     heads = ("", *(flight_name(mode, controller) for mode in modes))
     tables = [Table(f"flights into the {met}", rows, heads, f"flight lost: {_UPSET}")]
     lidar = [
-        (
-            f"{label} / {unit}" if unit else label,
-            _with_unit(metrics.get(f"encounter.{key}"), factor),
-        )
+        (f"{label} / {unit}" if unit else label, _cell(metrics.get(f"encounter.{key}"), factor))
         for key, label, unit, factor in _OF_THE_LIDAR
         if f"encounter.{key}" in metrics
     ]
@@ -156,7 +153,7 @@ def encounter_chapter(
     )
     tables = [("The flights", [flight_name(mode, controller) for mode in modes], flights)]
     lidar = [
-        (label, unit, [_with_unit(metrics[f"encounter.{key}"], factor)])
+        (label, unit, [_cell(metrics[f"encounter.{key}"], factor)])
         for key, label, unit, factor in _OF_THE_LIDAR
         if f"encounter.{key}" in metrics
     ]
@@ -356,14 +353,14 @@ def _verdict(judged: Judged) -> "Tables":
 def _values(
     metrics: Mapping[str, float], modes: Sequence[str], key: str, factor: float
 ) -> list[str]:
-    return [_with_unit(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
+    return [_cell(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
 
 
 def _lost(metrics: Mapping[str, float], mode: str) -> bool:
     return metrics.get(f"encounter.{mode}.departed", 0) > 0
 
 
-def _with_unit(value: float | None, factor: float) -> str:
+def _cell(value: float | None, factor: float) -> str:
     if value is None:
         return "-"
     scaled = factor * value

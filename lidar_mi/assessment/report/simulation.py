@@ -68,18 +68,14 @@ def simulation_remark(experiment: Experiment, metrics: Mapping[str, float]) -> s
     if not sentence:
         return ""
     text = sentence[0].lower() + sentence[1:].removesuffix(".")
-    samples, sufficient = metrics[_SAMPLES], _sufficient_samples(experiment, metrics)
+    samples, enough = metrics[_SAMPLES], _sufficient_samples(experiment, metrics)
     allowed = experiment.render.monte_carlo_fraction
     if experiment.render.samples_per_beam == "auto" and experiment.detector:
-        times = (
-            f"; expected {float(f'{sufficient / samples:.2g}'):g} times as many"
-            if sufficient
-            else ""
-        )
+        times = f"; expected {float(f'{enough / samples:.2g}'):g} times as many" if enough else ""
         return f"render.max_samples: {text}{times}"
     # it is known to two digits
-    expected = f"{float(f'{sufficient:.2g}'):.0f} or more" if sufficient else "more"
-    visible = 0.0 if sufficient else _texture_visible(experiment, metrics)
+    expected = f"{float(f'{enough:.2g}'):.0f} or more" if enough else "more"
+    visible = 0.0 if enough else _texture_visible(experiment, metrics)
     if visible > samples:
         expected += (
             f": with {visible:.2g} its variance is {whole_percent(allowed)} of that of the texture"

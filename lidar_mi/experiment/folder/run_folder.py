@@ -125,22 +125,20 @@ class RunFolder:
         images = self._matching(RENDERED)
         results = [folder / name for name in (METRICS, REPORT, SUMMARY, *RESULTS.values())]
         results = [path for path in results if path.exists()] + [*folder.glob(f"*{BATCHES}")]
-        difference = _difference(read_record(folder), self.record) if marker.is_file() else None
+        change = _difference(read_record(folder), self.record) if marker.is_file() else None
         foreign = [path for path in images if self._is_foreign(path)]
-        if difference:
-            contents, old = f"a run of {difference}", [*results, *images]
+        if change:
+            contents, old = f"a run of {change}", [*results, *images]
         else:
             contents, old = f"{foreign[0].name} of another experiment" if foreign else "", foreign
-        self._refuse_inputs(changed=bool(difference))
+        self._refuse_inputs(changed=bool(change))
         if old and not overwrite:
             raise InputError(
                 f"{folder}: holds {contents}; expected an empty folder (-o DIR), or --overwrite to "
                 "replace it"
             )
         # results of another experiment must not be mistaken for those of this one
-        drawn = (
-            [*self.figures.glob("*.png"), *self._matching(PREVIEWS), self.log] if difference else []
-        )
+        drawn = [*self.figures.glob("*.png"), *self._matching(PREVIEWS), self.log] if change else []
         previews = [path.with_suffix(".png") for path in foreign]
 
         def remove_old() -> None:

@@ -64,17 +64,15 @@ def passage_rows(doppler: CoherentDoppler, air: PassingWake) -> Rows:
         rows.append(("turbulence", f"{rms:.2g} m/s rms of a component"))
     times = line_scan(doppler.scan).time
     for name, time in (("first", float(times[0])), ("last", float(times[-1]))):
-        for side, vortex in zip(("port", "starboard"), air.vortices(time) or (), strict=False):
-            where = f"y = {vortex.y:.4g} m, z = {vortex.z:.3g} m"
+        for side, core in zip(("port", "starboard"), air.vortices(time) or (), strict=False):
+            where = f"y = {core.y:.4g} m, z = {core.z:.3g} m"
             if doppler.scan.kind == "rhi":
-                where = (
-                    f"{plane_place(doppler, vortex.y):.4g} m from the lidar, {vortex.z:.3g} m high"
-                )
+                where = f"{plane_place(doppler, core.y):.4g} m from the lidar, {core.z:.3g} m high"
             age = doppler.passage.age + time
             rows.append(
                 (
                     f"{side} vortex at the {name} line",
-                    f"{abs(vortex.circulation):.4g} m^2/s, {where}, age {age:.3g} s",
+                    f"{abs(core.circulation):.4g} m^2/s, {where}, age {age:.3g} s",
                 )
             )
     return rows

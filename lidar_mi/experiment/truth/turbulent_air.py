@@ -6,9 +6,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.schema import air as schema
 
 
-def turbulent_air(
-    settings: schema.Turbulence, height: float, seed: int, section: str
-) -> Turbulence:
+def turbulent_air(keys: schema.Turbulence, height: float, seed: int, section: str) -> Turbulence:
     """Turbulence at a height above the ground, m.
 
     Parameters
@@ -25,27 +23,27 @@ def turbulent_air(
     InputError
         A shortest wavelength above a tenth of the length.
     """
-    sigma, length = turbulence_scales(settings, height)
-    if settings.shortest > length / 10:
+    sigma, length = turbulence_scales(keys, height)
+    if keys.shortest > length / 10:
         raise InputError(
-            f"{section}.turbulence.shortest: {settings.shortest:g} m is not allowed with the "
+            f"{section}.turbulence.shortest: {keys.shortest:g} m is not allowed with the "
             f"length of {length:.3g} m at {height:g} m; expected at most {length / 10:.3g} m"
         )
     return turbulence(
         sigma,
         length,
-        seed if settings.seed is None else settings.seed,
-        spectrum=settings.spectrum,
-        shortest=settings.shortest,
-        evolution=settings.evolution,
+        seed if keys.seed is None else keys.seed,
+        spectrum=keys.spectrum,
+        shortest=keys.shortest,
+        evolution=keys.evolution,
     )
 
 
-def turbulence_scales(settings: schema.Turbulence, height: float) -> tuple[float, float]:
+def turbulence_scales(keys: schema.Turbulence, height: float) -> tuple[float, float]:
     """Rms (m/s) and length (m) of turbulence: its own, or those of the standard."""
-    sigma, length = settings.sigma, settings.length
-    if settings.standard == "cs_25":
+    sigma, length = keys.sigma, keys.length
+    if keys.standard == "cs_25":
         assert sigma is not None  # the section refuses its absence with cs_25
         return sigma, length or CS_25_LENGTH
-    rms, scale = mil_f_8785c(height, settings.level)
+    rms, scale = mil_f_8785c(height, keys.level)
     return rms if sigma is None else sigma, length or scale

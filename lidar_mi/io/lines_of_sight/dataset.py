@@ -190,11 +190,7 @@ def _about_times(scans: Sequence[tuple[str, Scan, np.ndarray]], back: int) -> li
     elif back:
         remarks.append("the scans are not in the order of time; lines are sorted by time")
     spans = sorted((s.time.min(), s.time.max(), name) for name, s, _ in scans)
-    overlaps = [
-        f"{earlier[2]} and {later[2]}"
-        for earlier, later in pairwise(spans)
-        if later[0] < earlier[1]
-    ]
+    overlaps = [f"{a[2]} and {b[2]}" for a, b in pairwise(spans) if b[0] < a[1]]
     if overlaps:
         remarks.append(f"scans overlap in time: {', '.join(overlaps[:3])}; all lines are kept")
     keys = [

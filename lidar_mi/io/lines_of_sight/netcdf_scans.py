@@ -124,10 +124,8 @@ def _sweep_names(root: xr.Dataset, path: Path) -> list[str]:
     """Groups of the sweeps; empty: the variables are in the root group."""
     present = groups(path)
     if "sweep_group_name" in root.variables:
-        listed_names = [
-            as_text(word) for word in np.ravel(load_variable(root["sweep_group_name"], path))
-        ]
-        return [name for name in listed_names if name in present]
+        names = [as_text(word) for word in np.ravel(load_variable(root["sweep_group_name"], path))]
+        return [name for name in names if name in present]
     return sorted(name for name in present if name.lower().startswith("sweep"))
 
 
@@ -204,12 +202,10 @@ def _moving(data: xr.Dataset, names: Mapping[str, str], time: np.ndarray, path: 
     """A remark on a platform that moves, whose speed is in the velocities."""
     file_names = _file_names(data, names)
     coordinates = [file_names.get(name) for name in ("latitude", "longitude")]
-    if any(
-        theirs not in data.variables or data[theirs].size != time.size for theirs in coordinates
-    ):
+    if any(key not in data.variables or data[key].size != time.size for key in coordinates):
         return []
     latitude, longitude = (
-        np.deg2rad(np.ravel(_numbers(data[theirs], "", path))) for theirs in coordinates
+        np.deg2rad(np.ravel(_numbers(data[key], "", path))) for key in coordinates
     )
     finite = np.flatnonzero(np.isfinite(latitude) & np.isfinite(longitude))
     if finite.size < 2:
