@@ -245,7 +245,7 @@ def wake(name: str) -> Draw:
     """A plane of another simulated wake, mirrored or upside down or not.
 
     The pair's middle is within 8 m of the image's. The wind is the cubic spline through the nodes,
-    and periodic as the simulation is. Planes are 5 and 6 m apart.
+    and periodic as the simulation is. Planes are 5 or 6 m apart.
     """
 
     def draw(random):
@@ -450,6 +450,12 @@ FAMILIES = (
         "large eddy simulation, 24 m apart, 10 s old",
         "judge",
         wake("medium_strong_turbulence"),
+    ),
+    Family(
+        "wake of a medium aircraft, weak turbulence",
+        "large eddy simulation, 28 m apart, 12 s old",
+        "build",
+        wake("medium_weak_turbulence"),
     ),
 )
 

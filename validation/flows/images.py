@@ -92,6 +92,7 @@ TEXTURED = (
     "simulated wake, x = 25 to 30 m",
     "wake of a light aircraft, strong turbulence",
     "wake of a medium aircraft, strong turbulence",
+    "wake of a medium aircraft, weak turbulence",
 )
 """Families that are seen with all textures."""
 

@@ -132,6 +132,8 @@ def gap_from_fractions(
     '0.885 +- 0.001 mm'
     """
     std = np.array(fraction_std, float)
+    if std.ndim != 1:
+        raise InputError(f"fraction_std: {std.ndim} dimensions are not allowed; expected one")
     return gap_of_covariance(
         fraction, np.diag(std**2), wavelength, nominal, tolerance, refractive_index
     )

@@ -29,6 +29,9 @@ _WIDEST = 0.3
 _FURTHER = float(chi_square.isf(1e-3 / 150, 1))
 
 
+NOT_TOLD = "the pair cannot be told from the wind around it"
+
+
 def step_limits(
     y: np.ndarray, z: np.ndarray, profile: Profile, dt: float = 0.0
 ) -> Callable[[torch.Tensor, torch.Tensor], bool]:

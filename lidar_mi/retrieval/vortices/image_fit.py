@@ -24,6 +24,7 @@ from lidar_mi.retrieval.images.intensity import normalised
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.vortices.acceptance import (
+    NOT_TOLD,
     STARTS,
     TOLERANCE,
     check_profile,
@@ -445,6 +446,9 @@ def _iterated(found: Solution, make: Builder, limits: Limits) -> VortexPairFit:
             return no_fit(make.profile, "the images have no structure in common")
         best = fit(images, best.parameters, limits, error.variance, 10, TOLERANCE)
     ambient = in_ambient_wind(best, white.y, white.z, make.dt)
+    before = best.parameters[:10]
+    if not limits(before, ambient.solution.parameters[:10] - before):
+        return no_fit(make.profile, NOT_TOLD)
     error = model_error_of(ambient.solution, _NOISE_LAGS, changes=True)
     return _checked(make, ambient, images, white(best.parameters), error)
 

@@ -10,6 +10,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.common_error import common_rotation, common_stderr, own_errors
 from lidar_mi.retrieval.vortices.acceptance import (
+    NOT_TOLD,
     STARTS,
     TOLERANCE,
     check_profile,
@@ -165,7 +166,11 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     for _ in range(3):
         error = model_error_of(best, 1.0)
         best = fit(model, best.parameters[:10], limits, error.variance, 12, TOLERANCE)
+        before = best.parameters
         ambient = in_ambient_wind(best, lateral, vertical, 1.0, around)
+        # linear in the pair: beyond, any other pair would do in some air
+        if not limits(before, ambient.solution.parameters[:10] - before):
+            return no_fit(profile, NOT_TOLD)
         around, best = ambient.wind, ambient.solution
         model = replace(model, ambient=around.at(lateral, vertical))
     error = model_error_of(best, 1.0)

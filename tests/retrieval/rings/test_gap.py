@@ -122,6 +122,7 @@ def test_refused():
         ((e, [1e-3], lines), "2 for 2 fractions"),
         ((e, [1e-3, 1e-3], (ARGON, ARGON)), "twice"),
         ((e, [0.0, 1e-3], lines), "fraction_std: 0 is not allowed"),
+        ((e, None, lines), "fraction_std: 0 dimensions are not allowed"),
         ((e, [1e-3, 1e-3], (488.0, 487.0)), "wavelength: 488 is not allowed"),
         (([0.2, 1.4], [1e-3, 1e-3], lines), "fraction: 1.4"),
         ((e, [1e-3, 1e-3], lines, GAP), "expected both"),

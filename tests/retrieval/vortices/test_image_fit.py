@@ -270,7 +270,7 @@ def test_no_pair_without_evidence():
     missing = flat.where(flat.y < 9)
     for images, reason in (
         ((flat, flat), "constant"),
-        (shaken, "is not significant"),
+        (shaken, "cannot be told from the wind around it"),
         ((still, missing), "finite"),
     ):
         found = fit_vortices(*images, DT, noise=0.05)

@@ -8,7 +8,7 @@ import pytest
 import torch
 import xarray as xr
 
-from lidar_mi.atmosphere.vortices.vortex import velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices import vector_fit
 from lidar_mi.retrieval.vortices.model import wind
@@ -118,3 +118,14 @@ def test_flags_outliers_and_unknown_errors():
     assert np.isnan(unknown.chi2)
     with pytest.raises(InputError, match="vectors: 0 are valid"):
         fit_vortices_to_wind(data.assign(flag=data.flag + 1))
+
+
+@pytest.mark.parametrize("noise", [0.5, 3.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_few_vectors_give_a_pair_or_a_reason(seed, noise):
+    """Where the air around takes the pair's part a step beyond all cores ended in a traceback."""
+    few = vectors(noise, seed, 2.5, 14, 12, vortex_pair(20.0, 12.0, 1.5))
+    pair = fit_vortices_to_wind(few)
+    assert pair.success == (not pair.reasons)
+    if pair.success:
+        assert np.isfinite(pair.parameters).all() and np.isfinite(pair.covariance).all()
