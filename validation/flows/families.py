@@ -245,7 +245,7 @@ def wake(name: str) -> Draw:
     """A plane of another simulated wake, mirrored or upside down or not.
 
     The pair's middle is within 8 m of the image's. The wind is the cubic spline through the nodes,
-    and periodic as the simulation is. Planes are 5 or 6 m apart.
+    and periodic as the simulation is. Planes are 5 to 6.25 m apart.
     """
 
     def draw(random):
@@ -456,6 +456,12 @@ FAMILIES = (
         "large eddy simulation, 28 m apart, 12 s old",
         "build",
         wake("medium_weak_turbulence"),
+    ),
+    Family(
+        "wake of a heavy aircraft, stratified air",
+        "large eddy simulation, 34 m apart, 18 s old",
+        "judge",
+        wake("heavy_stratified"),
     ),
 )
 

@@ -93,6 +93,7 @@ TEXTURED = (
     "wake of a light aircraft, strong turbulence",
     "wake of a medium aircraft, strong turbulence",
     "wake of a medium aircraft, weak turbulence",
+    "wake of a heavy aircraft, stratified air",
 )
 """Families that are seen with all textures."""
 
