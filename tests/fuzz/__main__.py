@@ -36,7 +36,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=CORPUS)
     asked = parser.parse_args()
     start, tried, known, broken = time.monotonic(), Counter(), {}, []
-    number = int(time.time()) if asked.seed is None else asked.seed
+    # seeds of renderings have 32 bits
+    number = int(time.time()) % 10**8 if asked.seed is None else asked.seed
     with Sandbox(seconds=asked.seconds) as sandbox:
         while time.monotonic() - start < 60 * asked.minutes:
             number += 1
