@@ -83,7 +83,6 @@ def test_quantities_become_si(kind, text, expected):
     assert getattr(Quantities(**{kind: text}), kind) == pytest.approx(expected, rel=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unit", "texts"),
     [

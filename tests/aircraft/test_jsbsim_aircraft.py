@@ -113,7 +113,6 @@ def test_control_moments_are_the_derivatives_of_the_file():
     assert abs(moments[0, 1]) < 1e-3 * roll and abs(moments[2, 0]) < 1e-3 * yaw
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("axis", "angle", "sign"), [(0, "roll", 1), (1, "pitch", -1), (2, "yaw", 1)]
 )

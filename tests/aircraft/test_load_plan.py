@@ -95,7 +95,6 @@ def least_load_factor(aircraft, loads, duration=8.0):
     return found.fun
 
 
-@pytest.mark.slow
 def test_the_plan_is_near_the_best_possible():
     """Largest load factor: below half of that without control, a third above the least."""
     loads = gust_on(heave())
@@ -107,7 +106,6 @@ def test_the_plan_is_near_the_best_possible():
     assert 0.98 * least < ours < 1.35 * least and ours < 0.45 * off
 
 
-@pytest.mark.slow
 def test_bending_falls_with_the_load_factor():
     loads = gust_on(heave())
     off, ours, fixed = (

@@ -122,7 +122,6 @@ def test_turbulence_has_no_divergence_and_unit_strength():
     assert_allclose(gusts.mean((1, 2, 3)), 0, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_turbulence_has_von_karmans_spectrum():
     """Longitudinal line spectrum: that of E(k) = k^4 / (k^2 + k0^2)^(17/6), summed over the others.
 

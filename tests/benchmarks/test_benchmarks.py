@@ -216,7 +216,6 @@ def test_sides_take_turns_after_one_untimed_call():
     assert all(seconds >= 0 for seconds, _ in found["a"])
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="no /proc here")
 def test_memory_of_a_fresh_process_is_its_own():
     held = np.ones(50_000_000)  # 400 MB

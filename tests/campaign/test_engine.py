@@ -201,7 +201,6 @@ def test_a_scheduler_that_does_not_answer_and_a_worker_of_another_version(
         pass
 
 
-@pytest.mark.slow
 def test_a_lifetime_that_is_too_short_begins_nothing(tmp_path, client):
     path = described(tmp_path, sweep={"retrieval.template": [6, 8]})
     ready = prepare_campaign(path, tmp_path / "out")

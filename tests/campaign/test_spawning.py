@@ -71,7 +71,6 @@ def called(text, folder, **options):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", SCRIPTS)
 def test_the_reason_in_one_line(kind, tmp_path):
     text, reason = SCRIPTS[kind]

@@ -439,7 +439,6 @@ def test_a_file_name_stands_for_one_text():
                 assert first.text == block.text, f"{block.place}: {block.file}, as {first.place}"
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(
     "pages",

@@ -144,7 +144,6 @@ def test_the_work_of_the_autopilot_is_not_the_lidars(experiment, how, first):
     assert verdict.startswith(first) and "it meets" not in verdict
 
 
-@pytest.mark.slow
 def test_only_what_a_mode_needs_is_flown(experiment):
     class Unused:
         def step(self, *_):

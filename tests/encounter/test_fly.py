@@ -162,7 +162,6 @@ def flown(tmp_path_factory):
     return in_process("fly", "encounter", "--mode", "off", *sets, "-o", folder), folder
 
 
-@pytest.mark.slow
 def test_the_command_flies(flown):
     done, folder = flown
     assert done.returncode == 0, done.stderr

@@ -116,7 +116,6 @@ def test_time_to_the_alarm_and_back():
     assert np.flatnonzero(found)[-1] == count + needed - 2
 
 
-@pytest.mark.slow
 def test_false_alarms_are_as_stated():
     """40 000 samples of a right prediction in errors as stated: at most 4 alarms in the mean."""
     aircraft = aircraft_of(met()[0])

@@ -21,7 +21,6 @@ def experiment():
     return lm.load_experiment("encounter", encounter={"path": PATH, "aircraft": {"model": "737"}})
 
 
-@pytest.mark.slow
 def test_a_script_rolls_as_a_flight_does():
     """The same wake, aircraft and trim, stepped by JSBSim's step and by ours: within 2 %."""
     given = experiment()

@@ -64,7 +64,6 @@ def test_estimates_are_those_of_the_flight(flown):
     assert WakeTracker(lidar, 0.1, 7.5).lidar is lidar
 
 
-@pytest.mark.slow
 def test_another_controller_has_the_same_estimates(flown):
     first, folder = flown
 

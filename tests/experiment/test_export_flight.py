@@ -27,7 +27,6 @@ def flight(folder):
     return folder
 
 
-@pytest.mark.slow
 def test_tables_have_the_values_of_the_flight(flight):
     names = [path.name for path in lm.export(flight, "csv")]
     assert names == ["flight.csv", "track.csv", "slab_winds.csv"]

@@ -153,7 +153,6 @@ def test_ring_images_do_not_depend_on_what_is_beside_them():
         assert equal(before[name], found[name]) and signatures(after)[name] == signed[name]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "value"),
     [

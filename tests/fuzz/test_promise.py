@@ -85,7 +85,6 @@ def die():
     ctypes.string_at(0)
 
 
-@pytest.mark.slow
 def test_the_sandbox_sees_how_calls_end(sandbox):
     assert sandbox.call(double, 4).value == 8
     assert sandbox.call(hang, seconds=0.5).timed_out

@@ -28,7 +28,6 @@ def by_quadrature(gate, cosine, factor):
     return quad(signal, low, high, points=kinks or None)[0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 0.7])
 def test_signal_is_the_integral(factor):
     found, _ = Layers(NODES, EDGES, COSINES).signal(EXTINCTION, factor)

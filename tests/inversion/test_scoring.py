@@ -61,7 +61,6 @@ def retrieved(profile, depth, brightest, calibration, seed):
     return np.log(mean / true) / error
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("profile", [plumes, layers, noise])
 @pytest.mark.parametrize(
     ("depth", "brightest", "calibration"),

@@ -76,7 +76,6 @@ def test_missing_file_is_named(tmp_path):
         open_netcdf(tmp_path / "no.nc")
 
 
-@pytest.mark.slow
 def test_a_full_disk_leaves_the_old_file_and_the_process_alive(tmp_path):
     """In a process of its own, which HDF5 would take down: no file may grow beyond 100 kB."""
     path = tmp_path / "wind.nc"

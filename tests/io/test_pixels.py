@@ -17,7 +17,6 @@ from lidar_mi.io.images import read_frames, read_image, read_pixels
 from tests.support import image_files as files
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*files.WHOLE, *files.FLOATS])
 def test_tiff_of_every_type_compression_and_layout(kind):
     """All pairs of compression and layout; predictor, pages, order, tiles, BigTIFF at random."""

@@ -68,7 +68,6 @@ def signal(low, high, face):
     return total
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 @pytest.mark.parametrize("estimator", ["gated", "analog"])
 def test_beams_from_the_origin_are_those_of_directions(world, variant, estimator):
@@ -105,7 +104,6 @@ def test_single_scattering_from_displaced_origins(world, statistics, variant, ki
     statistics.assert_agree(found, sigma, truth, samples, bias=2e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["gated", "analog"])
 def test_displaced_origin_is_a_displaced_scene(world, statistics, estimator):
     """All orders of scattering: the same beams from another place, or the air from there."""

@@ -41,7 +41,6 @@ def slab(world, to_world, gates, size=(1, 1), orders=1, phase="rayleigh_polarize
     )
 
 
-@pytest.mark.slow
 def test_a_beam_that_crosses_the_field_of_view(world):
     """A laser 10 m beside the telescope meets its axis at 115 m: the lidar equation along it."""
     g, base, fov, aperture = 0.5, 10.0, 10e-3, 0.01
@@ -136,7 +135,6 @@ def test_fields_of_view_of_one_telescope(world):
     np.testing.assert_array_less(abs(found.mean(0) - expected), 4 * error)
 
 
-@pytest.mark.slow
 def test_what_is_refused(world):
     with pytest.raises(RuntimeError, match="'2 numbers' is not allowed; expected one, or 1"):
         slab(world, pose(), (110.0, 120.0), fov_half_mrad="1, 2")

@@ -22,7 +22,6 @@ VIEW = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [1e-4, 0.02, 0.3, 1.0, 5.0, 300.0])
 def test_ranges_have_the_distribution_of_gate_and_pulse(sigma):
     """Weighted fractions below each of 40 places against differences of normal integrals."""
@@ -136,7 +135,6 @@ def test_gradients_have_one_candidate(world):
     assert np.abs(found[0]).max() > 0
 
 
-@pytest.mark.slow
 def test_open_surfaces_have_one_candidate(world):
     """Behind them the medium is known from the one in front alone."""
     at = mi.ScalarTransform4f().translate([499, 0, 0]).rotate([0, 1, 0], -90).scale(200)

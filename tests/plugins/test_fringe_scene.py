@@ -168,7 +168,6 @@ EVERY_WAY = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "estimator", "shape", "lens"),
     [
@@ -322,7 +321,6 @@ def test_two_etalons_see_the_same_frequency(estimator, statistics):
 # --- polarisation
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["camera", "forward", "analog"])
 def test_stokes_vector_of_the_source_arrives_about_the_horizontal_axis(estimator):
     """Through an etalon that knows no polarisation; then through Mitsuba's own polariser."""
@@ -346,7 +344,6 @@ def test_stokes_vector_of_the_source_arrives_about_the_horizontal_axis(estimator
     np.testing.assert_allclose(total, 0.25 * np.array([1, -1, 0, 0]), atol=noise)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["camera", "forward"])
 @pytest.mark.parametrize(
     ("centre", "stokes_index"), [((-80.0, 15.5), 1), ((-60.0, -60.0), 2), ((-60.0, 91.0), 2)]
@@ -537,7 +534,6 @@ def test_rays_into_the_scene_are_those_that_arrive():
 # --- Mitsuba
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"], indirect=True)
 def test_mitsuba_s_own_integrator_sees_the_same_rings(statistics):
     """`path` follows both lobes of the plates; the source is an environment to it."""

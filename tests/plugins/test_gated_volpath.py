@@ -91,7 +91,6 @@ class TestAnalogAgreesWithGated:
         self.compare(world, statistics, seed=2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ["gated", "gated, half in view", "analog"])
 def test_standard_error_is_correct(world, statistics, case):
     """100 seeds x 100 equal beams: z-scores have unit variance, in all, per seed, per beam.
@@ -155,7 +154,6 @@ def test_standard_error_is_correct_in_a_thin_textured_slab(world, statistics, ph
 
 
 class TestVariants:
-    @pytest.mark.slow
     @pytest.mark.parametrize(
         "variant",
         [
@@ -412,7 +410,6 @@ class TestOpaqueTargets:
             wall=wall,
         )
 
-    @pytest.mark.slow
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     @pytest.mark.parametrize("x", [300.0, 495.0])
     def test_no_light_from_behind_a_wall(self, world, estimator, x):

@@ -84,7 +84,6 @@ def test_backward_agrees_with_differences(slab, samples_per_pass):
     assert abs(np.mean(found) - expected) < 4 * spread + 0.005 * abs(expected)
 
 
-@pytest.mark.slow
 def test_forward_is_the_transpose_of_backward(slab):
     scene, parameters = slab
     expected = (backward(scene, parameters, 4, 20_000) * DIRECTION).sum()
@@ -126,7 +125,6 @@ def test_blurred_slab_is_recovered_by_gradient_descent(slab):
     assert float(misfit(1000).array[0]) < 0.02 * before
 
 
-@pytest.mark.slow
 def test_gradient_of_the_albedo_is_the_image_over_the_albedo(variant, world):
     """Single scattering is proportional to the albedo where the vertex is: Euler's relation."""
     medium = world.homogeneous(2e-3, albedo=0.8)

@@ -252,7 +252,6 @@ class TestRefused:
         scene = reference.loaded(reference.extinction(1.0, False))
         assert "'no parameter' is not allowed; expected dr.enable_grad of" in self.refused(scene)
 
-    @pytest.mark.slow
     def test_analog_samples(self):
         scene = reference.loaded(reference.extinction(1.0, False))
         scene.integrator().estimator = "analog"

@@ -201,7 +201,6 @@ def lit_wall(integrator, distance, **beam):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["path", "volpath", "ptracer"])
 @pytest.mark.parametrize(
     ("distance", "beam"),

@@ -255,7 +255,6 @@ class TestGates:
                     stokes[gate, 0], error[gate], truth[gate], photons, bias=TRUNCATION
                 )
 
-    @pytest.mark.slow
     def test_many_gates_are_the_single_gates_one_by_one(self, world, statistics):
         """And their sum is the signal of one gate over all of them."""
         photons, gates = 1000, 8

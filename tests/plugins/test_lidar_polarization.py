@@ -81,7 +81,6 @@ def test_depolarisation_ratios(world, depolarization):
     assert (i + v) / (i - v) == pytest.approx(2 * linear / (1 - linear), abs=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("phase", "value"),
     [
@@ -119,7 +118,6 @@ def test_unpolarised_variants_carry_intensity_only(world, variant):
     assert (stokes[0] > 0).all() and (stokes[1:] == 0).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("direction", "roll"),
     [((0, 0, 1), 0), ((0, 0, -1), 0), ((1e-3, 2e-3, 1), 0), ((1, 0, 0), 30), ((1, 0.3, 0.2), 77)],

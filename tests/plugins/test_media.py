@@ -101,7 +101,6 @@ def test_transmittance_through_nested_cubes(surfaces, tmp_path):
     np.testing.assert_allclose(np.log(found), np.log(expected), rtol=0, atol=1e-3 * SLAB)
 
 
-@pytest.mark.slow
 def test_a_cube_without_media_changes_nothing():
     scene, _ = nested({"type": "cube"}, {"type": "cube", "bsdf": {"type": "null"}})
     assert len(Air(scene).bodies) == 2

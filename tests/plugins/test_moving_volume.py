@@ -103,7 +103,6 @@ def test_a_carried_sinusoid_has_the_phase_and_amplitude_of_the_closed_form(d):
     assert worst < {0.25: 7e-4, 0.5: 6e-3}[d]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 @pytest.mark.parametrize(
     ("estimator", "order"),
@@ -147,7 +146,6 @@ def test_every_beam_meets_the_air_of_its_time(world, variant, estimator, order):
     assert np.abs((moving - other) / np.hypot(moving_error, at_time_error)).max() > 10
 
 
-@pytest.mark.slow
 def test_gradients_belong_to_the_states_around_a_beams_time(world):
     """A quarter of the way between two equal states: 3/4 and 1/4 of the static air's gradient."""
     base = 0.05 * np.random.default_rng(1).uniform(0.5, 1.5, SHAPE[1:])
@@ -265,7 +263,6 @@ def test_new_states_compile_nothing(world):
     assert history and all(kernel["cache_hit"] for kernel in history)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [

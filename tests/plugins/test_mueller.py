@@ -220,7 +220,6 @@ def edited(change):
     return table
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "message"),
     [

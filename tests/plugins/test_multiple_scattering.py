@@ -72,7 +72,6 @@ def test_dense_slab_agrees_with_an_independent_simulation(world, truth, case, es
     np.testing.assert_allclose(orders[3:], reference[3:], rtol=high)
 
 
-@pytest.mark.slow
 def test_depolarisation_by_multiple_scattering(world, truth):
     mean, error = truth[RAYLEIGH]
     found = gates(dense(world, RAYLEIGH), spp=1_000_000, seed=6)
@@ -105,7 +104,6 @@ def test_orders_sum_to_the_total_and_the_first_is_single_scattering(world):
     np.testing.assert_allclose(found[:, 5], single[:, 0], rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_orders_of_millions_of_samples_keep_their_digits(world):
     """In one gate: a running sum of so many terms is off by 4e-6, or more with longer runs."""
     case = Case(gates=(500.0, 510.0))

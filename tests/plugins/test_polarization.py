@@ -24,7 +24,6 @@ def test_horizontal_axis_is_horizontal_perpendicular_and_unit(optics):
     assert np.array(horizontal_axis(mi.Vector3f(1, 0, 0))).ravel() == pytest.approx([0, 1, 0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_horizontal_axis_of_vertical_light_is_y(up):
     assert np.array(horizontal_axis(mi.Vector3f(0, 0, up))).ravel() == pytest.approx([0, 1, 0])

@@ -49,7 +49,6 @@ def onto_common_axis(optics, matrix, incident, scattered, axis):
     return back @ matrix @ into
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.0, 1e-7, 1e-6, 1e-5, 1e-3], ids=lambda o: f"{o:g}rad")
 def test_backscatter_is_diag_1_1_m1_m1(optics, offset):
     """At 180 degrees, where the scattering plane vanishes, and so near it that rounding decides.
@@ -103,7 +102,6 @@ def uniaxial_dipoles(depolarization):
     return tensor, weight / power
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("depolarization", [0.0, 0.028, 0.3])
 def test_stokes_vectors_are_those_of_radiating_dipoles(optics, depolarization):
     """Fields E' = k' x (k' x alpha E) for random directions and random elliptic polarisation."""
@@ -122,7 +120,6 @@ def test_stokes_vectors_are_those_of_radiating_dipoles(optics, depolarization):
     assert np.abs(found - expected).max() < 1e-6
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("depolarization", [0.0, 0.028, 0.3])
 def test_depolarisation_factor_is_that_of_natural_light(optics, depolarization):
     rng = np.random.default_rng(4)
@@ -158,7 +155,6 @@ def test_integrates_to_one_over_the_sphere(optics, depolarization):
     assert pdf == pytest.approx(matrix[:, 0, 0], rel=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("depolarization", [0.0, 0.3])
 @pytest.mark.parametrize("wi", [(0, 0, 1), (0.6, -0.64, 0.48)])
 def test_samples_follow_the_density(depolarization, wi):

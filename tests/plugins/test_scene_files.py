@@ -110,7 +110,6 @@ def same_scene(world):
     )
 
 
-@pytest.mark.slow
 def test_xml_and_dictionary_give_the_same_image_in_every_variant(world, scene_file):
     """Back and forth between variants, in one process."""
     images = {}

@@ -149,7 +149,6 @@ def check(scene, boxes, tolerance=2e-4):
     np.testing.assert_allclose(found, truth, rtol=0, atol=allowed)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cube", "mirrored", "inside out", "mesh"])
 @pytest.mark.parametrize("name", ARRANGEMENTS)
 def test_boxes(name, kind, tmp_path):

@@ -72,7 +72,6 @@ def test_return_of_a_wall(world, variant, estimator, tilt):
     np.testing.assert_allclose(found[:, 5], found[:, 0], rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_a_pulse_spreads_it_over_gates(world):
     duration = 3e-8
     scene = target(world, gates=10, laser={"pulse_duration": duration}, wall=wall())
@@ -109,7 +108,6 @@ def test_gated_and_analog_agree_with_air_before_and_behind(world):
     assert gated[2, 5] > 3 * gated[1, 5] and analog[2, 4] < 0.1 * analog[2, 0]
 
 
-@pytest.mark.slow
 def test_faces_that_are_dark(world):
     away = wall(180.0)
     facing = wall(180.0, bsdf={"type": "twosided", "bsdf": wall()["bsdf"]})

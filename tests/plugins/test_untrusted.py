@@ -54,7 +54,6 @@ def test_of_two_samples_each_has_half(world):
     assert scene.integrator().untrusted == scene.integrator().lit == share.size
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("samples_per_pass", [1 << 20, 3000])
 def test_share_of_one_sample_in_a_layer_that_few_meet(world, samples_per_pass):
     """The numbers of samples in the layer are binomial; k equal ones have a share of 1 / k each."""
@@ -105,7 +104,6 @@ def test_a_warning_where_shares_are_not_asked_for(world):
         mi.render(loaded(world, shares=False), spp=64)
 
 
-@pytest.mark.slow
 def test_a_rendered_file_says_so(tmp_path):
     """The header's counts are those of the layer, and the sentence is theirs."""
     scene, out = lm.scene_file("slab"), tmp_path / "slab.exr"

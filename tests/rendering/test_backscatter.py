@@ -256,7 +256,6 @@ class TestScans:
                 plane(1e-3 * rng.uniform(0.5, 1.5, (len(Z), len(Y)))), plans[0], BackscatterLidar()
             )
 
-    @pytest.mark.slow
     def test_a_moved_scene_gives_the_image_of_a_new_one(self):
         """The second and third scan from the first's scene, and each rendered alone."""
         plans = self.plans((0.0, 15.0, 30.0))

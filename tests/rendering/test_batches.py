@@ -99,7 +99,6 @@ def test_a_killed_image_resumes_where_it_was(variant, tmp_path, monkeypatch, mak
     np.testing.assert_array_equal(image.view(np.uint32), whole.view(np.uint32))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "estimator", "other"),
     [(ring_scene, "camera", 700), pytest.param(lidar_scene, "gated", 15, marks=pytest.mark.slow)],

@@ -70,7 +70,6 @@ def render(fields, plans, seed=1, environment=ENVIRONMENT, **settings):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 @pytest.mark.parametrize("gates", ["planar", "spherical"])
 def test_beams_all_at_once_give_the_image_of_a_plan_without(variant, gates):
@@ -91,7 +90,6 @@ def test_beams_all_at_once_give_the_image_of_a_plan_without(variant, gates):
         assert "beam_time" not in without and not with_beams["beam_time"].any()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("gates", ["planar", "spherical"])
 def test_homogeneous_air_is_flat_from_every_origin(gates):
     """Range and gate length of each beam are corrected: 4 sigma of the mean, and of rows."""
@@ -119,7 +117,6 @@ def test_corrections_use_the_reported_range():
     assert abs(ratio.mean() - expected) < 4 * sigma + 1e-4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.0, 0.7, -0.4)])
 def test_a_scatterer_lies_where_the_reported_beams_cross_it(offset, tmp_path):
     """Its true place plus the error of the reported one; 25 mm, in the file too."""

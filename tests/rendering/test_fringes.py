@@ -215,7 +215,6 @@ def test_lens_and_field_fit_any_camera():
     assert np.all(np.array(source.radiance(-direction)) == 1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("call", "message"),
     [

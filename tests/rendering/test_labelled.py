@@ -60,7 +60,6 @@ def test_axes_are_the_places_of_the_beams():
             assert np.array_equal(layer, rows[..., 5 * gate + k]), name
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_backscatter_is_that_of_the_air():
     """beta exp(-2 sigma r), r the middle of the first gate; beta is 1.5 sigma / (4 pi)."""

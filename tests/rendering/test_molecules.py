@@ -71,7 +71,6 @@ def test_backscatter_is_the_sum_of_both():
         assert float(middle.mean()) == pytest.approx(expected, rel=3e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_light_is_depolarised_by_particles_alone():
     """S1 / S0 is the mean of both, weighted with what each sends back."""

@@ -16,7 +16,6 @@ from lidar_mi.schema.scattering import Scattering
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scattering", "expected"),
     [
@@ -97,7 +96,6 @@ def test_molecules_are_those_of_the_wavelength():
     assert whole.albedo == pytest.approx(1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("cosine", [-1.0, -0.3, 0.8])
 def test_a_mixture_is_weighted_by_scattering_coefficient(cosine):
     """Three parts of soot (albedo 0.22) and one of molecules: by hand from the parts alone."""

@@ -18,7 +18,6 @@ def test_every_llvm_variant_can_be_set(variant, name):
     assert mi.load_dict({"type": "rayleigh_polarized"}) is not None
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_magic", "", "LLVM_AD_RGB"])
 def test_others_are_refused(variant, name):
     with pytest.raises(InputError) as error:

@@ -62,7 +62,6 @@ def test_what_is_shared_comes_off_again():
         with_common_error(own, -1)
 
 
-@pytest.mark.slow
 def test_pair_fitted_to_vectors():
     """Only the mean wind, and what follows from it, is less certain."""
     y, z = axes(27, 21, 2.3)
@@ -111,7 +110,6 @@ def test_a_rotation_of_vectors_is_part_of_their_errors():
         with_common_error(own, 0.0, rotation=np.nan)
 
 
-@pytest.mark.slow
 def test_what_a_turn_does_to_a_pair():
     """It is a gradient of the ambient wind: the mean wind at the pair alone follows it.
 
@@ -161,7 +159,6 @@ def turned_images(turn, seed):
     return images
 
 
-@pytest.mark.slow
 def test_an_unknown_roll_is_not_a_circulation():
     """1.5 mrad between the scans, as of moving_platform with poor navigation: a gradient."""
     found = fit_vortices(*turned_images(TURN_ERROR, 1), DT, 0.01)

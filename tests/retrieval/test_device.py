@@ -85,7 +85,6 @@ def test_other_errors_stay():
         within_memory(compute)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", "ws", "multipass"])
 def test_winds_do_not_depend_on_the_tiles(method):
     """As if memory were full in the first pass of each size but the last one."""

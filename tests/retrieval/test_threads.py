@@ -49,7 +49,6 @@ def test_the_number_is_given_back_after_an_error():
     assert torch.get_num_threads() == 2
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("call", ["retrieve_wind", "fit_vortices"])
 def test_retrievals_of_images_work_on_one(call, monkeypatch):

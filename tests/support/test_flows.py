@@ -21,7 +21,6 @@ def test_air_turns_around_a_single_vortex():
     np.testing.assert_allclose(then, now * np.exp(-1j * swirl / r * 0.1), atol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("spacing", [1.0, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_texture_has_the_contrast_and_the_correlation_it_is_given(spacing):
     """exp(-(r / length)^2) over 5 seeds of 120 x 90 px: some 900 independent cells of a texture of

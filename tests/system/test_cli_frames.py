@@ -42,7 +42,6 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tif", "ome", "imagej", "fits", "npy", "pgm", "im7"])
 def test_a_file_of_two_frames_is_a_pair(here, lidar_mi, kind):
     images = np.stack(exposures())
@@ -67,7 +66,6 @@ def test_a_file_of_two_frames_is_a_pair(here, lidar_mi, kind):
     assert v == pytest.approx(5, abs=0.3) and w == pytest.approx(-2.5, abs=0.3)
 
 
-@pytest.mark.slow
 def test_frames_are_named(here, lidar_mi):
     pages("stack.tif", exposures(4))
     code, _, err = lidar_mi("retrieve", "stack.tif", *OPTIONS)
@@ -131,7 +129,6 @@ def test_identical_images_are_remarked_on(here, lidar_mi):
         assert f"frames 0 and 1 {words}" in lidar_mi("rings", "same.tif", option)[1]
 
 
-@pytest.mark.slow
 def test_depth_of_colour_does_not_change_the_wind(here, lidar_mi):
     """12 bits in 16-bit colour: the wind of the grey images, digit by digit."""
     images = exposures(scale=600)

@@ -76,7 +76,6 @@ def test_number_of_samples_is_the_scene_s_by_default(there, lidar_mi):
     assert read_scan(there / "a.exr").attrs["samples_per_beam"] == 64
 
 
-@pytest.mark.slow
 def test_retrieve_equals_the_run(demo, there, lidar_mi):
     """The same images by the two ways, with the noise that their files tell."""
     one, other = (demo.folder / f"image_t{k}.exr" for k in (1, 2))
@@ -122,7 +121,6 @@ def test_retrieve_accepts_any_image_with_a_spacing(there, lidar_mi):
         assert np.median(wind["w"].values[valid]) == pytest.approx(-0.5, abs=0.05)
 
 
-@pytest.mark.slow
 def test_retrieve_resamples_scans_by_angles_to_one_grid(there, lidar_mi):
     assert lidar_mi("render", "slab.xml", "-s", 4, "-o", "far.exr")[0] == 0
     assert (
@@ -179,7 +177,6 @@ def test_retrieve_uses_the_times_of_scans(there, lidar_mi):
     assert np.ptp(found["moving"]["time"].values) > 0.05
 
 
-@pytest.mark.slow
 def test_retrieve_puts_beams_on_the_nodes(there, lidar_mi):
     """Beams 0.6 px further to port in scan 2: not a wind of 3 m/s."""
     y, z = axes(50, 44)

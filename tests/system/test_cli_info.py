@@ -41,7 +41,6 @@ def test_info_on_a_run_folder(demo, lidar_mi):
     assert f"{demo.metrics['true_wind.rms_w']:.2f}" in out and "no skill" in out
 
 
-@pytest.mark.slow
 def test_info_on_an_image_and_on_winds(demo, lidar_mi):
     code, out, _ = lidar_mi("info", demo.folder / "image_t1.exr")
     assert code == 0
@@ -121,7 +120,6 @@ def test_aerosol_writes_a_table_that_info_reads(there, lidar_mi):
     assert lidar_mi("info", "smoke.txt")[1].count("smoke") >= 2
 
 
-@pytest.mark.slow
 def test_a_missing_library_is_answered_with_the_line_to_type(there, lidar_mi, monkeypatch):
     monkeypatch.setitem(sys.modules, "scatrs.mie", None)
     code, _, err = lidar_mi("aerosol", "soot", "--wavelength", "355 nm")

@@ -66,7 +66,6 @@ def test_order_is_not_judged_where_the_gates_followed_the_air(tmp_path):
     assert steps_of([tmp_path / "0.exr", tmp_path / "1.exr"]) == [0.1]
 
 
-@pytest.mark.slow
 def test_time_step_and_statistics(here, lidar_mi):
     code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", *OPTIONS)
     assert code == 0 and "dt 0.1 s, by the headers" in words_of(out)

@@ -76,7 +76,6 @@ def test_bad_input_is_one_line(folder, arguments, message):
     assert done.stderr.count("\n") <= 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "elevation", "code", "message"),
     [

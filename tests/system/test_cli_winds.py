@@ -22,7 +22,6 @@ def scan(tmp_path):
     return path
 
 
-@pytest.mark.slow
 def test_winds_of_a_scan(scan, tmp_path):
     done = in_process("winds", scan, "--noise", "0.02 m/s", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -76,7 +75,6 @@ def test_bad_input_is_one_line(scan, tmp_path, arguments, message):
     assert done.stderr.count("\n") == 1 and not (tmp_path / "winds.nc").exists()
 
 
-@pytest.mark.slow
 def test_many_profiles_are_drawn_as_maps():
     one = made.lines()
     data = xr.Dataset(

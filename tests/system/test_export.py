@@ -223,7 +223,6 @@ def test_matlab_has_arrays_units_and_reasons(folder):
     assert list(found["flag_meanings"]["flag"]) == ["rim", "faint", "outlier"]
 
 
-@pytest.mark.slow
 def test_export_refuses_in_one_line(folder, tmp_path, monkeypatch, lidar_mi):
     monkeypatch.chdir(tmp_path)
     for args, words in (

@@ -311,7 +311,6 @@ def test_a_stopped_run_resumes_with_its_images(tmp_path, quick):
     assert "using 2 of 3 ring images" in (tmp_path / "run" / "log.txt").read_text()
 
 
-@pytest.mark.slow
 def test_images_that_the_fit_refuses_are_counted_and_it_says_why(tmp_path, quick):
     retrieval = QUICK["retrieval"] | {"images": 2, "max_chi_square": 1}
     metrics = run(check(**QUICK | {"retrieval": retrieval}), tmp_path).metrics
@@ -333,7 +332,6 @@ def test_another_experiment_is_refused_or_replaces(tmp_path, quick):
     assert all(time > before[name] for name, time in written(tmp_path).items())
 
 
-@pytest.mark.slow
 def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
     leave_out_figures(monkeypatch)
     both = config.check(

@@ -44,7 +44,6 @@ DESCRIBING = {"numpy", "scipy"}
 """Loaded by an experiment file."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [("--help",), ("run", "--help"), ("check", "--help")])
 def test_help(arguments):
     found = modules_of_command(*arguments) & (COMPUTING | READING | DESCRIBING)
@@ -93,7 +92,6 @@ def test_keys(tmp_path, arguments, rare):
     assert not loaded & (COMPUTING | READING - rare) and "pydantic" in loaded
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", ["spheroids", "molecules"])
 def test_info_of_a_scatterer(what):
     loaded = modules_of_command("info", what)
@@ -109,7 +107,6 @@ def test_info_of_an_image(tmp_path):
     assert not modules_of_command("info", tmp_path / "a.exr") & (COMPUTING | READING)
 
 
-@pytest.mark.slow
 def test_info_of_a_run_folder(tmp_path):
     (tmp_path / "experiment.yaml").write_text("experiment: {name: a, seed: 3}\nversions: {}\n")
     (tmp_path / "metrics.json").write_text(json.dumps({"backscatter.mc_relative_error": 0.1}))

@@ -41,7 +41,6 @@ def another_process(folder):
         process.stdin.close()
 
 
-@pytest.mark.slow
 def test_a_second_run_is_refused_while_the_first_works(tmp_path, quick):
     """The second has another seed; it comes when the first renders, and changes nothing."""
     folder, refused = tmp_path / "run", []
@@ -129,7 +128,6 @@ def test_metrics_of_another_run_are_not_shown(tmp_path, quick, lidar_mi):
     assert code == 2 and "metrics.json: was changed or copied here" in err
 
 
-@pytest.mark.slow
 def test_results_without_images_are_not_replaced_by_default(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)

@@ -110,7 +110,6 @@ def test_report_is_self_contained(demo):
     assert "url(" not in page and "@import" not in page
 
 
-@pytest.mark.slow
 def test_report_contains_the_numbers(demo):
     words = " ".join(Links((demo.folder / "report.html").read_text()).words)
     assert "wake_backscatter" in words and "seed: 1" in words

@@ -398,7 +398,6 @@ def test_an_error_common_to_all_lines_is_stated_apart():
     assert float(alone["u_systematic"].median()) == pytest.approx(0.5, rel=0.1)
 
 
-@pytest.mark.slow
 def test_the_fraction_of_noise_is_between_those_of_draws_and_of_the_lines():
     """Mean square error less that without noise, over 8 draws: no less than the variance of u over
     the draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than

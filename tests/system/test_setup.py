@@ -168,7 +168,6 @@ def test_an_interrupted_installation_is_made_anew(machine):
     assert not (machine.project / ".venv" / ".installing").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["empty", "no interpreter", "dangling link"])
 def test_a_broken_environment_is_made_anew(machine, damage):
     venv = machine.project / ".venv"
@@ -198,7 +197,6 @@ def test_without_network_it_reports_this_and_can_be_repeated(machine):
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gpu", "answers", "given", "asked"),
     [

@@ -108,7 +108,6 @@ def test_faults_name_the_variant(file, variants, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
     leave_out_figures(monkeypatch)

@@ -114,7 +114,6 @@ def test_lines_of_sight_within_their_stated_errors(whole):
     assert np.ptp(lines["time"].values) == pytest.approx(0.09 * 14 / 15, rel=0.1)
 
 
-@pytest.mark.slow
 def test_files_have_the_time_of_every_beam(whole):
     for number, reference in ((1, 0.0), (2, DT)):
         scan = lm.read_scan(whole[0] / f"image_t{number}.exr")

@@ -50,7 +50,6 @@ def test_values_that_are_not_known_do_not_count():
     assert coverage._mean_and_error(values) == (3.0, 0.0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [pytest.param(0.05, marks=pytest.mark.slow), 0.3])
 def test_replaced_fraction_is_the_uncorrelated_variance(fraction):
     moved = coverage.replaced_texture(0.0, 1, noise=0.0)
@@ -74,7 +73,6 @@ def test_gain_gradient_and_pattern():
     assert float((pattern[0] / plain[0]).std()) == pytest.approx(0.05, rel=0.1)
 
 
-@pytest.mark.slow
 def test_true_second_state_is_another_one():
     advected = coverage.shipped_wake("advect", 0.1, 1)
     true = coverage.shipped_wake("40.1 s", 0.1, 1)

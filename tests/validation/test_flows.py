@@ -64,7 +64,6 @@ SPECTRA = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SPECTRA)
 def test_spectrum_along_a_line(name):
     """Six realisations, bands of 8 wave numbers, 4.5 standard errors from their scatter."""

@@ -100,7 +100,6 @@ def disc(radius, x, y, number=400):
     return x + a[within], y + b[within]
 
 
-@pytest.mark.slow
 def test_defocus_is_the_mean_of_shifted_frames():
     """Over the disc of the given diameter; next to the edges too, where the margin shows."""
     instrument = Instrument(shape=(120, 150), pixel=22e-6, centre=(40.0, 30.0))

@@ -29,7 +29,6 @@ def test_bound_is_that_of_the_model():
     assert ratio == pytest.approx(math.sqrt(EMCCD.excess), rel=0.02)
 
 
-@pytest.mark.slow
 def test_errors_at_one_size():
     least = resolution.bound(10, pixel_noise(CCD))
     found = resolution.fitted(10, CCD, 24, 1)

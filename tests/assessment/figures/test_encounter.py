@@ -47,7 +47,6 @@ def test_loads_of_the_air_are_drawn(tmp_path):
     assert imread(drawn[-1].path).std() > 0.05
 
 
-@pytest.mark.slow
 def test_loads_of_an_aircraft_that_rises_are_drawn(tmp_path):
     alone = made_up_flights().series.sel(flight=["off"])
     changed = {

@@ -256,7 +256,6 @@ def advected(move, columns=81, rows=61):
     return [field(texture(WAVES, *at)) for at in (grid, move(*grid))]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", pytest.param("multipass", marks=pytest.mark.slow)])
 def test_noise_alone_has_all_of_it(method):
     """An even wind of a whole pixel, 10 % white noise: without the noise hardly anything is
@@ -280,7 +279,6 @@ def test_noise_alone_has_all_of_it(method):
     assert budget["beam_blur.fraction"] == pytest.approx(0, abs=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", pytest.param("multipass", marks=pytest.mark.slow)])
 def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
     """Noise taken away as it fell, or drawn anew six times: its fraction of the error is the same.

@@ -97,7 +97,6 @@ def test_pure_noise_is_undetermined(seed):
     assert "of the variance of a point" in found.reason and np.isnan(found.first).all()
 
 
-@pytest.mark.slow
 def test_members_tell_luck_from_the_knobs():
     names, values, _ = sample(sobol_g(G_3), 3, seed=31, points=128)
     rng = np.random.default_rng(32)

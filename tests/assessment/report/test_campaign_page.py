@@ -114,7 +114,6 @@ def test_members_alone_are_shown_one_by_one():
     assert {link for link, _ in links(html)} == {f"points/aa/{k}/" for k in range(4)}
 
 
-@pytest.mark.slow
 def test_a_sample_has_indices_and_a_front():
     n = 64
     unit = (np.arange(n) + 0.5) / n
@@ -132,7 +131,6 @@ def test_a_sample_has_indices_and_a_front():
     assert "63 of 63 points (orange)" in html
 
 
-@pytest.mark.slow
 def test_a_sample_shows_where_requirements_are_met_over_the_knobs_that_decide():
     n = 64
     unit = (np.arange(n) + 0.5) / n

@@ -221,7 +221,6 @@ def test_correlation_in_time(evolution):
 # --- a known aircraft -----------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_plunge_of_a_small_aircraft():
     """A point mass with lift: its acceleration is the integral of the standard's spectrum |H|^2.
 

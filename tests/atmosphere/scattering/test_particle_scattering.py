@@ -97,7 +97,6 @@ def test_table_of_one_sphere_against_miepython(scatrs, radius, m):
     np.testing.assert_allclose(got, expected, rtol=0, atol=2e-5 * got[0].max())
 
 
-@pytest.mark.slow
 def test_water_cloud(scatrs):
     """Lidar ratio 18.8 +- 0.8 sr at 905 nm (O'Connor, Illingworth & Hogan 2004, J. Atmos. Oceanic
     Technol. 21, 777); extinction of C.1 twice its geometric cross-section, a few per cent more."""

@@ -30,7 +30,6 @@ PAIR = PairAlongPath(
 )
 
 
-@pytest.mark.slow
 def test_without_waves_it_is_the_pair():
     """Within 1 % of the largest swirl: the table's error."""
     wake, random = FilamentsAlongPath(PAIR, 0.0), np.random.default_rng(1)
@@ -57,7 +56,6 @@ def test_vortices_are_where_the_lines_cross_the_plane():
             assert vortex.circulation == pytest.approx(side * 400 * math.exp(-25 / 60))
 
 
-@pytest.mark.slow
 def test_swirl_about_a_vortex_of_the_plane():
     """At the core radius about each crossing, both sides, it is that of the vortex: within 3 %.
 

@@ -136,7 +136,6 @@ def test_linking():
     assert age == pytest.approx(2 * np.pi * B**2 / 400 / 0.83 * math.log(amplitude / 2))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("amplitude", "model"),
     [

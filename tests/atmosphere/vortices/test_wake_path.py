@@ -146,7 +146,6 @@ def curved_lines(place, amplitude, wavelength):
     return total
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("amplitude", "largest"), [(2.0, 0.05), (5.0, 0.12), (10.0, 0.22)])
 def test_deformation_against_curved_lines(amplitude, largest):
     """Anywhere along the wave: 6 % of the change by the deformation at most.

@@ -126,7 +126,6 @@ def test_vortices_count_once(wake):
     assert error < 0.15 * strength
 
 
-@pytest.mark.slow
 def test_turbulence_about_a_wake_is_known(wake):
     """The track alone does not know it."""
     lidar = WithVectors(wake, turbulent(1.0, 100.0, 8))
@@ -156,7 +155,6 @@ def test_a_lost_track_fades(wake):
     assert np.abs(alone[:6]).min() > 0.2
 
 
-@pytest.mark.slow
 def test_missing_slabs_cost_accuracy_alone(wake):
     other = turbulent(1.5, 200.0, 4)
     errors = {}

@@ -348,7 +348,6 @@ def test_predicted_variances_with_losses_agree_with_flights(block, samples, run,
     np.testing.assert_allclose(found, predicted, rtol=0.1)
 
 
-@pytest.mark.slow
 def test_a_few_lost_estimates_raise_the_load_much(block):
     """The residual without losses is small: 3 % in runs of 3 add half of its variance.
 

@@ -51,7 +51,6 @@ def test_a_backlog_is_kept_and_slabs_are_skipped():
     assert cores.wind < 0  # the other core did nothing
 
 
-@pytest.mark.slow
 def test_measured_time_is_charged(monkeypatch):
     """Fits of 0.14 s on a computer of half the speed: 0.28 s each, most slabs are skipped."""
     lidar = lm.VirtualLidar(small_encounter(control={"computing_factor": 2}))

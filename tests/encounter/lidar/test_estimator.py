@@ -20,7 +20,6 @@ def images():
     return vortex_pair_images(0.03, seed=4)
 
 
-@pytest.mark.slow
 def test_vortices_from_nothing_and_from_the_last_fit(images):
     estimator = Estimator(load_experiment("wake_sensor"), vectors=False)
     wind, cold, seconds, *_ = estimator.pair_of(images.first, images.second, DT, 0.03)

@@ -28,7 +28,6 @@ def recorded():
     return scans, slabs
 
 
-@pytest.mark.slow
 def test_errors_are_as_stated(recorded):
     """72 lines of six slabs: the variance of normalised errors is known to 17 %."""
     scans, slabs = recorded
@@ -56,7 +55,6 @@ def test_frames_that_do_not_follow_are_fitted_alone_or_have_no_speed(recorded):
     np.testing.assert_allclose(found["v_los"][2:], before["v_los"][2:])
 
 
-@pytest.mark.slow
 def test_a_slab_without_rings_has_no_speeds(recorded):
     scans, slabs = recorded
     speeds = LineSpeeds(scans)

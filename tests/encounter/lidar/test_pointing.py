@@ -41,7 +41,6 @@ def test_a_nose_that_is_higher_than_told_sees_the_wake_lower():
         assert found[mean] == pytest.approx(75 * angle, abs=error[mean])
 
 
-@pytest.mark.slow
 def test_a_roll_turns_the_pair():
     """Vortices 24 m apart: the port wing higher than told, and the port vortex seems lower."""
     angle = 200e-3
@@ -50,7 +49,6 @@ def test_a_roll_turns_the_pair():
     assert found[3] - found[7] == pytest.approx(-24 * angle, abs=spread) and spread < 2
 
 
-@pytest.mark.slow
 def test_change_from_scan_to_scan_feigns_a_wind():
     """5 mrad/s from the first scan on: the nearer gate is 144 m x 0.5 mrad lower after 0.1 s."""
     found, error = departure(drift={"pitch": "5 mrad/s"})

@@ -38,7 +38,6 @@ def same(first, second):
     )
 
 
-@pytest.mark.slow
 def test_first_scan_has_no_estimate(flight):
     (first, second, *_), images, _ = flight
     assert first.flags == (NO_EARLIER_SCAN,) and first.wind is None and first.pair is None
@@ -69,7 +68,6 @@ def test_vortices_within_stated_errors(flight):
     assert sum(chi2) < 10 * len(chi2) + 4 * np.sqrt(20 * len(chi2))
 
 
-@pytest.mark.slow
 def test_samples_are_chosen_once_for_all_scans():
     """By the nominal pose, whatever the first one is; a larger fraction takes fewer."""
     settings = {"samples_per_beam": "auto"}

@@ -149,7 +149,6 @@ def test_vortices_come_back_from_the_lines():
     assert (found["circulation_5_15_true"].values[0] < 0).tolist() == [True, False]
 
 
-@pytest.mark.slow
 def test_winds_come_back_from_the_lines():
     scan = {"kind": "ppi", "rate": "30 deg/s", "accumulation": "0.5 s", "count": 2}
     scan |= {"repeat": "20 s"}

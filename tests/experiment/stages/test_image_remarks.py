@@ -131,7 +131,6 @@ def test_check_ends_with_the_warnings():
     assert title == "warned: warnings" and "overlap" in rows[0][0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("molecules", [0, "auto"])
 def test_light_and_noise_are_those_of_the_rendered_image(molecules):
     """The first order's median, to the spread of air in the median pixels (3 %)."""

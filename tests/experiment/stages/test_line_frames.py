@@ -61,7 +61,6 @@ def test_lines_share_frames_of_the_laser():
     assert own == [0, 0, 1] and len(laser) == 2 and not torch.equal(*laser)
 
 
-@pytest.mark.slow
 def test_streams_are_those_of_a_line_and_a_scan():
     first, again, other = (recorded(scan=scan)[0] for scan in (0, 0, 1))
     alone = recorded(lines=(1,))[0]

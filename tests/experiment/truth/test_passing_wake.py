@@ -44,7 +44,6 @@ def test_frames_of_lidar_and_flight():
     assert float(up[0]) == 0
 
 
-@pytest.mark.slow
 def test_a_plane_of_a_simulation_drifts_and_sinks():
     given = experiment(PLANE, passage={"height": "110 m"}, air={"wind": ["0 m/s", "2 m/s"]})
     air = call(passing_air, given)

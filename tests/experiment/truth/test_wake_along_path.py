@@ -78,7 +78,6 @@ def crow_file(tmp_path_factory):
     return path
 
 
-@pytest.mark.slow
 def test_a_volume_is_repeated_and_its_vortices_are_found(crow_file):
     """Against the analytic pair: places to 0.1 m, circulation to 2 %, descent to 3 %."""
     wake = wake_along_path(from_file(crow_file))
@@ -147,7 +146,6 @@ def test_what_is_not_known_along_the_axis_is_refused(crow_file, tmp_path):
         wake_along_path(from_file(calm))
 
 
-@pytest.mark.slow
 def test_a_part_of_a_wave_is_closed_and_described(tmp_path):
     """The vortices of both vortices' planes are the file's, then those of its mirror image."""
     part = tmp_path / "part.nc"

@@ -27,7 +27,6 @@ def test_noise_is_as_stated_and_shared_by_gates_that_overlap():
         assert found == pytest.approx(expected, abs=4 * np.sqrt(2 / 2000))
 
 
-@pytest.mark.slow
 def test_the_wind_of_a_simulated_scan_comes_back():
     """Within its errors, and to centimetres per second."""
     scan = ppi_scan(np.deg2rad(60), (0.0, 2 * np.pi), np.deg2rad(15), 2.0)

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.flags import CombinedFlag, flag_attributes
+from lidar_mi.flags import REJECTED, CombinedFlag, flag_attributes
 from lidar_mi.retrieval.along_path.vectors import counting, slab_vectors
 from lidar_mi.retrieval.common_error import with_common_error
 
@@ -22,7 +22,7 @@ def wind(spacing=4.0, **attributes):
     fields = {"v": values, "w": -values, "v_stderr": 0.3 + 0 * values, "w_stderr": 0.4 + 0 * values}
     fields["vw_correlation"] = 0 * values
     data = {name: (("z", "y"), a) for name, a in fields.items()}
-    data["flag"] = (("z", "y"), np.zeros(shape, np.uint16), flag_attributes(CombinedFlag))
+    data["flag"] = (("z", "y"), np.zeros(shape, np.uint16), flag_attributes(CombinedFlag, REJECTED))
     return xr.Dataset(data, {"z": z, "y": y}, attributes or {"template": 8, "stride": 4})
 
 

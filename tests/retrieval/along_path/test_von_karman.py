@@ -35,7 +35,6 @@ def test_correlations_are_the_published_ones(length):
     assert covariance("w", 0.0, 0.0, 0.0, length) == pytest.approx(1, abs=2e-3)
 
 
-@pytest.mark.slow
 def test_means_are_those_of_points():
     """Against the mean over pairs of points, drawn from both Gaussians."""
     length, width, swept = 40.0, 4.0, 2.0

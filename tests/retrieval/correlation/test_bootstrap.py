@@ -51,7 +51,6 @@ def test_standard_errors_in_a_uniform_wind(method):
         assert ratio == pytest.approx(1, abs=0.25)
 
 
-@pytest.mark.slow
 def test_differences_between_vectors_that_are_errors_are_not_shear():
     """In a uniform wind they were taken for it: errors were stated 20 % too large.
 
@@ -103,7 +102,6 @@ def test_a_map_of_little_noise_does_not_spread_the_errors_by_other_causes():
     assert abs(ratio - 1).max() < 0.15
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "case"),
     [
@@ -167,7 +165,6 @@ def test_vectors_whose_candidates_are_confused_are_flagged():
     assert (wind["flag"] == 0).mean() < 0.05
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", "multipass"])
 @pytest.mark.parametrize(("rows", "columns"), [(16, 16), (16, 40), (24, 24)])
 def test_few_windows(method, rows, columns):

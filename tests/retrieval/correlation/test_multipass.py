@@ -37,7 +37,6 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "everywhere", "beyond"),
     [

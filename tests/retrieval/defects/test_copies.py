@@ -129,7 +129,6 @@ def test_wind_is_that_of_the_air(fraction):
     assert "at rest" in wind.attrs["copy_at_rest"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["multipass", "cc"])
 def test_windows_give_the_wind_of_the_air(method):
     """With 20 % of image 1 in image 2 they were 20 % too slow, stated 3 % and 10 %."""

@@ -109,7 +109,6 @@ def test_standard_errors_hold_with_a_pattern():
     assert np.mean(score**2) < 1.7
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pattern", "method"),
     [pytest.param(0.1, "variational", marks=pytest.mark.slow), (0.05, "vortex_fit")],

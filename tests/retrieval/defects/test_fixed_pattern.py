@@ -98,7 +98,6 @@ def test_clean_images_have_no_pattern(length, noise):
         assert not str(pattern(pair(seed, length, noise, mean=mean)[0]))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["columns", "rows", "pixels"])
 @pytest.mark.parametrize("size", [0.05, slow(0.1)])
 def test_gains_are_detected_by_their_size(kind, size):
@@ -144,7 +143,6 @@ def test_gains_of_columns_and_rows_are_removed(method):
         assert rms(ratio) < 1.5 * max(1.0, rms(least))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mean", [(0.0, 12.0), (1.0, 1.0)])
 def test_gains_that_the_motion_does_not_determine_are_flagged(mean):
     """Air that hardly moves across columns: valid vectors were off by 3 standard errors."""
@@ -161,7 +159,6 @@ def test_gains_of_pixels_that_spoil_winds_are_flagged():
     assert "pixels" in wind.attrs["fixed_pattern"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["smooth", slow("straight edges"), slow("round edge")])
 def test_vignetting_is_no_pattern(kind):
     """Brightness that falls to the rim, the same in all images."""
@@ -200,7 +197,6 @@ def test_stripes_that_move_are_no_pattern():
     assert not found.columns and not found.rows
 
 
-@pytest.mark.slow
 def test_images_of_counts_and_holes():
     """Whole numbers, and a corner without values: the pattern is found as in others."""
     images, _ = pair(198)

@@ -38,7 +38,6 @@ def test_moving_air_is_lit_evenly(seed):
         assert described(found(image1, image2)) == ""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ["advected, texture 0 %", "stored state at t2, texture 5 %"])
 def test_turning_smoke_is_lit_evenly(case):
     image1, image2, _, _ = CASES[case](5)

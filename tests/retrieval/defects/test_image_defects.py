@@ -58,7 +58,6 @@ def test_hot_pixels_do_not_hold_the_air(counts, fraction, noise, method):
         assert np.median(stated) < 1.5 * np.median(clean[f"{name}_stderr"].values)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (0.05, 0.1), (0.3, -0.4), (2.2, -1.4)])
 def test_air_is_no_defect_however_slow(seed, moved):

@@ -53,7 +53,6 @@ def ratio(wind, off, good):
     return np.sqrt(np.mean((off / wind.v_stderr.values)[good] ** 2))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("length", "noise"), [(1.8, 0.0), pytest.param(2.6, 0.05, marks=pytest.mark.slow), (5.0, 0.02)]
 )
@@ -64,7 +63,6 @@ def test_nothing_is_at_rest_in_moving_air(length, noise):
         assert not bool(found.structure.any()) and not bool(found.saturated.any())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 5])
 def test_dense_particles_are_not_at_rest(seed):
     """Some lie where another one was: by chance, and where shear hides their motion."""
@@ -137,7 +135,6 @@ def test_an_area_that_saturates_in_one_image_alone():
     assert ratio(wind, errors(wind, v), good) < 1.5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "ws", "variational")] + ["multipass"],
@@ -258,7 +255,6 @@ def test_saturated_voxels():
     assert not bool(((wind.flag & Flag.NON_FINITE_INPUT.value) > 0).any())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mean", [(-9.0, 5.0), (2.0, -3.0)])
 @pytest.mark.parametrize("thin", ["mast", "border"])
 def test_thin_structure_is_found_as_a_whole(thin, mean):

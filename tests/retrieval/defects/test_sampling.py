@@ -54,7 +54,6 @@ def wind(images, method="variational"):
     return good.mean(), (np.abs(error) > 4 * stated).any(0).mean() if good.any() else 0.0, error, x
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("levels", [None, 300, 30, 8])
 def test_independent_samples_have_no_structure(levels):
     """60 pairs, of whole numbers as well: at the rate of false alarms of each test, none."""

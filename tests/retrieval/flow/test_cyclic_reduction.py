@@ -56,7 +56,6 @@ def positive_form(cells, seed):
 
 
 # 4 to 27 knots: 2 to 9 blocks, whole and not, even and odd in every round
-@pytest.mark.slow
 @pytest.mark.parametrize("cells", [1, 2, 3, 4, 6, 7, 10, 13, 17, 24])
 def test_solution_and_inverse_are_those_of_the_dense_matrix(cells):
     band, dense = positive_form(cells, cells)
@@ -79,7 +78,6 @@ def test_solution_and_inverse_are_those_of_the_dense_matrix(cells):
     torch.testing.assert_close(covariance, cholesky(band).covariance() * (covariance != 0))
 
 
-@pytest.mark.slow
 def test_one_answer_is_waited_for():
     band, _ = positive_form(17, 3)
     right = torch.ones(2, *(band.shape[k] for k in (3, 5)), dtype=torch.float64)
@@ -138,7 +136,6 @@ def test_a_form_that_is_not_positive_has_no_factor():
         cyclic_reduction.factored(torch.stack([band, -band]))
 
 
-@pytest.mark.slow
 def test_winds_are_those_of_lapack(monkeypatch):
     """The flow, its errors and the next flow by either factor, to 1e-3 of a standard error."""
     images = moving_texture()

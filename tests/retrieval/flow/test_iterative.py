@@ -4,7 +4,6 @@ Detects a transpose that is not one, a system that is not solved, draws of anoth
 """
 
 import numpy as np
-import pytest
 import torch
 
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, halves
@@ -108,7 +107,6 @@ def test_draws_have_the_posterior_covariance():
     torch.testing.assert_close(found.mean((2, 3, 4)), mean, rtol=0.15, atol=0.1 * float(mean.max()))
 
 
-@pytest.mark.slow
 def test_the_same_draws_in_every_run():
     linear, mesh, prior = case()
     start = torch.zeros(3, *(a.knots for a in mesh.axes)).double()

@@ -120,7 +120,6 @@ def test_the_next_slabs_are_as_accurate_as_from_nothing(slabs, learnt):
         assert abs(covered - cold) < 0.06
 
 
-@pytest.mark.slow
 def test_a_flow_that_has_moved(slabs, learnt):
     """Structure 3 px further: the flow there is that from before, and so are weights and prior."""
     still = torch.zeros(2, 90, 130, dtype=torch.float64)

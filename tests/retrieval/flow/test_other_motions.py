@@ -5,7 +5,6 @@ that are lost by the test of it.
 """
 
 import numpy as np
-import pytest
 import torch
 
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
@@ -64,7 +63,6 @@ def found(stack, displacement):
     return better_elsewhere(images, linear, d.expand(2, *WINDOWS.count), WINDOWS)
 
 
-@pytest.mark.slow
 def test_a_lattice_that_is_a_period_off_is_flagged():
     """At its own motion only places around which no dot is missing, whose motion nothing tells.
 

@@ -65,7 +65,6 @@ def test_vortices_are_found_within_their_errors(family, options):
     assert np.median(relative) < 0.08
 
 
-@pytest.mark.slow
 def test_without_stated_noise_it_is_estimated():
     one = drawn(PAIR, 31)
     unknown = lm.fit_vortices_to_lines(one.lines.drop_vars("radial_velocity_stderr"))
@@ -169,7 +168,6 @@ def test_track_is_better_than_its_fits():
     assert np.square(normal).mean() < 3
 
 
-@pytest.mark.slow
 def test_track_goes_on_where_a_scan_shows_nothing():
     one = drawn(replace(PAIR, sigma=0.2, heights=(70.0, 100.0)), 3, slices(2, 11, count=4))
     lines = one.lines.copy(deep=True)

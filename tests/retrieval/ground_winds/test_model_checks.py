@@ -115,7 +115,6 @@ def test_few_lines_that_may_fold_are_flagged():
     assert float(abs(found["u"] - 5).where(found["flag"] == 0).max()) < 1
 
 
-@pytest.mark.slow
 def test_a_tilt_that_is_not_applied_is_in_the_error_of_w():
     """Lidars tilted by 0.5 and 3 degrees about any axis: variance of normalised errors.
 

@@ -45,7 +45,6 @@ def test_the_integral_scale_along_the_wind_is_the_length():
     assert scipy.integrate.simpson(along, r) == pytest.approx(LENGTH, rel=2e-3)
 
 
-@pytest.mark.slow
 def test_covariances_of_lines_and_of_an_average_are_those_of_realisations():
     random = np.random.default_rng(3)
     places = 80 * random.standard_normal((5, 3))

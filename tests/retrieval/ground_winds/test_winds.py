@@ -186,7 +186,6 @@ def test_profiles_of_scans_and_of_intervals():
     assert lm.fit_winds_to_lines(both, interval=300.0).sizes["time"] == 2
 
 
-@pytest.mark.slow
 def test_many_cycles_of_beams_are_one_profile():
     """Ten minutes of a DBS: averages are of beams of one direction, not of successive ones."""
     azimuth = np.tile([0, 90, 180, 270], 40)

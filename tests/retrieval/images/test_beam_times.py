@@ -86,7 +86,6 @@ def test_a_serpentine_is_averaged_over_the_template():
     np.testing.assert_allclose(found.middle - smooth, 0, atol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["cc", "ws", "multipass"])
 def test_times_of_zero_change_nothing(method):
     images, _ = uniform_wind("photograph", 4.0, 3.0, (50, 40))

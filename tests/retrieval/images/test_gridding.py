@@ -69,7 +69,6 @@ def test_linear_fields_and_times_are_exact():
     )
 
 
-@pytest.mark.slow
 def test_noise_follows_the_weights():
     """Of 200 draws of white noise: 4 sigma in the mean variance over the image."""
     places, sigma = scattered(0.3), 0.1 + 0.05 * np.abs(np.sin(NODES[0]))
@@ -87,7 +86,6 @@ def test_noise_follows_the_weights():
     assert 0.6 < float(half["Y_noise_std"].mean()) < 0.8
 
 
-@pytest.mark.slow
 def test_beams_on_their_nodes_do_not_change():
     """Bit by bit, in single precision, whatever the neighbours do."""
     random = np.random.default_rng(4)
@@ -107,7 +105,6 @@ def test_beams_on_their_nodes_do_not_change():
     )
 
 
-@pytest.mark.slow
 def test_film_order_does_not_matter():
     """The same beams in another order, as those of a curve."""
     places = scattered(0.2)
@@ -118,7 +115,6 @@ def test_film_order_does_not_matter():
     np.testing.assert_allclose(one["Y"], other["Y"], atol=1e-9)
 
 
-@pytest.mark.slow
 def test_no_value_beyond_the_beams():
     places = NODES + np.reshape([2.2 * SPACING, 0.0], (2, 1, 1))
     found = on_nodes(scan(places, texture(WAVES, *places)))["Y"]

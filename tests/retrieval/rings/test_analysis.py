@@ -121,7 +121,6 @@ def test_laboratory_images():
     assert split.misfit < 0.01 and not single.misfit > 0.01
 
 
-@pytest.mark.slow
 def test_given_centre_stays():
     image = split_rings((500, 640), (300.3, 262.8), 20000.0, (0.5,))
     found = analyse_rings(image, (300.3, 262.8))

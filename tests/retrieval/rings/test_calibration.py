@@ -212,7 +212,6 @@ def test_one_ring():
     refused(laser_frames(3, 12, Defects(), 5e5, small), "ring", model=model)
 
 
-@pytest.mark.slow
 def test_wrong_focal_length():
     """By 30 %: the nominal instrument is another one."""
     refused(laser_frames(2, 13, replace(DEFECTS, focal_length=1.3)), "check focal length")

@@ -113,7 +113,6 @@ def test_lines_of_one_height_are_not_told_apart():
     assert abs(found.gap - GAP) < 4 * found.gap_std
 
 
-@pytest.mark.slow
 def test_refused():
     lines = ARGON, THORIUM
     e = fractions(GAP, lines)

@@ -66,7 +66,6 @@ def bound_of(case, v_los=20.0, **size):
     return cramer_rao(ring_model(**size), photons, noise, v_los=v_los, centre=centre)["v_los"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [
@@ -281,7 +280,6 @@ def test_outliers_are_left_out_and_counted():
     assert abs(float(fit.v_los.mean()) - 20) < 4 * float(fit.v_los_std.mean()) / np.sqrt(8)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size, level", [(6, 20000.0), (10, 1500.0), (16, 5000.0)])
 def test_bright_patches_are_left_out(size, level):
     """A reflection that keeps the fit from converging: without it the speed is as before."""

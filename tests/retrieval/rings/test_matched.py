@@ -36,7 +36,6 @@ def score():
     return matched_score(fit_rings(frames(60.0, 8, 1), MODEL, NOISE), MODEL, NOISE)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("v_los", "light"), [(60.0, 1.0), (40.0, 0.85), (75.0, 1.15)])
 def test_is_as_accurate_as_a_fit_of_every_image(score, v_los, light):
     """64 images: std known to 9 %, mean to 12 % of it; each within 4 sigma."""

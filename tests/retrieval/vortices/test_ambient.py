@@ -163,7 +163,6 @@ def test_a_gradient_is_no_circulation(gradient):
     assert found.covariance[0, 0] ** 0.5 < 15
 
 
-@pytest.mark.slow
 def test_a_pair_within_the_pair_is_refused():
     found = fit_vortices_to_wind(vectors(2, inner=120.0))
     assert any("more than two vortices" in reason for reason in found.reasons)

@@ -24,7 +24,6 @@ def images():
     return drifting_pair_images(uneven(), (1.0, -0.5), 0.03, seed=3, **SMALL)
 
 
-@pytest.mark.slow
 def test_the_same_fit_as_by_a_search(images):
     found = detected_fit(images.first, images.second, DT, 0.03)
     searched = fit_vortices(images.first, images.second, DT, 0.03)

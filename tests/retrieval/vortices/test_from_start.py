@@ -37,7 +37,6 @@ def cold(images):
     return fit_vortices(images.first, images.second, DT, 0.03)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 2.5])
 def test_the_same_fit_as_by_a_search(images, cold, sigma):
     off = np.random.default_rng(2).choice([-1.0, 1.0], 10) * sigma * EXPECTED
@@ -53,7 +52,6 @@ def test_the_same_fit_as_by_a_search(images, cold, sigma):
     assert (np.abs(found.parameters - truth) < 4 * stderr).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("metres", [3.0, 8.0])
 def test_a_wrong_start_is_found_out(images, cold, metres):
     wrong = cold.parameters + metres * np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0])
@@ -63,7 +61,6 @@ def test_a_wrong_start_is_found_out(images, cold, metres):
     np.testing.assert_allclose(found.parameters, cold.parameters, rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_a_fit_that_is_started_with_the_first_image(images, cold):
     """The same as with both at once; pixels of the second image alone may be unknown."""
     start, noise = expected(cold, cold.parameters + 0.3 * EXPECTED), 0 * images.first + 0.03

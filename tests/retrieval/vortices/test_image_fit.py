@@ -132,7 +132,6 @@ def changed_pair(seed, fraction, gradient=0.0):
     return pair.first, second * (1 + gradient * pair.first["y"] / float(pair.first["y"].max()))
 
 
-@pytest.mark.slow
 def test_air_that_changes_and_light_that_varies():
     """10 % of the texture is replaced, image 2 is brighter to one side: found, within errors.
 
@@ -178,7 +177,6 @@ def test_unlike_images_hold_no_pair():
         assert not fit_vortices(*changed_pair(seed, 1.0), DT).success
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_profile_gain_offset_and_unlike_spacings(profile):
     """A pair advected along by 6 and -3 m/s, on oblong pixels, the second image brighter."""
@@ -354,7 +352,6 @@ def simulated(texture_rms, noise):
     return truth, fit_vortices(*images, DT, noise=level)
 
 
-@pytest.mark.slow
 def test_simulated_wake_with_texture():
     """Circulation to 5 %, places to 0.5 m: 440 and 438 m^2/s, y = +-23.4 m, z = -0.5 m."""
     truth, found = simulated(0.1, 0.01)
@@ -474,7 +471,6 @@ def oblique_images(angle, distance, fraction):
     return images, vector(*wake.vortices(0.0, 0.0))
 
 
-@pytest.mark.slow
 def test_motion_along_oblique_beams():
     """Change of the circulations by half of the motion along x: as by their derivatives, to 30 %.
 

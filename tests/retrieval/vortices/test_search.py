@@ -61,7 +61,6 @@ def test_the_pair_is_detected_whatever_wind_advects_it(angle, mean):
     np.testing.assert_allclose(off, 0, atol=0.6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_starts_are_pairs_in_order_of_misfit(profile):
     """Oppositely rotating, three core radii apart, each better than the next by least squares of
@@ -112,7 +111,6 @@ def test_brightness_is_no_wind():
     np.testing.assert_allclose(start[[0, 4]], [320, -280], rtol=0.15)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("angle", [None, 0.9], ids=["v and w", "one component"])
 def test_blocks_tell_as_much_as_all_that_is_in_them(angle):
     """Winds that are uniform over each block have the same weighted least squares."""

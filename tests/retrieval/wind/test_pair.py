@@ -190,7 +190,6 @@ def test_blob_moved_by_one_and_a_half_metres():
         assert int(at_blob.flag) == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", list(METHODS))
 def test_constant_images_are_flagged_throughout(method):
     y, z = axes(50, 40)
@@ -235,7 +234,6 @@ def test_beyond_the_search_range_no_vector_is_valid():
     assert not (np.abs(dataset.v) > 17.5).any()
 
 
-@pytest.mark.slow
 def test_data_set_is_cf_and_survives_a_file(tmp_path):
     pair = moved(6.0, -3.0)
     for method, score in (("cc", "correlation"), ("ws", "mismatch")):
@@ -341,7 +339,6 @@ def burst(number, noise, seed=7):
         yield data_array(rendered, y, z)
 
 
-@pytest.mark.slow
 def test_more_images_of_a_burst_lower_the_error():
     """N images in uniform wind hold N (N^2 - 1) / 6 times the information of two: 10 for four.
 

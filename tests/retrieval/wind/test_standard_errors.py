@@ -55,7 +55,6 @@ def vectors(step, sigma, seed=7):
     ]
 
 
-@pytest.mark.slow
 def test_the_wind_is_what_the_images_show(pair):
     """Else all that follows tests nothing: the sense of the rotation, 0.05 px."""
     found = lm.retrieve_wind(*pair, DT, windows=lm.WindowSizes(stride=4))
@@ -65,7 +64,6 @@ def test_the_wind_is_what_the_images_show(pair):
         assert float(np.sqrt((error**2).mean())) < 0.05
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [(0.2, 0.2), (0.5, 0.1)])
 def test_stated_errors_are_those_that_were_added(pair, sigma):
     """221 vectors, independent (windows as wide as their step); means of 35 are known to 12 %."""

@@ -44,7 +44,6 @@ def rms(values):
 SHIFT = np.array([0.37, -1.21, 1.74])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(
     "moved",
