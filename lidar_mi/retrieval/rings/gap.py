@@ -86,9 +86,9 @@ class Gap(Tabular):
 
 @checked_arguments
 def gap_from_fractions(
-    fraction: Any,
-    fraction_std: Any,
-    wavelength: Any,
+    fraction: Sequence[float] | np.ndarray,
+    fraction_std: Sequence[float] | np.ndarray,
+    wavelength: Sequence[float] | np.ndarray,
     nominal: float | None = None,
     tolerance: float | None = None,
     refractive_index: float = 1.0,
@@ -131,9 +131,11 @@ def gap_from_fractions(
     >>> f"{1e3 * found.gap:.3f} +- {1e3 * found.gap_std:.3f} mm"
     '0.885 +- 0.001 mm'
     """
+    lines = {"fraction": fraction, "fraction_std": fraction_std, "wavelength": wavelength}
+    for name, values in lines.items():
+        if np.ndim(values) != 1:
+            raise InputError(f"{name}: {np.ndim(values)} dimensions are not allowed; expected one")
     std = np.array(fraction_std, float)
-    if std.ndim != 1:
-        raise InputError(f"fraction_std: {std.ndim} dimensions are not allowed; expected one")
     return gap_of_covariance(
         fraction, np.diag(std**2), wavelength, nominal, tolerance, refractive_index
     )
