@@ -51,8 +51,6 @@ _RATIO_OF_TWO = (2 - 3**0.5) ** 2
 """Median ratio of the eigenvalues of the structure tensor of two independent slopes."""
 _LEAST_DENSITY = 1e-6
 """Of the differences, over their mean: what is less is rounding."""
-_ASKED = 2.71
-"""Twice the logarithm of a ratio of likelihoods that one in twenty absent components exceeds."""
 _LEAST_MOTION = 0.015
 """px: differences that are finer than those of this motion are of interpolation and ringing."""
 
@@ -97,7 +95,6 @@ def differences(
     The amplitudes are the likeliest (`reml.most_likely`): what the fit absorbs is counted, as in
     restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545-554). That of the
     unresolved motion is 1 where the prior's spectrum goes on beyond the splines, and at most.
-    Components that the squares do not ask for are left out (`_asked_for`).
 
     What differs from the sum of the components by place, and by wavenumber, multiplies it: the
     variance of the ratio, less that of its sampling, says how freely (`_shrunk`).
@@ -143,11 +140,10 @@ def differences(
     names = [name for name in kinds if not (name == "noise" and images.noise_known)]
     fields = (found, torch.stack([terms[name] for name in names]), number, known)
     square, means, half, rest = (field[..., use].cpu().numpy() for field in fields)
-    asked = _asked_for(
-        dict(zip(names, means, strict=True)), square, half / _overlap(mesh.dims), rest
-    )
-    amplitudes = {name: asked.get(name, 0.0) for name in kinds}
-    amplitudes["noise"] += told
+    most = np.array([1.0 if name == "unresolved" else np.inf for name in names])
+    _, factors = most_likely(square, means, most, half, rest)
+    amplitudes = {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
+    amplitudes["noise"] = amplitudes.get("noise", 0.0) + told
 
     def total(parts: Mapping[str, torch.Tensor]) -> torch.Tensor:
         return reduce(torch.add, (amplitudes[name] ** 0.5 * parts[name] for name in parts))
@@ -192,33 +188,6 @@ def differences(
     # where the residual is smaller than expected, so is the motion that would make it
     unresolved = unresolved * amplitudes["unresolved"] * local.clamp(max=1.0)
     return Differences(again, unresolved, amplitudes)
-
-
-def _asked_for(
-    terms: Mapping[str, np.ndarray], squares: np.ndarray, half: np.ndarray, held: np.ndarray
-) -> dict[str, float]:
-    """Amplitudes of the components that independent squares ask for; see `reml.most_likely`.
-
-    An amplitude is not negative: of a component that is not there it is above 0 half of the time.
-    Twice the logarithm of the ratio of the likelihoods with and without it is then 0 or chi-square
-    of one degree of freedom, each half of the time (Self & Liang 1987, J. Am. Stat. Assoc. 82,
-    605-610). All but noise are left out below the limit, the least likely one first.
-    """
-
-    def fitted(names: Sequence[str]) -> tuple[float, dict[str, float]]:
-        most = np.array([1.0 if name == "unresolved" else np.inf for name in names])
-        means = np.array([terms[name] for name in names]).reshape(len(names), len(squares))
-        misfit, factors = most_likely(squares, means, most, half, held)
-        return misfit, {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
-
-    misfit, amplitudes = fitted(list(terms))
-    while optional := [name for name in amplitudes if name != "noise"]:
-        without = [fitted([other for other in amplitudes if other != one]) for one in optional]
-        least = min(without, key=lambda found: found[0])
-        if 2 * (least[0] - misfit) > _ASKED:
-            break
-        misfit, amplitudes = least
-    return amplitudes
 
 
 def _spectrum(
@@ -437,11 +406,6 @@ def _flows_left(
     drawn = weights.sqrt() * normal_fields((_DRAWS[mesh.dims], *weights.shape), weights, 5)
     flows = prior.rates_transposed(drawn)
     return (slope * mesh.field(response(flows))).sum(1) * linear.valid
-
-
-def _overlap(dims: int) -> float:
-    """Of the squares, how many neighbouring ones tell as much as an independent one."""
-    return (4 * math.pi) ** (dims / 2)
 
 
 class _Squares:

@@ -27,7 +27,6 @@ from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.flow.likelihood import Linear
 from lidar_mi.retrieval.flow.prior import first_prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
-from lidar_mi.retrieval.reml import most_likely
 from tests.support.flows import origin, plane_waves, texture
 from tests.support.random_flows import random_flow
 
@@ -288,41 +287,6 @@ def test_residuals_have_the_variance_that_leverage_leaves(level):
     error = sum(float(part.var()) / len(part) for part in squares) ** 0.5
     # as many squares as pixels: the mean's own scatter
     assert abs(found - expected) < 3 * error + 0.002 * level**2
-
-
-def test_overlapping_squares_tell_as_much_as_fewer():
-    """Amplitudes of 200 fields of white noise scatter as the likelihood's curvature says, to 25 %.
-
-    Regions at the rim overlap less: the scatter is 14 % smaller.
-    """
-    squares = components._Squares(torch.ones(SHAPE, dtype=torch.bool))
-    random = torch.Generator().manual_seed(1)
-    found = squares(torch.randn(200, *SHAPE, generator=random))
-    half = (1 / components._chance(found[:4])).expand_as(found[0]) / components._overlap(2)
-    term, half = found.mean(0).reshape(1, -1).numpy(), half.reshape(-1).numpy()
-    factors = [
-        most_likely(one.reshape(-1).numpy(), term, np.array([np.inf]), half)[1] for one in found
-    ]
-    assert np.std(factors) == pytest.approx(half.sum() ** -0.5, rel=0.25)
-
-
-@pytest.mark.parametrize("told", [True, False])
-def test_components_are_there_if_the_squares_ask_for_them(told):
-    """Of 200 absent ones 5 % are found, to three standard deviations; none of ten sigma is lost."""
-    random, places, half = np.random.default_rng(1), 400, 4.0
-    white, steep = np.ones(places), np.linspace(0.01, 3, places) ** 4
-    steep /= steep.mean()
-    terms = {"replaced": steep} if told else {"noise": white, "replaced": steep}
-    held = white if told else 0 * white
-
-    def found(true):
-        chance = random.chisquare(2 * half, places) / (2 * half)
-        squares = (white + true * steep) * chance
-        return components._asked_for(terms, squares, np.full(places, half), held)
-
-    absent = [found(0.0).get("replaced", 0.0) > 0 for _ in range(200)]
-    assert np.mean(absent) < 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5
-    assert all(0.2 < found(0.5)["replaced"] < 0.8 for _ in range(50))
 
 
 def test_ratios_that_scatter_by_chance_are_those_of_one():
