@@ -129,7 +129,9 @@ def flag_attributes(flags: type[enum.IntFlag], text: str) -> dict[str, Any]:
 
 
 def masks_of(attributes: Mapping[Any, Any]) -> dict[str, int]:
-    """The bit of each meaning, from the CF attributes of a flag variable; empty without any."""
+    """The bit of each meaning, from the CF attributes of a flag variable; empty without bits."""
+    if "flag_masks" not in attributes:
+        return {}
     names = str(attributes.get("flag_meanings", "")).split()
-    masks = map(int, np.ravel(attributes.get("flag_masks", [])))
+    masks = map(int, np.ravel(attributes["flag_masks"]))
     return dict(zip(names, masks, strict=True))

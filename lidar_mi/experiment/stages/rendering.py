@@ -212,18 +212,15 @@ def render_images(
 
 def _fields(observed: ObservedAir, wanted: Sequence[int], log: Log) -> list[xr.DataArray]:
     """The extinction that the beams of each scan meet, at their times if the air moves."""
-    observation, flows, truth, plans = (
-        observed.observation,
-        observed.flows,
-        observed.truth,
-        observed.plans,
-    )
+    observation, truth, plans = observed.observation, observed.truth, observed.plans
     fields = list(truth.extinction)
     if observation.scan.air == "moving":
         for index, plan in enumerate(plans):
             if index in wanted and plan.beams is not None:
                 log.bar(f"moving the air of scan {index + 1} of {len(plans)}", None)
-                fields[index] = air_in_time(observation, truth, flows, index, plan.beams.time)
+                fields[index] = air_in_time(
+                    observation, truth, observed.flows, index, plan.beams.time
+                )
     return fields
 
 

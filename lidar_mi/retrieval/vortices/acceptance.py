@@ -28,13 +28,13 @@ _WIDEST = 0.3
 # 150 places.
 _FURTHER = float(chi_square.isf(1e-3 / 150, 1))
 
+Limits = Callable[[torch.Tensor, torch.Tensor], bool]
+"""Whether a step from some parameters may be tried."""
 
 NOT_TOLD = "the pair cannot be told from the wind around it"
 
 
-def step_limits(
-    y: np.ndarray, z: np.ndarray, profile: Profile, dt: float = 0.0
-) -> Callable[[torch.Tensor, torch.Tensor], bool]:
+def step_limits(y: np.ndarray, z: np.ndarray, profile: Profile, dt: float = 0.0) -> Limits:
     """Limits of a step: its size, and core radii between half a cell and half the region.
 
     Between two images, separated by ``dt``, no core rotates more than once: images do not determine
@@ -58,6 +58,13 @@ def step_limits(
         )
 
     return allowed
+
+
+def within(limits: Limits, parameters: torch.Tensor, found: Solution | None) -> Solution | None:
+    """The solution if the limits allow the step to it; it may have further parameters behind."""
+    if found and limits(parameters, found.parameters[: len(parameters)] - parameters):
+        return found
+    return None
 
 
 def no_fit(profile: Profile, reason: str) -> VortexPairFit:

@@ -1,24 +1,18 @@
 """A pair of vortices from two images and an expected pair: a few steps in place of a search."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from lidar_mi.retrieval.vortices.acceptance import Limits, within
 from lidar_mi.retrieval.vortices.ambient import Ambient, AmbientWind, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import model_error_of
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images, Path, View
 from lidar_mi.retrieval.vortices.model_error import ModelError
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.robust_fit import (
-    Misfit,
-    Solution,
-    residual_after,
-    stepped,
-    without_step,
-)
+from lidar_mi.retrieval.vortices.robust_fit import Misfit, residual_after, stepped, without_step
 
 # Blur and step between the pixels used (px), and the expected error of displacements (px) that they
 # are for: images of texture 3 px long agree by chance with themselves moved by more.
@@ -43,10 +37,6 @@ _CURVATURE_ERROR, _ROUNDS = 0.1, 6
 _AMBIENT = 0.1
 # Rms normalised difference of fit and start beyond which one of them is wrong.
 _REJECTED = 4.0
-
-
-Limits = Callable[[torch.Tensor, torch.Tensor], bool]
-"""(parameters, step) -> whether such a step may be tried."""
 
 
 class NearbyFit(NamedTuple):
@@ -157,7 +147,7 @@ def fit_near(
         for _ in range(_STEPS):
             misfit = thin(theta)
             images = thin.at_least(_linear_power(misfit, variance))
-            found = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
+            found = within(limits, theta, stepped(theta, images.weighted(misfit), variance))
             if found is None:
                 return None
             far = _displaced(found.parameters - theta, misfit, make)
@@ -171,7 +161,7 @@ def fit_near(
         misfit, known = white.misfit(theta, views), None
         # before an estimate of change the weights are of all residuals, as of white noise
         images = white.at_least(_linear_power(misfit, variance))
-        plain = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
+        plain = within(limits, theta, stepped(theta, images.weighted(misfit), variance))
         if plain is None:
             return None
         # where air changes, the weights of the estimates below lead elsewhere
@@ -194,7 +184,7 @@ def fit_near(
             images = make.with_change(white, images, solution.misfit, moves)
             if not images.passed > 0:
                 return None
-            found = _near(limits, theta, stepped(theta, images.whitened(misfit), moves))
+            found = within(limits, theta, stepped(theta, images.whitened(misfit), moves))
             if found is None:
                 return None
             solution = found
@@ -227,11 +217,6 @@ def _curvature_error(
     """Standard errors that a linear step may be off by curvature."""
     far = _displaced(step, misfit, make) / _CURVED
     return float(step @ normal @ step) ** 0.5 * far
-
-
-def _near(limits: Limits, theta: torch.Tensor, found: Solution | None) -> Solution | None:
-    """The solution if the limits allow the step to it from theta."""
-    return found if found and limits(theta, found.parameters - theta) else None
 
 
 def _displaced(step: torch.Tensor, misfit: Misfit, make: Builder) -> float:

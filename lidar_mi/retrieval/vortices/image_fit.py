@@ -27,10 +27,12 @@ from lidar_mi.retrieval.vortices.acceptance import (
     NOT_TOLD,
     STARTS,
     TOLERANCE,
+    Limits,
     check_profile,
     checked_fit,
     no_fit,
     step_limits,
+    within,
 )
 from lidar_mi.retrieval.vortices.ambient import Ambient, ambient_errors, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import (
@@ -41,14 +43,7 @@ from lidar_mi.retrieval.vortices.covariance import (
     shared_error,
 )
 from lidar_mi.retrieval.vortices.detection import detect
-from lidar_mi.retrieval.vortices.from_start import (
-    Limits,
-    StartedFit,
-    agrees,
-    fit_from,
-    fit_near,
-    start_fit,
-)
+from lidar_mi.retrieval.vortices.from_start import StartedFit, agrees, fit_from, fit_near, start_fit
 from lidar_mi.retrieval.vortices.image_builder import Acquisition, builder_of, near_to
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model import Profile, wind
@@ -446,8 +441,7 @@ def _iterated(found: Solution, make: Builder, limits: Limits) -> VortexPairFit:
             return no_fit(make.profile, "the images have no structure in common")
         best = fit(images, best.parameters, limits, error.variance, 10, TOLERANCE)
     ambient = in_ambient_wind(best, white.y, white.z, make.dt)
-    before = best.parameters[:10]
-    if not limits(before, ambient.solution.parameters[:10] - before):
+    if within(limits, best.parameters, ambient.solution) is None:
         return no_fit(make.profile, NOT_TOLD)
     error = model_error_of(ambient.solution, _NOISE_LAGS, changes=True)
     return _checked(make, ambient, images, white(best.parameters), error)

@@ -17,6 +17,7 @@ from lidar_mi.retrieval.vortices.acceptance import (
     checked_fit,
     no_fit,
     step_limits,
+    within,
 )
 from lidar_mi.retrieval.vortices.ambient import AmbientWind, ambient_errors, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import (
@@ -166,10 +167,9 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     for _ in range(3):
         error = model_error_of(best, 1.0)
         best = fit(model, best.parameters[:10], limits, error.variance, 12, TOLERANCE)
-        before = best.parameters
         ambient = in_ambient_wind(best, lateral, vertical, 1.0, around)
         # linear in the pair: beyond, any other pair would do in some air
-        if not limits(before, ambient.solution.parameters[:10] - before):
+        if within(limits, best.parameters, ambient.solution) is None:
             return no_fit(profile, NOT_TOLD)
         around, best = ambient.wind, ambient.solution
         model = replace(model, ambient=around.at(lateral, vertical))
