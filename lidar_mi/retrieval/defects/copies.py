@@ -30,6 +30,9 @@ _BLOCK, _FEW_BLOCKS, _RIM = {2: 16, 3: 9}, 12, 4
 # Relative error of a fraction by the orders left out: 0.2 is found as 0.194 to 0.197 in three pairs
 # of texture of 2 px moved by 1.5 px.
 _HIGHER_ORDERS = 0.03
+# Of the fraction, by which displacements are too large if image 1 holds as much of the image
+# before it: image 2 has the longer trail, which looks like three times the lag of displacements.
+_EARLIER = 2 / 3
 # Standard errors of the difference by which two estimates of one fraction may differ.
 _UNLIKE = 2.0
 # Robust standard deviations that a pixel's difference counts at most.
@@ -65,10 +68,15 @@ class Copy(NamedTuple):
         return abs(self.fraction) > _LEAST and self.p_value < FALSE_ALARM
 
     def widened(self, found: Displacement) -> Displacement:
-        """Displacements with the error of the fraction: each errs by as much of itself."""
+        """Displacements with the error of the fraction: each errs by as much of itself.
+
+        And with that of what two images do not tell: whether only one of them holds a copy, or
+        each holds a part of the image before it (afterglow), or what lies between: uniform.
+        """
         if not self.fraction or found.covariance is None:
             return found
-        error = self.stderr**2 * found.d[:, None] * found.d
+        variance = self.stderr**2 + (_EARLIER * self.fraction) ** 2 / 3
+        error = variance * found.d[:, None] * found.d
         return found._replace(covariance=found.covariance + error)
 
     def __str__(self) -> str:
