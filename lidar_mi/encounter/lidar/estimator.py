@@ -22,6 +22,18 @@ from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.schema.experiment import Experiment
 
 
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Collections, of 0.1 s and more over all objects of the libraries, wait until the end."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 class SlabEstimate(NamedTuple):
     """What is estimated from the signals of a slab.
 
@@ -99,6 +111,7 @@ class Estimator:
 
     # no derivatives are recorded: 7 % of the time
     @torch.inference_mode()
+    @_without_garbage_collection()
     def pair_of(
         self,
         image1: xr.DataArray,
@@ -136,24 +149,6 @@ class Estimator:
         take : (bool, bool)
             Whether vortices (with the lines) and wind are estimated, see `Cores.take`.
         """
-        with _without_garbage_collection():
-            return self._pair_of(
-                image1, image2, dt, noise, expected, times, frames, complete, telescope, take
-            )
-
-    def _pair_of(
-        self,
-        image1: xr.DataArray,
-        image2: xr.DataArray,
-        dt: float,
-        noise: float | xr.DataArray | None,
-        expected: VortexPairFit | None,
-        times: Sequence[xr.DataArray] | None,
-        frames: LineFrames | None,
-        complete: Completion | None,
-        telescope: tuple[float, float, float] | None,
-        take: tuple[bool, bool],
-    ) -> SlabEstimate:
         seconds: dict[str, float] = {}
         timed = partial(_timed, seconds, clock=self._clock)
         winds = self._winds if take[1] else None
@@ -206,18 +201,6 @@ class Estimator:
         elif self._winds:
             flags = (f"wind: {SKIPPED}",)
         return SlabEstimate(wind, pair, seconds, lines, flags)
-
-
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """Collections, of 0.1 s and more over all objects of the libraries, wait until the end."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Limits of the steps of a fit of a pair, and the conditions on which its result is accepted."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -75,27 +76,27 @@ def no_fit(profile: Profile, reason: str) -> VortexPairFit:
     )
 
 
-def checked_fit(
-    solution: Solution,
-    covariance: np.ndarray,
-    profile: Profile,
-    chi2: float,
-    match: float,
-    error: float,
-    length: float,
-    z: np.ndarray,
-    y: np.ndarray,
-    turned: np.ndarray,
-    inclined: np.ndarray | None = None,
-    further: float = 0.0,
+def with_reasons(
+    pair: VortexPairFit, solution: Solution, y: np.ndarray, z: np.ndarray, further: float = 0.0
 ) -> VortexPairFit:
-    """The fit, with the reasons for which it is not accepted."""
-    theta = solution.parameters[:10].cpu().numpy()
+    """The fit with the reasons for which it is not accepted.
+
+    Parameters
+    ----------
+    pair : VortexPairFit
+    solution : Solution
+        That it was made of.
+    y, z : ndarray
+        Axes of the region, m.
+    further : float
+        Chi-square of one more vortex.
+    """
+    theta, covariance = pair.parameters, pair.covariance
     reasons = []
     if not solution.converged and far_from_minimum(solution, covariance):
         reasons.append("did not converge")
-    if not match >= _MATCH:
-        reasons.append(f"correlation {match:.2f}; expected at least {_MATCH:g}")
+    if not pair.correlation >= _MATCH:
+        reasons.append(f"correlation {pair.correlation:.2f}; expected at least {_MATCH:g}")
     if not (np.isfinite(covariance).all() and (np.diagonal(covariance) > 0).all()):
         reasons.append("some parameters are undetermined")
     spread = np.sqrt(np.clip(np.diagonal(covariance), 0, None))
@@ -121,18 +122,7 @@ def checked_fit(
             f"there are more than two vortices (chi-square of one more {further:.0f}; expected at "
             f"most {_FURTHER:.0f})"
         )
-    return VortexPairFit(
-        theta,
-        covariance,
-        profile,
-        chi2,
-        match,
-        error,
-        length,
-        tuple(reasons),
-        turned=turned,
-        inclined=inclined,
-    )
+    return replace(pair, reasons=tuple(reasons))
 
 
 def check_profile(profile: str) -> None:

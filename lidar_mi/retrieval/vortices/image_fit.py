@@ -29,9 +29,9 @@ from lidar_mi.retrieval.vortices.acceptance import (
     TOLERANCE,
     Limits,
     check_profile,
-    checked_fit,
     no_fit,
     step_limits,
+    with_reasons,
     within,
 )
 from lidar_mi.retrieval.vortices.ambient import Ambient, ambient_errors, in_ambient_wind
@@ -466,23 +466,24 @@ def _checked(
     match = float(torch.corrcoef(torch.stack([first[valid], second[valid]]))[0, 1])
     known = make.noise > 0
     chi2 = float((misfit.residual.square() / misfit.scatter)[valid].mean()) if known else np.nan
-    pair = checked_fit(
-        best,
+    scope = make.telescope
+    shared, length = shared_error(by_air)
+    pair = VortexPairFit(
+        best.parameters[:10].cpu().numpy(),
         covariance,
         make.profile,
         chi2,
         match,
         error.variance**0.5 / make.dt,
         mean_length(error) * (make.spacing[0] * make.spacing[1]) ** 0.5,
-        make.z,
-        make.y,
         # a roll rate of 1 rad/s that is not known moves the images by this
-        change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
-        None if make.telescope is None else _change_by_slopes(make, make.telescope, best, images),
-        by_air.further,
+        turned=change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
+        inclined=None if scope is None else _change_by_slopes(make, scope, best, images),
+        ambient=ambient.wind,
+        shared=shared,
+        shared_length=length,
     )
-    shared, length = shared_error(by_air)
-    return replace(pair, ambient=ambient.wind, shared=shared, shared_length=length)
+    return with_reasons(pair, best, make.y, make.z, by_air.further)
 
 
 def _change_by_slopes(

@@ -14,9 +14,9 @@ from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
     check_profile,
-    checked_fit,
     no_fit,
     step_limits,
+    with_reasons,
     within,
 )
 from lidar_mi.retrieval.vortices.ambient import AmbientWind, ambient_errors, in_ambient_wind
@@ -182,21 +182,21 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     varied = model.value[:, valid] - model.value[:, valid].mean(1, keepdim=True)
     explained = 1 - float(residual.square().sum() / varied.square().sum())
     spacing = (float(np.diff(y).mean()) * float(np.diff(z).mean())) ** 0.5
-    pair = checked_fit(
-        best,
+    shared, length = shared_error(by_air)
+    pair = VortexPairFit(
+        best.parameters[:10].cpu().numpy(),
         covariance,
         profile,
         chi2,
         explained,
         error.variance**0.5,
         mean_length(error) * spacing,
-        z,
-        y,
-        change_by_flow(best, torch.stack([-model.z, model.y])),
-        further=by_air.further,
+        turned=change_by_flow(best, torch.stack([-model.z, model.y])),
+        ambient=around,
+        shared=shared,
+        shared_length=length,
     )
-    shared, length = shared_error(by_air)
-    pair = replace(pair, ambient=around, shared=shared, shared_length=length)
+    pair = with_reasons(pair, best, y, z, by_air.further)
     v_stderr, w_stderr = common
     rotation, centre = common_rotation(vectors)
     return pair.with_common_error(v_stderr, w_stderr, rotation, centre)
