@@ -40,8 +40,15 @@ FIGURES = {
     "real_wakes": ("fly", "real_wakes", "figures/fig29_encounter.png"),
     "gust": ("fly", "gust", "figures/fig37_load_factor.png"),
 }
-# picture: campaign, heading of the part of its report
-PARTS = {"design_map": ("design_map", "Requirements"), "encounters": ("encounters", "Bank angle")}
+# picture: campaign, heading of the part of its report, options
+PARTS = {
+    "design_map": ("design_map", "Requirements", ()),
+    "encounters": (
+        "encounters",
+        "Bank angle",
+        ("--set", "sample.n=20", "--set", "set.encounter.control.latency=0.12 s"),
+    ),
+}
 EXAMPLES = ("dense", "inflow", "recover_slab")
 CHECKS = {"resolution": "resolution"}
 
@@ -56,12 +63,12 @@ def figure(name: str) -> None:
 
 def part(name: str) -> None:
     """Run or resume a campaign, and take panels of its report by a browser."""
-    campaign, heading = PARTS[name]
+    campaign, heading, options = PARTS[name]
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if not browser:
         raise SystemExit(f"{name}: panels of a report are drawn by Chromium, which is not here")
     folder = ROOT / "outputs" / campaign
-    _call("-m", "lidar_mi.cli.app", "campaign", "run", campaign, "-o", str(folder))
+    _call("-m", "lidar_mi.cli.app", "campaign", "run", campaign, "-o", str(folder), *options)
     text = (folder / "report.html").read_text()
     after = text[text.index(f">{heading}</h2>") :]
     panels = re.findall(r"<svg.*?</svg>", after.partition("<h2")[0], re.DOTALL)
@@ -70,10 +77,10 @@ def part(name: str) -> None:
         here = Path(place)
         style = "<style>body { margin: 0; display: flex; font-family: sans-serif }</style>"
         (here / "a.html").write_text(f"<meta charset=utf-8>{style}{''.join(panels)}")
-        options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
-        options += ["--force-device-scale-factor=1.6", f"--window-size={width},{height}"]
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        flags += ["--force-device-scale-factor=1.6", f"--window-size={width},{height}"]
         target = f"--screenshot={here / 'a.png'}"
-        subprocess.run([browser, *options, target, (here / "a.html").as_uri()], check=True)
+        subprocess.run([browser, *flags, target, (here / "a.html").as_uri()], check=True)
         _write(name, Image.open(here / "a.png"))
 
 
