@@ -1,7 +1,7 @@
 """Pixels that stand out of all around them, as no image of air does that a beam or a lens blurs."""
 
 from collections.abc import Callable, Iterable
-from functools import reduce
+from functools import lru_cache, reduce
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ _ALIKE = 0.3
 _ADJACENT = (0, 1), (1, 0), (1, 2), (2, 1)
 
 
+@lru_cache(maxsize=256)
 def threshold(number: int) -> float:
     """Standard deviations that no one of so many normal values exceeds but for false alarms."""
     return float(norm.isf(FALSE_ALARM / 2 / max(number, 1)))
