@@ -358,7 +358,7 @@ def normalised_errors(family: Family, flights: int) -> tuple[np.ndarray, np.ndar
             if fit.success
         ]
         if track is not None and track.usable:
-            spread = np.sqrt(track.inflation * np.diagonal(track.covariance)[:10])
+            spread = np.sqrt((track.inflation * np.diagonal(track.covariance))[:10])
             tracked.append(((track.state[:10] - truths[-1]) / spread)[None])
     return np.concatenate(tracked), np.concatenate(fitted)
 

@@ -6,6 +6,8 @@ Applications to Tracking and Navigation, 5.2.3; Bierman 1977, Factorization Meth
 Sequential Estimation, II.5).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
@@ -42,13 +44,15 @@ def innovation(
     measured: np.ndarray,
     error: np.ndarray,
     observed: np.ndarray,
+    part: Sequence[int] | None = None,
 ) -> float:
     """Normalised square of a measurement's departure from its prediction: chi-square of (m,).
 
-    Arguments as of `updated`.
+    Arguments as of `updated`; `part`: of these measured quantities alone.
     """
-    departure = measured - observed @ state
-    factor = cho_factor(observed @ covariance @ observed.T + error)
+    chosen = np.arange(len(measured)) if part is None else np.asarray(part)
+    departure = (measured - observed @ state)[chosen]
+    factor = cho_factor((observed @ covariance @ observed.T + error)[np.ix_(chosen, chosen)])
     return float(departure @ cho_solve(factor, departure))
 
 

@@ -23,6 +23,7 @@ from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.track_motion import (
     CIRCULATIONS,
+    CORES,
     MEAN_WIND,
     PLACES,
     SLOPES,
@@ -40,6 +41,14 @@ _MOVING = MEASURED + len(SLOPES)
 _OBSERVED = np.hstack([np.eye(MEASURED), np.zeros((MEASURED, len(SLOPES))), np.eye(MEASURED)])
 # Least variance of the shared error, over that of the fit: covariances must have an inverse.
 _LEAST_SHARED = 1e-6
+# Kinds of quantities that may misfit, each by itself: circulations, core radii, places and the mean
+# wind, as they are measured, and as a state has them, with the slopes beside the places.
+_KINDS = (
+    (CIRCULATIONS, CIRCULATIONS),
+    (CORES, CORES),
+    (PLACES, [*PLACES, *range(MEASURED, _MOVING)]),
+    (MEAN_WIND, MEAN_WIND),
+)
 # Of port and starboard, along y and z.
 _MEAN_SLOPES = np.array([[0.5, 0, 0.5, 0], [0, 0.5, 0, 0.5]])
 
@@ -122,6 +131,8 @@ class Slab:
     innovation : float or None
         Normalised square of the fit's departure from the prediction, also of a rejected fit; None
         where there is nothing to compare.
+    by_kind : tuple of float
+        The same of circulations, core radii, places and mean wind alone; empty where it is None.
     """
 
     x: float
@@ -132,6 +143,7 @@ class Slab:
     transition: np.ndarray
     noise: np.ndarray
     innovation: float | None = None
+    by_kind: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,19 +202,21 @@ class Track:
         return None if square is None else (square, MEASURED)
 
     @cached_property
-    def inflation(self) -> float:
-        """Factor of the variances that the recent innovations ask for, 1 or more.
+    def inflation(self) -> np.ndarray:
+        """Factors (14,) of the state's variances that the recent innovations ask for, 1 or more.
 
-        Their mean square over what is expected, from rejected fits too, if that is beyond the gate
-        for so many slabs; else 1 (Birge 1932, Phys. Rev. 40, 207-227). Above 1 the wake is curved,
-        or the fits err, by more than stated.
+        For each kind of quantity their mean square over what is expected, from rejected fits too,
+        if that is beyond the gate for so many slabs and kinds; else 1 (Birge 1932, Phys. Rev. 40,
+        207-227). Above 1 the wake is curved, or the fits err, by more than stated.
         """
-        recent = [slab.innovation for slab in self.slabs[-self.settings.window :]]
-        squares = [square for square in recent if square is not None]
-        freedom = MEASURED * len(squares)
-        if not squares or sum(squares) <= chi2.ppf(self.settings.gate, freedom):
-            return 1.0
-        return sum(squares) / freedom
+        recent = [slab.by_kind for slab in self.slabs[-self.settings.window :] if slab.by_kind]
+        factors = np.ones(_MOVING)
+        gate = 1 - (1 - self.settings.gate) / len(_KINDS)
+        for kind, (measured, states) in enumerate(_KINDS):
+            total, freedom = sum(squares[kind] for squares in recent), len(measured) * len(recent)
+            if recent and total > chi2.ppf(gate, freedom):
+                factors[states] = total / freedom
+        return factors
 
     @property
     def lost(self) -> bool:
@@ -262,7 +276,8 @@ class Track:
         )
         # a straight pair has the same induction in all slabs
         by_curvature = self._inductions[:, nearest] - self._inductions.mean(1)
-        covariance = self.inflation * covariance + unsteady(state, dt, wandering, by_curvature)
+        root = np.sqrt(self.inflation)
+        covariance = np.outer(root, root) * covariance + unsteady(state, dt, wandering, by_curvature)
         return replace(
             self.fit,
             parameters=state[:MEASURED],
@@ -401,15 +416,20 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         track.settings.wandering,
         fit or track.fit,
     )
-    predicted, square, used = state, None, None
+    predicted, square, by_kind, used = state, None, (), None
     if fit is not None:
         measured = fit.parameters, _own(fit), _OBSERVED
         # also of what is rejected below: `Track.inflation` counts it
         square = kalman.innovation(state, covariance, *measured)
+        by_kind = tuple(
+            kalman.innovation(state, covariance, *measured, part=kind) for kind, _ in _KINDS
+        )
         if _has_sense(fit) and square <= chi2.ppf(track.settings.gate, MEASURED):
             used = fit
             state, covariance = kalman.updated(state, covariance, *measured)
-    slab = Slab(float(x), float(time), state, covariance, predicted, transition, noise, square)
+    slab = Slab(
+        float(x), float(time), state, covariance, predicted, transition, noise, square, by_kind
+    )
     return Track(
         slabs=(*track.slabs, slab)[-track.settings.memory :],
         fit=used or track.fit,

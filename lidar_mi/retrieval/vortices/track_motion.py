@@ -18,7 +18,7 @@ SLOPES = ("port_dy_dx", "port_dz_dx", "starboard_dy_dx", "starboard_dz_dx")
 PLACES = [2, 3, 6, 7]
 """Parameters that move along the slopes and with the drift."""
 CIRCULATIONS = [0, 4]
-_RADII = [1, 5]
+CORES = [1, 5]
 MEAN_WIND = [8, 9]
 _OF_SLOPES = slice(len(PARAMETERS), len(PARAMETERS) + len(SLOPES))
 
@@ -174,7 +174,7 @@ def wandered(
     length = abs(dx)
     path = np.zeros(len(state))
     path[CIRCULATIONS] = (wandering.circulation * state[CIRCULATIONS]) ** 2
-    path[_RADII] = wandering.log_radius**2
+    path[CORES] = wandering.log_radius**2
     path[PLACES] = wandering.place**2 + wandering.slope**2 * length**2 / 3
     path[MEAN_WIND] = _TRANSVERSE * (wandering.dissipation * _MATCHED) ** (2 / 3) / _MATCHED
     path[_OF_SLOPES] = wandering.slope**2
