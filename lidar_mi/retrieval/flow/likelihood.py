@@ -13,7 +13,6 @@ from lidar_mi.retrieval.images.band_limit import Filter
 from lidar_mi.retrieval.images.intensity import normalised, normalised_intensity, rms
 from lidar_mi.retrieval.images.noise_map import known_and_weight
 from lidar_mi.retrieval.images.quality import misfit_variance
-from lidar_mi.retrieval.images.settings import FilterSettings
 from lidar_mi.retrieval.images.spline import (
     Spline,
     filter_of,
@@ -85,7 +84,13 @@ class Images(NamedTuple):
 
     def single(self) -> "Images":
         """The same to be warped in single precision: places to 1e-5 px."""
-        return self._replace(time=self.time.float(), weight=self.weight.float())
+        spline, smooth = (
+            one._replace(coefficients=one.coefficients.float())
+            for one in (self.spline, self.smooth)
+        )
+        return self._replace(
+            spline=spline, smooth=smooth, time=self.time.float(), weight=self.weight.float()
+        )
 
     def only(self, number: int) -> "Images":
         """With the splines of one of the images."""
@@ -93,7 +98,9 @@ class Images(NamedTuple):
 
     def filtered(self, chosen: Filter) -> "Images":
         """The images after another filter, with its noise."""
-        spline, smooth = _splines(self.stack, chosen, self.spline.settings)
+        stack = finite(self.stack)
+        chosen = chosen.to(stack)
+        spline, smooth = splines_of_values_and_slopes(stack, chosen, self.spline.settings)
         return self._replace(spline=spline, smooth=smooth, noise=chosen.level, chosen=chosen)
 
     def sample(self, *places: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -153,7 +160,7 @@ def prepared(
         blur=blur,
         settings=settings.filter,
     )
-    spline, smooth = _splines(images, chosen, settings.filter)
+    spline, smooth = splines_of_values_and_slopes(finite(images), chosen, settings.filter)
     level = max(chosen.level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     return Images(
@@ -172,14 +179,6 @@ def prepared(
         noise_known,
         all_usable=bool(known_at.all()),
     )
-
-
-def _splines(
-    stack: torch.Tensor, chosen: Filter, settings: FilterSettings
-) -> tuple[Spline, Spline]:
-    """Of values and slopes, in single precision: images are sampled to 1e-7 of their contrast."""
-    images = finite(stack).float()
-    return splines_of_values_and_slopes(images, chosen.to(images), settings)
 
 
 def linearised(

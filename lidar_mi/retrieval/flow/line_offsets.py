@@ -188,9 +188,9 @@ def _lines(images: Images, places: torch.Tensor, time: torch.Tensor, axis: int) 
     shape = images.spline.shape
     one = torch.eye(shape[axis]).to(images.spline.coefficients)
     one = one.unsqueeze(2 - axis).expand(-1, *shape).contiguous()
-    spline, _ = splines_of_values_and_slopes(one, images.chosen.to(one), images.spline.settings)
+    spline, _ = splines_of_values_and_slopes(one, images.chosen, images.spline.settings)
     found = [
-        weight * spline.values(*(place[image].to(one).expand_as(one).contiguous() for place in places))
+        weight * spline.values(*(place[image].expand_as(one).contiguous() for place in places))
         for image, weight in enumerate(time)
     ]
     return working(torch.cat(found))

@@ -199,10 +199,10 @@ def _fitted(
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
-    like = images.stack[:0]
+    like = images.spline.coefficients[:0]
     bare = without_texture(images, windows.template).to(like) if windows.dims == 2 else None
     pixels = [torch.arange(n).to(like) for n in windows.shape]
-    flow, _ = first_pass(stack, images.smooth, windows, Grid(windows.shape, 0.0, images.spline.coefficients[:0]))
+    flow, _ = first_pass(stack, images.smooth, windows, Grid(windows.shape, 0.0, like))
     prior: Prior | None = None
     posterior: Posterior | None = None
     unresolved = torch.zeros(windows.shape).to(like)
@@ -211,7 +211,7 @@ def _fitted(
         axes = [Axis(n, max(2.0, knots * windows.template)) for n in windows.shape]
         mesh, single = Mesh(axes, pixels), Mesh(axes, [place.float() for place in pixels])
         solve = _solver(axes, settings)
-        coefficients = mesh.fitted(flow.to(like))
+        coefficients = mesh.fitted(flow)
         if prior is None:
             width = settings.prior_width * windows.template
             unit = spacing or (1.0,) * windows.dims
