@@ -113,9 +113,9 @@ def vorticity(wind: xr.Dataset) -> xr.DataArray:
     """
     _only_a_plane(wind["v"])
     valid = wind.where(wind["flag"] == 0) if "flag" in wind else wind
-    found = valid["w"].differentiate("y") - valid["v"].differentiate("z")
+    curl = valid["w"].differentiate("y") - valid["v"].differentiate("z")
     about = {"long_name": "vorticity along x", "units": "s-1"}
-    return found.transpose("z", "y").rename("vorticity").assign_attrs(about)
+    return curl.transpose("z", "y").rename("vorticity").assign_attrs(about)
 
 
 def arrow_length(speeds: np.ndarray, limit: float) -> float:

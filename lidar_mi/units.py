@@ -152,9 +152,9 @@ class Given(float):
     @classmethod
     def of(cls, number: float, text: str) -> "Given":
         """The number of a text."""
-        found = cls(number)
-        found.text = text
-        return found
+        given = cls(number)
+        given.text = text
+        return given
 
 
 AS_GIVEN = {"as_given": True}
@@ -287,8 +287,8 @@ def usual_unit(number: float, unit: str) -> tuple[float, str]:
     if unit == "rad" and _in_degrees(number):
         return 180 / math.pi, "deg"
     if number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
-        found = registry().Quantity(number, unit).to_compact()
-        return float(found.magnitude) / number, f"{found.units:~}"
+        quantity = registry().Quantity(number, unit).to_compact()
+        return float(quantity.magnitude) / number, f"{quantity.units:~}"
     return 1.0, unit
 
 

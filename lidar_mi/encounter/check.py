@@ -49,13 +49,13 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     encounter, gates = encounter_of(experiment), gates_of(experiment)
     if encounter.control.mode == "feedforward":
         _check_latency(experiment, gates)
-    found = _without_effect(experiment, gates)
+    remarks = _without_effect(experiment, gates)
     model = aircraft or aircraft_of(encounter)
     strength = _strongest(experiment, model)
     has_wake = encounter.air is None or encounter.air.wake
     # other air may lift an aircraft without rolling it
     if strength < _MISSED and (has_wake or not isinstance(model, RisingAircraft)):
-        found.append(
+        remarks.append(
             "encounter.path: the flight misses the wake: its largest rolling moment is "
             f"{strength:.1%} of the ailerons'; expected a smaller miss or a smaller crossing angle"
             if has_wake
@@ -66,16 +66,16 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     control = encounter.control
     if control.mode == "feedforward" and not has_wake:
         if control.preview == "pair":
-            found.append(
+            remarks.append(
                 "encounter.air.wake: false leaves the lidar no vortices to track: its flight is "
                 "that of the autopilot; expected true, or encounter.control.preview: wind"
             )
     elif control.mode == "feedforward" and slabs < _LEAST_SLABS:
-        found.append(
+        remarks.append(
             f"encounter.look_ahead: the images hold both vortices in {slabs} slabs; a track needs "
             f"{_LEAST_SLABS} (expected a wider image, wake.vortex_pair.width and height)"
         )
-    return found
+    return remarks
 
 
 def sections(
@@ -134,13 +134,13 @@ def sections(
 
 def _without_effect(experiment: Experiment, gates: Gates) -> list[str]:
     """Keys of the file without effect on a flight, and those in their place."""
-    encounter, found = encounter_of(experiment), []
+    encounter, remarks = encounter_of(experiment), []
     thickness = experiment.scan.thickness
     if "thickness" in experiment.scan.model_fields_set and not _same(thickness, gates.depth):
         near = gates.stride / thickness
         counts = sorted({max(1, math.floor(near)), math.ceil(near)})
         fitting = " or ".join(f"{gates.stride / count:.4g} m" for count in counts)
-        found.append(
+        remarks.append(
             f"scan.thickness: {thickness:g} m becomes {gates.depth:.4g} m: a whole number of gates "
             f"fills the {gates.stride:.4g} m flown from scan to scan (expected {fitting}, or "
             "another encounter.path.speed or encounter.rate)"
@@ -154,11 +154,11 @@ def _without_effect(experiment: Experiment, gates: Gates) -> list[str]:
         part = getattr(experiment, section)
         value = getattr(part, key)
         if key in part.model_fields_set and not _same(value, effective):
-            found.append(
+            remarks.append(
                 f"{section}.{key}: {value:g} {_UNITS[key]} has no effect on a flight; "
                 f"encounter.{instead} makes it {effective:g} {_UNITS[key]}"
             )
-    return found
+    return remarks
 
 
 def _same(one: float, other: float) -> bool:

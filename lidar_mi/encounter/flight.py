@@ -118,19 +118,19 @@ def simulate_flights(
     wake = air_along_path(experiment)
     new = aircraft or (lambda: aircraft_of(encounter))
     name = name_of(controller) if controller else ""
-    found: dict[str, xr.Dataset] = {}
+    flights: dict[str, xr.Dataset] = {}
     slabs, track = None, None
     for mode in FLIGHTS[encounter.control.mode]:
         model, progress = new(), _titled(notice, flight_name(mode, name))
         fly = partial(simulate_flight, model, wake=wake, encounter=encounter, notice=progress)
         if mode == OFF:
-            found[mode] = fly(wings_level(model, encounter.control.levelling_time))
+            flights[mode] = fly(wings_level(model, encounter.control.levelling_time))
             continue
         steering = user_controller(controller, model) if controller else feedforward(model)
         if mode == AUTOPILOT:
-            found[mode] = fly(steering, preview_at=lambda state: no_loads)
+            flights[mode] = fly(steering, preview_at=lambda state: no_loads)
         elif mode == PERFECT:
-            found[mode] = fly(steering, preview_at=partial(preview_in, wake.wind, model))
+            flights[mode] = fly(steering, preview_at=partial(preview_in, wake.wind, model))
         else:
             instrument = lidar or _virtual_lidar(experiment, processes, scans)
             recorder = SlabRecorder(instrument)
@@ -144,7 +144,7 @@ def simulate_flights(
             # aircraft of JSBSim do not follow the linear roll mode
             tested = encounter.control.preview == "pair" and not isinstance(model, JSBSimAircraft)
             integrity = Integrity(model) if tested else None
-            found[mode] = fly(
+            flights[mode] = fly(
                 steering,
                 observe=tracker.update,
                 preview_at=partial(tracker.preview, model),
@@ -153,8 +153,8 @@ def simulate_flights(
             track, slabs = track_dataset(tracker.slabs, wake), recorder.dataset()
             track = track.merge(arrivals_dataset(tracker.arrivals, wake))
     # from no help to all help; simulated in another order, so that the slow one comes last
-    order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in found]
-    series = flights_dataset({mode: found[mode] for mode in order})
+    order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in flights]
+    series = flights_dataset({mode: flights[mode] for mode in order})
     about = {CONTROLLER: name} if name else {}
     if encounter.air is not None:
         about[MET] = "air"
@@ -234,10 +234,10 @@ def simulate_flight(
             deflection[0], symmetric = ailerons_deflected(aileron, symmetric, commands, dt, limits)
     most = abs(aircraft.control_moments[0, 0]) * aircraft.limits.deflection[0]
     about = {"units": "N m", "long_name": "rolling moment of the ailerons at full deflection"}
-    found = record.dataset().assign(largest_control_roll_moment=((), most, about))
+    flight = record.dataset().assign(largest_control_roll_moment=((), most, about))
     about = {"units": "1", "long_name": "1: the measured roll contradicts the preview"}
     values = np.array(withdrawn if integrity else np.zeros(count + 1), float)
-    return found.assign(preview_withdrawn=("time", values, about))
+    return flight.assign(preview_withdrawn=("time", values, about))
 
 
 def duration(encounter: Encounter) -> float:

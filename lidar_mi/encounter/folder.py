@@ -124,5 +124,5 @@ class EncounterFolder:
         path = self.path / file
         if not path.is_file():
             return None
-        found = read_netcdf(path)
-        return found if found.attrs.get(MADE_BY) == self.made_by else None
+        dataset = read_netcdf(path)
+        return dataset if dataset.attrs.get(MADE_BY) == self.made_by else None

@@ -137,13 +137,13 @@ def recorded_flight(folder: str | Path, experiment: Experiment) -> FlightData:
             f"{folder}: holds no finished flight with the lidar; expected the folder of lidar-mi "
             "fly --mode feedforward"
         )
-    found = read_netcdf(track)
-    if not {*ESTIMATED} <= {*found.data_vars}:
+    dataset = read_netcdf(track)
+    if not {*ESTIMATED} <= {*dataset.data_vars}:
         raise InputError(
             f"{track}: has no covariances of the estimates, as it is of an earlier version; "
             "expected a flight of this version"
         )
-    return FlightData(read_netcdf(series), found, read_netcdf(slabs) if slabs.is_file() else None)
+    return FlightData(read_netcdf(series), dataset, read_netcdf(slabs) if slabs.is_file() else None)
 
 
 def recorded_lidar(recorded: FlightData, experiment: Experiment) -> RecordedLidar:
@@ -177,9 +177,9 @@ def _difference(
             continue
         first, second = one.get(name), other.get(name)
         if isinstance(first, Mapping) and isinstance(second, Mapping):
-            found = _difference(first, second, (*above, name))
-            if found:
-                return found
+            difference = _difference(first, second, (*above, name))
+            if difference:
+                return difference
             continue
         return key
     return None

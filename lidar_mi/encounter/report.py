@@ -57,7 +57,7 @@ def write_report(
         data.series.attrs.get(CONTROLLER, ""),
         data.series.attrs.get(MET, "wake"),
     )
-    found = answer(experiment, data, metrics)
+    verdict = answer(experiment, data, metrics)
     html = page(
         at_the_slabs(experiment, gates_of(experiment)),
         dump(experiment),
@@ -65,10 +65,10 @@ def write_report(
         metrics,
         [chapter],
         log.warnings,
-        found,
+        verdict,
         folder.data_files(),
     )
-    folder.write_verdict(metrics, html, found)
+    folder.write_verdict(metrics, html, verdict)
 
 
 def answer(experiment: Experiment, data: FlightData, metrics: Mapping[str, float]) -> list[str]:

@@ -148,24 +148,27 @@ def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
         `recorded_vectors`.
     """
     rows = [_row(slab, wake) for slab in slabs]
-    found = xr.Dataset(
+    dataset = xr.Dataset(
         coords={
             "slab": ("slab", np.arange(len(rows)), {"long_name": "slab delivered"}),
             "source": ("source", list(SOURCES)),
         }
     )
     for name, (units, text) in _PER_SLAB.items():
-        found[name] = ("slab", [row[name] for row in rows], {"units": units, "long_name": text})
-    found["flags"] = ("slab", np.array(["; ".join(s.estimate.flags) for s in slabs], dtype=object))
+        dataset[name] = ("slab", [row[name] for row in rows], {"units": units, "long_name": text})
+    dataset["flags"] = (
+        "slab",
+        np.array(["; ".join(s.estimate.flags) for s in slabs], dtype=object),
+    )
     for name in QUANTITIES:
         units, text = MEANING[name]
         for suffix in ("", "_stderr"):
             values = np.array([[row[source, name + suffix] for row in rows] for source in SOURCES])
             about = {"units": units, "long_name": f"standard error of {text}" if suffix else text}
-            found[name + suffix] = (("source", "slab"), values.reshape(len(SOURCES), -1), about)
+            dataset[name + suffix] = (("source", "slab"), values.reshape(len(SOURCES), -1), about)
     fits = _fits([slab.estimate.pair for slab in slabs])
     vectors = recorded_vectors([slab.estimate for slab in slabs])
-    return found.merge(fits).merge(vectors).assign_attrs(fits.attrs | vectors.attrs)
+    return dataset.merge(fits).merge(vectors).assign_attrs(fits.attrs | vectors.attrs)
 
 
 def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
@@ -183,7 +186,7 @@ def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
                 shared[number] = pair.shared
     reasons = ["; ".join(pair.reasons) if pair is not None else "" for pair in pairs]
     about = {"long_name": "m2 s-1, log of m, m, m of port and starboard; mean v and w in m s-1"}
-    found = xr.Dataset(
+    fits = xr.Dataset(
         {
             "estimated": ("slab", np.array(there, float), {"units": "1", "long_name": "1: a fit"}),
             "estimate_parameters": (("slab", "parameter"), parameters, about),
@@ -200,7 +203,7 @@ def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
     )
     profiles = [pair.profile for pair in pairs if pair is not None]
     # one flight has one profile
-    return found.assign_attrs({"profile": profiles[0]} if profiles else {})
+    return fits.assign_attrs({"profile": profiles[0]} if profiles else {})
 
 
 _PER_SLAB = {
@@ -247,8 +250,8 @@ def _row(slab: Slab, wake: WakeAlongPath) -> dict[Any, float]:
         **_wind_errors(estimate.wind, wake, estimate.x, estimate.time),
     }
     tracked = track.pair_at(estimate.x, estimate.time) if track else None
-    for source, found in (("estimate", pair), ("track", tracked)):
-        row |= {(source, name): value for name, value in _numbers(found).items()}
+    for source, pair_or_track in (("estimate", pair), ("track", tracked)):
+        row |= {(source, name): value for name, value in _numbers(pair_or_track).items()}
     true = vortices_in_plane(wake, estimate.x, estimate.time)
     truth = dict(zip(("port", "starboard"), true, strict=True)) if true else {}
     for name in QUANTITIES:
@@ -262,15 +265,15 @@ def _numbers(pair: VortexPairFit | None) -> dict[str, float]:
     """Quantities of a valid pair with their standard errors; else NaN."""
     if pair is None or not pair.success:
         return {name + suffix: np.nan for name in QUANTITIES for suffix in ("", "_stderr")}
-    stderr, found = np.sqrt(np.diagonal(pair.covariance)), {}
+    stderr, numbers = np.sqrt(np.diagonal(pair.covariance)), {}
     for name in QUANTITIES:
         logarithm = name.endswith("core_radius")
         k = PARAMETERS.index(name.replace("core_radius", "log_radius"))
         value = float(np.exp(pair.parameters[k]) if logarithm else pair.parameters[k])
-        found[name] = value
+        numbers[name] = value
         # to first order the standard error of exp(q) is exp(q) times that of q
-        found[f"{name}_stderr"] = float(stderr[k]) * (value if logarithm else 1.0)
-    return found
+        numbers[f"{name}_stderr"] = float(stderr[k]) * (value if logarithm else 1.0)
+    return numbers
 
 
 def _line_error(lines: xr.Dataset | None) -> float:
@@ -284,15 +287,15 @@ def _wind_errors(
     wind: xr.Dataset | None, wake: WakeAlongPath, x: float, time: float
 ) -> dict[str, float]:
     """Rms errors of the vectors that are valid; NaN where a component was not estimated."""
-    found = {"error_u": np.nan, "error_v": np.nan, "error_w": np.nan, "vectors": 0.0}
+    row = {"error_u": np.nan, "error_v": np.nan, "error_w": np.nan, "vectors": 0.0}
     if wind is None:
-        return found
+        return row
     y, z = np.meshgrid(wind["y"].values, wind["z"].values)
     truth = wake.wind(np.full(y.shape, x), y, z, time)
     valid = (wind["flag"].transpose("z", "y") == 0).values
-    found["vectors"] = float(valid.sum())
+    row["vectors"] = float(valid.sum())
     for name, true in zip("uvw", truth, strict=True):
         if name in wind and valid.any():
             error = (wind[name].transpose("z", "y").values - true)[valid]
-            found[f"error_{name}"] = float(np.sqrt(np.mean(error**2)))
-    return found
+            row[f"error_{name}"] = float(np.sqrt(np.mean(error**2)))
+    return row

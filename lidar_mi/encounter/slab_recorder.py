@@ -30,10 +30,10 @@ class SlabRecorder:
         images = getattr(self.lidar, "images", None)
         if estimate.wind is None and images is None:
             return
-        found = {}
+        variables = {}
         if images is not None:
             image = images.first.transpose("z", "y").astype(np.float32)
-            found["image"] = image.rename({"y": "image_y", "z": "image_z"})
+            variables["image"] = image.rename({"y": "image_y", "z": "image_z"})
         if estimate.wind is not None:
             vectors = estimate.wind
             every = max(1, round(vectors.sizes["y"] / _VECTORS))
@@ -41,10 +41,12 @@ class SlabRecorder:
             vectors = vectors[["v", "w", "flag"]].reset_coords(drop=True)
             vectors = vectors.isel(y=some, z=some).transpose("z", "y")
             valid = vectors["flag"] == 0
-            found |= {name: vectors[name].where(valid).astype(np.float32) for name in ("v", "w")}
+            variables |= {
+                name: vectors[name].where(valid).astype(np.float32) for name in ("v", "w")
+            }
         late = estimate.delivered if estimate.wind_delivered is None else estimate.wind_delivered
         about = {"time": estimate.time, "x": estimate.x, "delivered": late}
-        self._slabs.append(xr.Dataset(found).assign(about))
+        self._slabs.append(xr.Dataset(variables).assign(about))
 
     def dataset(self) -> xr.Dataset | None:
         """All slabs, dims (slab, z, y) and (slab, image_z, image_y); None: there are none.
@@ -58,8 +60,8 @@ class SlabRecorder:
         # a slab whose wind the computer skipped has images alone
         nothing = {name: np.nan * first[name] for name in "vw" if name in first}
         slabs = [one if "v" in one else one.assign(nothing) for one in self._slabs]
-        found = xr.concat([one.interp(grid) for one in slabs], "slab")
+        dataset = xr.concat([one.interp(grid) for one in slabs], "slab")
         # interpolation gives double precision, which no figure needs
-        return found.assign(
-            {name: found[name].astype(np.float32) for name in first if first[name].ndim}
+        return dataset.assign(
+            {name: dataset[name].astype(np.float32) for name in first if first[name].ndim}
         )

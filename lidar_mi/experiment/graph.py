@@ -180,14 +180,14 @@ def parameters(function: Callable[..., Any]) -> tuple[Parameter, ...]:
     A type in quotes is that of a result, from a module that only the stage itself loads: it is read
     as text.
     """
-    found: list[Parameter] = []
+    leaves: list[Parameter] = []
     for name, given in inspect.signature(function).parameters.items():
         # their names stand for nothing that the graph could look up
         if given.kind in (given.VAR_POSITIONAL, given.VAR_KEYWORD):
             continue
         kind, marks = given.annotation, ()
         if kind in _BUNDLES:
-            found += parameters(kind)
+            leaves += parameters(kind)
             continue
         if isinstance(kind, str) and "Annotated" in kind:
             raise ValueError(f"{function.__name__}: {name}: marks in quotes are not read")
@@ -202,8 +202,8 @@ def parameters(function: Callable[..., Any]) -> tuple[Parameter, ...]:
         )
         default = given.default is not given.empty
         kinds = () if isinstance(kind, str) else tuple(sections_in(kind))
-        found.append(Parameter(name, section_path(name), optional, default, marks, kinds))
-    return tuple(found)
+        leaves.append(Parameter(name, section_path(name), optional, default, marks, kinds))
+    return tuple(leaves)
 
 
 @functools.cache
@@ -225,18 +225,18 @@ def section(experiment: Experiment, path: str) -> Any:
 
     None below a missing section, or one of a kind that has no such key.
     """
-    found: Any = experiment
+    value: Any = experiment
     for key in path.split("."):
-        found = getattr(found, key, None)
-    return found
+        value = getattr(value, key, None)
+    return value
 
 
 def _given(experiment: Experiment, parameter: Parameter) -> Any:
     """The section or value of a parameter; None where it is a section of another kind."""
     assert parameter.path is not None
-    found = section(experiment, parameter.path)
-    wrong = isinstance(found, BaseModel) and parameter.kinds
-    return None if wrong and not isinstance(found, parameter.kinds) else found
+    value = section(experiment, parameter.path)
+    wrong = isinstance(value, BaseModel) and parameter.kinds
+    return None if wrong and not isinstance(value, parameter.kinds) else value
 
 
 def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
@@ -309,10 +309,10 @@ class Graph:
         # a stage without its inputs goes, and with it those that need its result
         while True:
             names = {stage.name for stage in remaining}
-            found = [stage for stage in remaining if self._is_possible(stage, names)]
-            if len(found) == len(remaining):
-                return found
-            remaining = found
+            possible = [stage for stage in remaining if self._is_possible(stage, names)]
+            if len(possible) == len(remaining):
+                return possible
+            remaining = possible
 
     def _is_possible(self, stage: Stage, names: set[str]) -> bool:
         for parameter in parameters(stage.compute):
@@ -355,21 +355,21 @@ class Graph:
         provided: Mapping[str, Any] = types.MappingProxyType({}),
     ) -> dict[str, Any] | None:
         """Arguments of a function from sections and results; None: a result is not there."""
-        found = {}
+        arguments = {}
         for parameter in parameters(function):
             if parameter.name in provided:
-                found[parameter.name] = provided[parameter.name]
+                arguments[parameter.name] = provided[parameter.name]
             elif parameter.name in self._names:
                 if parameter.name in results:
-                    found[parameter.name] = results[parameter.name]
+                    arguments[parameter.name] = results[parameter.name]
                 elif parameter.name in self._by_name:
                     # the experiment has this stage: its result is still to come
                     return None
                 else:
-                    found[parameter.name] = None
+                    arguments[parameter.name] = None
             elif parameter.path is not None:
-                found[parameter.name] = _given(self.experiment, parameter)
-        return _bundled(function, found)
+                arguments[parameter.name] = _given(self.experiment, parameter)
+        return _bundled(function, arguments)
 
     def call(self, function: Callable[..., T], results: Mapping[str, Any]) -> T:
         """A function that takes sections and results of the preflight."""
@@ -436,7 +436,7 @@ class Graph:
 
     def keys(self, stage: Stage) -> "Keys":
         """The keys of the experiment that a result depends on, through all that it needs."""
-        found: set[tuple[str, Only | But | None]] = set()
+        keys: set[tuple[str, Only | But | None]] = set()
         visited: set[str] = set()
         waiting = [stage]
         while waiting:
@@ -453,8 +453,8 @@ class Graph:
                         waiting.append(self[parameter.name])
                 elif parameter.path is not None:
                     marks = [m for m in parameter.marks if isinstance(m, Only | But)]
-                    found.add((parameter.path, marks[0] if marks else None))
-        return Keys(frozenset(found))
+                    keys.add((parameter.path, marks[0] if marks else None))
+        return Keys(frozenset(keys))
 
 
 @dataclass(frozen=True)

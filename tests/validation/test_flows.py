@@ -397,18 +397,6 @@ def test_resolved(variance, narrow, resolved):
     assert found.resolved is resolved and found.variance_inside == (variance[0] == 1)
 
 
-def test_seeds_end_when_rows_are_resolved(monkeypatch):
-    errors = iter(normal_errors(16))
-    monkeypatch.setattr(measure, "pair", lambda *_: None)
-    monkeypatch.setattr(measure, "errors_of", lambda *_: next(errors))
-    jet = BY_NAME["jet"]
-    (found,) = measure.measured(jet, CLEAN, ["cc"], range(1, 13), until_resolved=True)
-    assert found.seeds == measure.BATCH
-    errors = iter(normal_errors(16, spread=1.0))
-    (found,) = measure.measured(jet, CLEAN, ["cc"], range(1, 13), until_resolved=True)
-    assert found.seeds == 12 and not found.resolved
-
-
 # --- methods
 
 

@@ -20,8 +20,6 @@ METHODS = ("variational", "multipass", "cc")
 OTHERS = {"DIS": PEERS["OpenCV DIS"], "OpenPIV": PEERS["OpenPIV window deformation"]}
 """Other programs, with their packages: all their vectors count, and none has a standard error."""
 
-BATCH = 4
-"""Seeds that are added at a time where rows have to be resolved."""
 STRIDE = 4
 """Vectors of one template share their pixels; every fourth one is nearly as informative as all."""
 LEAST_VALID = 0.02
@@ -190,32 +188,14 @@ def accuracy(found: list[Errors], names: tuple[str, str, str]) -> Accuracy:
 
 
 def measured(
-    family: Family,
-    condition: Condition,
-    methods: Sequence[str],
-    seeds: Iterable[int],
-    until_resolved: bool = False,
+    family: Family, condition: Condition, methods: Sequence[str], seeds: Iterable[int]
 ) -> list[Accuracy]:
-    """A row for each method, all on the same image pairs.
-
-    Parameters
-    ----------
-    until_resolved : bool
-        After every `BATCH` seeds, omit the others if all rows that are judged are resolved.
-    """
+    """A row for each method, all on the same image pairs."""
     found: dict[str, list[Errors]] = {method: [] for method in methods}
-    for count, seed in enumerate(seeds, 1):
+    for seed in seeds:
         images = pair(family, condition, seed)
         for method, errors in found.items():
             errors.append(errors_of(images, method))
-        if until_resolved and count % BATCH == 0:
-            rows = _rows(family, condition, found)
-            if all(row.resolved for row in rows if row.judged):
-                return rows
-    return _rows(family, condition, found)
-
-
-def _rows(family, condition, found: dict[str, list[Errors]]) -> list[Accuracy]:
     return [
         accuracy(errors, (family.name, condition.name, method)) for method, errors in found.items()
     ]

@@ -12,7 +12,6 @@ from ..report import Check, Row
 from .families import BY_NAME, Family, Purpose, chosen
 from .images import Condition, conditions_of
 from .measure import (
-    BATCH,
     FAR_VARIANCE,
     LEAST_VALID,
     METHODS,
@@ -48,7 +47,7 @@ INTRODUCTION = (
 )
 LEAST_INSIDE = 0.85
 """Fraction of rows that is required to be inside each of the limits."""
-SEEDS = {1: 1, 16: 4 * BATCH}
+SEEDS = {1: 1, 16: 4}
 """At most, by the effort: one seed shows in minutes what is far out."""
 
 Case = tuple[Family, Condition]
@@ -68,9 +67,8 @@ def flows(effort) -> Check:
             f" --purpose {effort.purpose}" * bool(effort.purpose),
         ]
     )
-    until = f", in steps of {BATCH} until all rows of a line are resolved" * (seeds > BATCH)
     parts = [
-        f"Written by `python -m validation flows{options}`, seeds 1 to {seeds}{until}. "
+        f"Written by `python -m validation flows{options}`, seeds 1 to {seeds}. "
         + " ".join(f"{name}: {missing(name)}." for name in OTHERS if missing(name)),
         summary(found),
     ]
@@ -96,7 +94,7 @@ def lines(cases: Sequence[Case], methods: Sequence[str], seeds: int) -> Iterator
 
 def _measured(family: str, condition: Condition, methods, seeds: int) -> list[Accuracy]:
     """By the family's name: flows are no data that another process could be sent."""
-    return measured(BY_NAME[family], condition, methods, range(1, seeds + 1), until_resolved=True)
+    return measured(BY_NAME[family], condition, methods, range(1, seeds + 1))
 
 
 def of(found: Sequence[Line], method: str, purpose: Purpose) -> list[Accuracy]:

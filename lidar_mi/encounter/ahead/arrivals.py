@@ -51,7 +51,7 @@ def arrivals_dataset(arrivals: Sequence[Arrival], air: WakeAlongPath) -> xr.Data
     )
     _, *truth = air.wind(x, y, z, time)
     each, both = "arrival", ("arrival", "place")
-    found = {
+    variables = {
         "arrival_x": (each, x[:, 0], {"units": "m", "long_name": "plane of the slab"}),
         "arrival_time": (each, time[:, 0], {"units": "s", "long_name": "time of arrival"}),
         "arrival_y": (both, y, {"units": "m", "long_name": "place on the wing"}),
@@ -63,5 +63,5 @@ def arrivals_dataset(arrivals: Sequence[Arrival], air: WakeAlongPath) -> xr.Data
             ("_true", "as it is", truth[k]),
         ):
             about = {"units": "m s-1", "long_name": f"{name} on the wing, {text}"}
-            found[f"arrival_{name}{suffix}"] = (both, np.asarray(values), about)
-    return xr.Dataset(found)
+            variables[f"arrival_{name}{suffix}"] = (both, np.asarray(values), about)
+    return xr.Dataset(variables)

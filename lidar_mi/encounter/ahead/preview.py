@@ -133,15 +133,15 @@ class WakeTracker:
         """
         x, y, z, time = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
         # u stays 0: the pair of two images has no wind along the path
-        found = np.zeros((3, *x.shape))
+        wind = np.zeros((3, *x.shape))
         if self.ahead is None:
-            found[1:] = _tracked(self._usable, x, y, z, time)
+            wind[1:] = _tracked(self._usable, x, y, z, time)
         else:
             if self._usable:
-                found[1:] = self._vortices(x, y, z, time)
+                wind[1:] = self._vortices(x, y, z, time)
             if self.ahead:
-                found[1:] += self.ahead.at(x, y, z, time, error=False)[0]
-        u, v, w = found
+                wind[1:] += self.ahead.at(x, y, z, time, error=False)[0]
+        u, v, w = wind
         return u, v, w
 
     def _vortices(
@@ -179,8 +179,8 @@ class WakeTracker:
             _, stderr = self.ahead.at(x, y, z, time)
             if self._usable:
                 stderr = np.hypot(stderr, self._vortex_errors(slab.x, y, z, state.time))
-            found = np.stack(self.wind(x, y, z, time)[1:])
-            self.arrivals.append(Arrival(slab.x, state.time, y, state.z, found, stderr))
+            wind = np.stack(self.wind(x, y, z, time)[1:])
+            self.arrivals.append(Arrival(slab.x, state.time, y, state.z, wind, stderr))
 
     def _vortex_errors(self, x: float, y: np.ndarray, z: np.ndarray, time: float) -> np.ndarray:
         """Standard errors (2, n) of v and w by those of the tracked vortices in a plane, m/s."""
@@ -202,18 +202,18 @@ class WakeTracker:
         self.ahead.add(estimate.x, estimate.time, estimate.wind, vortices, place)
 
     def _track(self, estimate: Estimate) -> None:
-        before, pair, found = self.track, estimate.pair, None
+        before, pair, track = self.track, estimate.pair, None
         if before is not None:
-            found = updated(before, pair, estimate.x, estimate.time)
+            track = updated(before, pair, estimate.x, estimate.time)
         elif pair is not None and pair.success:
-            found = first_track(pair, estimate.x, estimate.time)
-        self.slabs.append(Slab(estimate, found))
-        if found is not None and found.usable:
+            track = first_track(pair, estimate.x, estimate.time)
+        self.slabs.append(Slab(estimate, track))
+        if track is not None and track.usable:
             # a track with one more slab replaces itself; a new track follows the lost one, whose
             # slabs the aircraft has yet to reach
             last = self._usable[-1].x if self._usable else None
-            continued = any(slab.x == last for slab in found.slabs)
-            self._usable[len(self._usable) - continued :] = [found]
+            continued = any(slab.x == last for slab in track.slabs)
+            self._usable[len(self._usable) - continued :] = [track]
 
 
 def _wind_time(estimate: Estimate) -> float:
@@ -234,7 +234,7 @@ def _tracked(
     With `vortices` those of the vortices alone, in a Gaussian mean of this standard deviation, m.
     """
     nearest = _nearest(tracks, x)
-    found = np.zeros((2, *x.shape))
+    velocity = np.zeros((2, *x.shape))
     for k, track in enumerate(tracks):
         here = nearest == k
         theta = torch.as_tensor(track.parameters_at(x[here], time[here]))
@@ -242,8 +242,8 @@ def _tracked(
             theta[MEAN_WIND] = 0.0
             theta = widened(theta, vortices)
         at_y, at_z = (torch.as_tensor(a[here]) for a in (y, z))
-        found[:, here] = pair_wind(theta, at_y, at_z, track.profile).numpy()
-    return found
+        velocity[:, here] = pair_wind(theta, at_y, at_z, track.profile).numpy()
+    return velocity
 
 
 def _nearest(tracks: Sequence[Track], x: np.ndarray) -> np.ndarray:

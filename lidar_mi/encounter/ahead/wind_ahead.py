@@ -112,8 +112,8 @@ class WindAhead:
         """
         given = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
         flat = [a.ravel() for a in given]
-        found = [one.at(*flat, error=error) for one in self._fields]
-        mean, stderr = np.moveaxis(np.array(found), 1, 0).reshape(2, 2, *given[0].shape)
+        winds = [one.at(*flat, error=error) for one in self._fields]
+        mean, stderr = np.moveaxis(np.array(winds), 1, 0).reshape(2, 2, *given[0].shape)
         return mean, stderr
 
     def _settle(self, statistics: Statistics, anew: bool) -> None:

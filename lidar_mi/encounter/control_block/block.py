@@ -93,7 +93,7 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
     scale = np.sqrt([fit.innovation_variance for fit in fits] / np.diag(covariance))
     covariance = covariance * np.outer(scale, scale)
     units = [GUSTS[axis][0] for axis in axes]
-    found = xr.Dataset(
+    block = xr.Dataset(
         {
             **state_space(fits, delay_steps),
             "noise_covariance": (
@@ -109,9 +109,9 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
         },
         {"axis": axes},
     )
-    found["axis_units"] = "axis", np.array(units, dtype=object)
-    found["axis_meaning"] = "axis", np.array([GUSTS[a][1] for a in axes], dtype=object)
-    return found
+    block["axis_units"] = "axis", np.array(units, dtype=object)
+    block["axis_meaning"] = "axis", np.array([GUSTS[a][1] for a in axes], dtype=object)
+    return block
 
 
 def state_space(fits: Sequence[FilterFit], delay_steps: int) -> Variables:
@@ -241,12 +241,12 @@ def _numbers(flights: Sequence[SensorSamples], fits: Sequence[FilterFit]) -> Var
         "decay_before": (ratio, "r: of taps from plane to plane before the estimated one"),
         "decay_after": (ratio, "s: of taps from plane to plane after the estimated one"),
     }
-    found = {}
+    numbers = {}
     for name, value, error in zip(texts, values, errors, strict=True):
         about, text = texts[name]
-        found[name] = column(value, about, text)
-        found[f"{name}_stderr"] = column(error, about, f"standard error of {name}")
-    return found | {
+        numbers[name] = column(value, about, text)
+        numbers[f"{name}_stderr"] = column(error, about, f"standard error of {name}")
+    return numbers | {
         "taps": (
             tap,
             np.array([fit.taps for fit in fits]),
@@ -286,12 +286,12 @@ def _losses(flights: Sequence[SensorSamples], measured: list[int]) -> Variables:
         "loss_gust_ratio": (ratio, "mean square of the gust in lost slabs over that in all"),
         "loss_gust_p": (ratio_p, "p value of losses that do not depend on the gust"),
     }
-    found = {
+    losses = {
         name: (("axis",) if np.ndim(value) else (), value, {"units": "1", "long_name": text})
         for name, (value, text) in texts.items()
     }
     about = {"units": "1", "long_name": "probability from received, lost to received, lost"}
-    return {**found, "loss_transition": (("loss", "loss_2"), chain.transition, about)}
+    return {**losses, "loss_transition": (("loss", "loss_2"), chain.transition, about)}
 
 
 def _spectra(fits: Sequence[FilterFit], dt: float, delay_steps: int) -> Variables:

@@ -71,44 +71,47 @@ def export_control(
     out = folder / "control" if out is None else Path(out)
     groups = list(pooled([samples_of(one) for one in flights_in(folder)]))
     blocks = dict(zip(_names([group[0].distance for group in groups]), groups, strict=True))
-    found, refused = {}, []
+    by_axis, refused = {}, []
     for name, group in blocks.items():
         try:
-            found[name] = control_block(group)
+            by_axis[name] = control_block(group)
         except InputError as error:
             refused.append(error)
-    if not found:
+    if not by_axis:
         raise refused[0]
-    paths = [out / f"{name}{kind}" for name in found for kind in (".npz", ".mat")]
+    paths = [out / f"{name}{kind}" for name in by_axis for kind in (".npz", ".mat")]
     paths.append(out / ABOUT)
     there = [path for path in paths if path.exists()]
     if there and not overwrite:
         raise InputError(
             f"{there[0]}: exists; expected another folder (-o DIR), or --overwrite to replace it"
         )
-    for text in [*map(str, refused), *(line for name in found for line in _doubts(found[name]))]:
+    for text in [
+        *map(str, refused),
+        *(line for name in by_axis for line in _doubts(by_axis[name])),
+    ]:
         (remark or warnings.warn)(text)
     make_folder(out)
-    for name, block in found.items():
+    for name, block in by_axis.items():
         write_npz(out / f"{name}.npz", block)
         write_mat(out / f"{name}.mat", block)
-    write_text(out / ABOUT, to_json({name: _described(block) for name, block in found.items()}))
+    write_text(out / ABOUT, to_json({name: _described(block) for name, block in by_axis.items()}))
     return paths
 
 
 def _doubts(block: xr.Dataset) -> list[str]:
     """A line for each property of the losses that the chain does not have."""
     where = f"control block at {float(block['range']):.4g} m: lost estimates"
-    found = []
+    doubts = []
     if (p := float(block["loss_memory_p"])) < _UNLIKELY:
-        found.append(f"{where}: the lengths of runs are not geometric (p = {p:.1g})")
+        doubts.append(f"{where}: the lengths of runs are not geometric (p = {p:.1g})")
     for axis in block["axis"].values[block["loss_gust_p"].values < _UNLIKELY]:
         ratio = float(block["loss_gust_ratio"].sel(axis=axis))
-        found.append(
+        doubts.append(
             f"{where} depend on the gust: the mean square of {axis} in them is {ratio:.2g} times "
             "that in all"
         )
-    return found
+    return doubts
 
 
 def _names(distances: list[float]) -> list[str]:

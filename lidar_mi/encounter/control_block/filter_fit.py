@@ -98,15 +98,15 @@ class FilterFit:
     def _slopes(self) -> np.ndarray:
         """Of `taps` by G, r and s; (taps, 3)."""
         gain, decays = self.parameters[1], list(self.parameters[2:])
-        found = [_weights(decays[0], decays[1], self.after)]
+        slopes = [_weights(decays[0], decays[1], self.after)]
         step = 1e-5
         for k in (0, 1):
             # inward: a decay may be at an edge
             other = decays.copy()
             other[k] += step if decays[k] < _LARGEST_DECAY / 2 else -step
-            change = _weights(other[0], other[1], self.after) - found[0]
-            found.append(gain * change / (other[k] - decays[k]))
-        return np.stack(found, axis=-1)
+            change = _weights(other[0], other[1], self.after) - slopes[0]
+            slopes.append(gain * change / (other[k] - decays[k]))
+        return np.stack(slopes, axis=-1)
 
 
 def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
@@ -132,15 +132,15 @@ def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
             f"{int(usable.sum())} slabs in succession with a valid wind are too few to identify a "
             f"filter; expected {LEAST_SAMPLES} or more, as of longer flights or of several"
         )
-    found, least = None, np.inf
+    best, least = None, np.inf
     for lags in range(MOST_LAGS + 1):
         fit = _fitted(output, value, after, lags)
         number = int(usable.sum())
         criterion = number * np.log(np.mean(fit.innovations[usable] ** 2)) + lags * np.log(number)
         if criterion < least:
-            found, least = fit, criterion
-    assert found is not None  # the criterion of finite data is finite
-    return found
+            best, least = fit, criterion
+    assert best is not None  # the criterion of finite data is finite
+    return best
 
 
 def fit_process(values: np.ndarray) -> tuple[np.ndarray, float]:
@@ -153,14 +153,14 @@ def fit_process(values: np.ndarray) -> tuple[np.ndarray, float]:
     """
     before = [_delayed(values, k) for k in range(MOST_PROCESS_LAGS + 1)]
     usable = np.isfinite(before).all(axis=0)
-    found, least = (np.zeros(0), 0.0), np.inf
+    best, least = (np.zeros(0), 0.0), np.inf
     for number in range(MOST_PROCESS_LAGS + 1):
         lags = burg(values, number)
         variance = float(np.mean(_whitened(values, lags)[usable] ** 2))
         criterion = usable.sum() * np.log(variance) + number * np.log(usable.sum())
         if criterion < least:
-            found, least = (lags, variance), criterion
-    return found
+            best, least = (lags, variance), criterion
+    return best
 
 
 def autocovariance(lags: np.ndarray, innovation_variance: float, number: int) -> np.ndarray:
@@ -175,10 +175,10 @@ def autocovariance(lags: np.ndarray, innovation_variance: float, number: int) ->
     drive = np.zeros((p, p))
     drive[0, 0] = innovation_variance
     first = scipy.linalg.solve_discrete_lyapunov(companion, drive)[0]
-    found = list(first)
-    while len(found) < number:
-        found.append(float(lags @ found[: -p - 1 : -1]))
-    return np.array(found[:number])
+    covariances = list(first)
+    while len(covariances) < number:
+        covariances.append(float(lags @ covariances[: -p - 1 : -1]))
+    return np.array(covariances[:number])
 
 
 def _weights(before: float, ahead: float, after: int) -> np.ndarray:
@@ -193,7 +193,7 @@ def _fitted(output: np.ndarray, value: np.ndarray, after: int, lags: int) -> Fil
     around = np.stack([_delayed(value, k) for k in range(-after, BEFORE + 1)], axis=-1)
     a = np.zeros(0)
     # the mean error and gain of least squares without memory
-    found = np.array([0.0, 1.0, 0.2, 0.2])
+    parameters = np.array([0.0, 1.0, 0.2, 0.2])
     for _ in range(_ROUNDS):
         white, design, ones = (_whitened(one, a) for one in (output, around, np.ones(len(output))))
         there = np.isfinite(white) & np.isfinite(design).all(axis=-1)
@@ -207,24 +207,24 @@ def _fitted(output: np.ndarray, value: np.ndarray, after: int, lags: int) -> Fil
             np.array([-np.inf, -np.inf, 0, 0]),
             np.array([np.inf, np.inf, *2 * [_LARGEST_DECAY]]),
         )
-        inside = np.clip(found, edges[0] + 1e-3, edges[1] - 1e-3)
+        inside = np.clip(parameters, edges[0] + 1e-3, edges[1] - 1e-3)
         data = white[there], design[there], ones[there]
         solution = scipy.optimize.least_squares(errors, inside, bounds=edges, args=data)
-        found = solution.x
-        before, a = a, burg(errors(found, output, around, np.ones(len(output))), lags)
+        parameters = solution.x
+        before, a = a, burg(errors(parameters, output, around, np.ones(len(output))), lags)
         if len(before) == lags and np.allclose(a, before, rtol=0, atol=1e-5):
             break
     innovations = np.full(len(output), np.nan)
     innovations[there] = solution.fun
     count = int(there.sum())
-    variance = float(np.sum(solution.fun**2) / (count - len(found) - lags))
+    variance = float(np.sum(solution.fun**2) / (count - len(parameters) - lags))
     noise = scipy.linalg.toeplitz(autocovariance(a, variance, lags)) if lags else np.zeros((0, 0))
-    free = np.flatnonzero([True, True, *(found[2:] > 1e-3)])
+    free = np.flatnonzero([True, True, *(parameters[2:] > 1e-3)])
     covariance = np.zeros((4, 4))
     jacobian = solution.jac[:, free]
     covariance[np.ix_(free, free)] = variance * np.linalg.inv(jacobian.T @ jacobian)
     return FilterFit(
-        found,
+        parameters,
         covariance,
         after,
         a,
@@ -254,16 +254,16 @@ def burg(values: np.ndarray, lags: int) -> np.ndarray:
 
 def _delayed(values: np.ndarray, by: int) -> np.ndarray:
     """Values of so many samples before; of a negative number, after."""
-    found = np.full(values.shape, np.nan)
+    delayed = np.full(values.shape, np.nan)
     if by >= 0:
-        found[by:] = values[: len(values) - by]
+        delayed[by:] = values[: len(values) - by]
     else:
-        found[:by] = values[-by:]
-    return found
+        delayed[:by] = values[-by:]
+    return delayed
 
 
 def _whitened(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    found = values.copy()
+    white = values.copy()
     for k, a in enumerate(lags, 1):
-        found -= a * _delayed(values, k)
-    return found
+        white -= a * _delayed(values, k)
+    return white

@@ -39,8 +39,8 @@ def stationary_distribution(transition: ArrayLike) -> np.ndarray:
             "probabilities whose rows sum to 1"
         )
     balance = np.vstack([p.T - np.eye(len(p)), np.ones(len(p))])
-    found = np.linalg.lstsq(balance, np.eye(1, len(p) + 1, len(p))[0], rcond=None)[0]
-    return np.clip(found, 0.0, 1.0)
+    probability = np.linalg.lstsq(balance, np.eye(1, len(p) + 1, len(p))[0], rcond=None)[0]
+    return np.clip(probability, 0.0, 1.0)
 
 
 def jump_covariance(

@@ -70,18 +70,18 @@ def flights_in(folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     needed = (RECORD, FLIGHT_FILES["series"], FLIGHT_FILES["slabs"])
-    found = sorted(
+    files = sorted(
         path.parent
         for path in (folder, *folder.rglob("*/"))
         for path in [path / RECORD]
         if all((path.parent / name).is_file() for name in needed)
     )
-    if not found:
+    if not files:
         raise InputError(
             f"{folder}: holds no finished flight with the lidar; expected the folder of lidar-mi "
             "fly --mode feedforward, or of a campaign of flights with keep: everything"
         )
-    return found
+    return files
 
 
 def samples_of(folder: Path) -> SensorSamples:

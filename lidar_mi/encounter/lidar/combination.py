@@ -97,5 +97,5 @@ def combined_in_flight(
             for axis, start in (("y", place[1]), ("z", place[2]))
         }
     )
-    found = combine(local, lines, crossflow_std=crossflow_std, distance=x - place[0])
-    return found.assign_coords(axes)
+    combined = combine(local, lines, crossflow_std=crossflow_std, distance=x - place[0])
+    return combined.assign_coords(axes)

@@ -57,18 +57,18 @@ class LineSpeeds:
         )
         own = torch.tensor(frames.own)
         emitted = laser.of(own)
-        found = torch.stack([*difference(air, emitted), emitted.v_los_std]).numpy()
+        speeds = torch.stack([*difference(air, emitted), emitted.v_los_std]).numpy()
         missed = np.flatnonzero(~(air.read & laser.read[own]).numpy())
         if missed.size:
-            found[:, missed] = self._fitted(frames, missed.tolist())
+            speeds[:, missed] = self._fitted(frames, missed.tolist())
         if missed.size > _MOST_MISSED * len(frames.air):
             self._scores = None
-        return self._with(frames, found)
+        return self._with(frames, speeds)
 
     def _reference(self, frames: LineFrames) -> list[MatchedScore] | None:
         """Score functions of air and laser; None where the frames do not fit the model."""
         assumed, settings = self._assumed, self._doppler.retrieval
-        found = []
+        emitted = []
         for part, model, noise in zip(
             (frames.air, frames.laser), (assumed.model, assumed.laser), self._noises, strict=True
         ):
@@ -83,8 +83,8 @@ class LineSpeeds:
                 )
             except InputError:
                 return None
-            found.append(matched_score(fit, model, noise, response=assumed.response))
-        return found
+            emitted.append(matched_score(fit, model, noise, response=assumed.response))
+        return emitted
 
     def _fitted(self, frames: LineFrames, lines: Sequence[int]) -> np.ndarray:
         """Speeds (4, lines) of some lines by a fit each; NaN where a fit is refused."""
@@ -99,7 +99,7 @@ class LineSpeeds:
             RingCentre.FREE,
         )
 
-    def _with(self, frames: LineFrames, found: np.ndarray) -> xr.Dataset:
+    def _with(self, frames: LineFrames, speeds: np.ndarray) -> xr.Dataset:
         return with_speeds(
-            frames.lines, found, self._doppler, self._pulses, self._experiment.seed, frames.scan
+            frames.lines, speeds, self._doppler, self._pulses, self._experiment.seed, frames.scan
         )

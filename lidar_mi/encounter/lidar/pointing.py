@@ -24,9 +24,9 @@ def pointing_error(experiment: Experiment, number: int, time: float) -> Rotation
     if reported is None:
         return None
     level = Pose(np.zeros((1, 3)), np.zeros((1, 3)), Rotation.identity(1))
-    found = reported_pose(reported, lambda _: level, np.array([time]), 0.0, experiment.seed, number)
+    pose = reported_pose(reported, lambda _: level, np.array([time]), 0.0, experiment.seed, number)
     # the scanner turns the beams against the reported attitude
-    return found.attitude[0].inv()
+    return pose.attitude[0].inv()
 
 
 def check_reported(reported: Reported | None) -> None:

@@ -58,22 +58,19 @@ class ScanStore:
         if not path.is_file():
             return None
         try:
-            found = read_netcdf(path)
+            scan = read_netcdf(path)
         except InputError:  # damaged: it is rendered again
             return None
         about = _about(pose, window)
-        if found.attrs.get(MADE_BY) != self.made_by or not np.allclose(
-            [found.attrs.get(name, np.nan) for name in about],
+        if scan.attrs.get(MADE_BY) != self.made_by or not np.allclose(
+            [scan.attrs.get(name, np.nan) for name in about],
             list(about.values()),
             rtol=0,
             atol=_ROUNDING,
         ):
             return None
         return Scan(
-            *(
-                found[name].rename({f"{gate}_{axis}": axis for axis in "zy"})
-                for name, gate in _PARTS
-            )
+            *(scan[name].rename({f"{gate}_{axis}": axis for axis in "zy"}) for name, gate in _PARTS)
         )
 
     def write(

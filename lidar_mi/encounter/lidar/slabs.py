@@ -146,14 +146,14 @@ def _image_axes(settings: Wake, wake: WakeAlongPath, most: int) -> tuple[np.ndar
     if not isinstance(wake, VolumeAlongPath):
         y, z = analytic_axes(settings, "vortex_pair", most)
         return y, z
-    spacing, found = settings.spacing, {}
+    spacing, axes = settings.spacing, {}
     for name in "yz":
         # rounding must not cost a cell of an extent that is a whole number of them
         cells = math.floor(float(np.ptp(wake.flow[name].values)) / spacing + 1e-6)
-        found[name] = spacing * (np.arange(cells + 1) - cells / 2)
-    counts = {name: len(axis) for name, axis in found.items()}
+        axes[name] = spacing * (np.arange(cells + 1) - cells / 2)
+    counts = {name: len(axis) for name, axis in axes.items()}
     check_nodes(spacing, counts, most)
-    return found["y"], found["z"]
+    return axes["y"], axes["z"]
 
 
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -239,8 +239,8 @@ class Air:
         # exhaust is advected as the texture is: that of the place and time of origin
         times = np.full(len(x), now)
         times[advected] -= gates.period
-        found = self.wake.extinction(at_x, at_y, at_z, times[:, None, None])
-        mean = self.background if found is None else found
+        extinction = self.wake.extinction(at_x, at_y, at_z, times[:, None, None])
+        mean = self.background if extinction is None else extinction
         values = mean * self.texture.at(at_x, at_y, at_z) + self.molecules
         field = xr.DataArray(values, {"x": x, "y": y, "z": z}, ("x", "y", "z"))
         field["x"].attrs["cell_width"] = step

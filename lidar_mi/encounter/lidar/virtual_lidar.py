@@ -195,7 +195,7 @@ class VirtualLidar:
             return nothing(flags=flags)
         midway = Midway.between(came_from, pose, period)
         complete = self._completion(x, midway, pose)
-        found = self._estimated(
+        estimate = self._estimated(
             number,
             images.first,
             images.second,
@@ -206,25 +206,25 @@ class VirtualLidar:
             complete=complete if self._doppler or complete.by_pointing else None,
             telescope=(midway.place[0] - x, midway.place[1], midway.place[2]),
         )
-        delivered, wind_delivered = self._delivered(number, found.seconds)
-        if "vortices" in found.seconds:
-            self._window.add(delivered, found.pair)
-        pair = found.pair.with_common_error(
+        delivered, wind_delivered = self._delivered(number, estimate.seconds)
+        if "vortices" in estimate.seconds:
+            self._window.add(delivered, estimate.pair)
+        pair = estimate.pair.with_common_error(
             complete.common, complete.common, complete.rotation, complete.roll_axis
         )
-        flags += found.flags
+        flags += estimate.flags
         if not pair.success:
             flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
         return Estimate(
             valid,
             delivered,
             x,
-            found.wind,
+            estimate.wind,
             pair,
             flags,
-            found.seconds,
-            found.lines,
-            wind_delivered if found.wind is not None else None,
+            estimate.seconds,
+            estimate.lines,
+            wind_delivered if estimate.wind is not None else None,
         )
 
     def _estimated(self, number: int, *images: Any, **about: Any) -> SlabEstimate:
@@ -362,13 +362,13 @@ class VirtualLidar:
             noise = np.hypot(noise, scan["S0_noise_std"].values)
         y, z = self.gates.axes(plan, gate)
         axes = {"z": ("z", pose.z + z, {"units": "m"}), "y": ("y", pose.y + y, {"units": "m"})}
-        found = []
+        images = []
         for s0 in (scan["S0_noisy" if noisy else "S0"].values.astype(float), noise):
             values = attenuated_backscatter(
                 s0, plan, self.experiment.lidar.aperture_area, scan.attrs["environment_extinction"]
             )
-            found.append(xr.DataArray(values[gate], axes, ("z", "y"), attrs={"units": "m-1 sr-1"}))
-        return found[0], found[1]
+            images.append(xr.DataArray(values[gate], axes, ("z", "y"), attrs={"units": "m-1 sr-1"}))
+        return images[0], images[1]
 
 
 def _on_first_grid(before: Scan, scan: Scan) -> tuple[SlabImages | None, tuple[str, ...]]:

@@ -30,26 +30,26 @@ _LEAST_ACROSS = 0.05  # of the scan's plane to the flight path: 3 degrees
 def line_scan(scan: CoherentScan) -> LineScan:
     """Direction and time of every line."""
     if scan.kind == "stare":
-        found = stare_scan(scan.azimuth, scan.elevation, scan.accumulation, scan.count)
+        beams = stare_scan(scan.azimuth, scan.elevation, scan.accumulation, scan.count)
     elif scan.kind == "dbs":
-        found = dbs_scan(scan.elevation, scan.accumulation, move=scan.move, count=scan.count)
+        beams = dbs_scan(scan.elevation, scan.accumulation, move=scan.move, count=scan.count)
     elif scan.kind == "ppi":
-        found = ppi_scan(
+        beams = ppi_scan(
             scan.elevation, scan.azimuths, scan.rate, scan.accumulation, count=scan.count
         )
     else:
-        found = rhi_scan(
+        beams = rhi_scan(
             scan.azimuth, scan.elevations, scan.rate, scan.accumulation, count=scan.count
         )
     wait = 0.0 if scan.repeat is None else scan.repeat - scan.duration
-    number = np.arange(scan.count) if scan.kind == "stare" else found.sweep
+    number = np.arange(scan.count) if scan.kind == "stare" else beams.sweep
     return LineScan(
-        found.time + wait * number,
-        found.azimuth,
-        found.elevation,
-        found.sweep,
-        found.azimuth_span,
-        found.elevation_span,
+        beams.time + wait * number,
+        beams.azimuth,
+        beams.elevation,
+        beams.sweep,
+        beams.azimuth_span,
+        beams.elevation_span,
     )
 
 
@@ -180,10 +180,10 @@ def true_vortices(doppler: CoherentDoppler, air: PassingWake, times: np.ndarray)
     Distance along the azimuth and height above the lidar (m), circulation over rings of 5 to 15 m
     (m^2/s, positive from distance to height).
     """
-    found = [air.vortices(float(time)) or () for time in times]
+    vortices = [air.vortices(float(time)) or () for time in times]
     # those of a simulated plane are averages already
     averaged = isinstance(air.wake, VolumeAlongPath)
-    return np.array([[_in_plane(doppler, one, averaged) for one in pair] for pair in found])
+    return np.array([[_in_plane(doppler, one, averaged) for one in pair] for pair in vortices])
 
 
 def ring_fraction(core_radius: np.ndarray, model: Model) -> np.ndarray:

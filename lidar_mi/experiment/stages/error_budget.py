@@ -142,7 +142,7 @@ def _budgets(
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if sensor.detector:
         sources |= {"measured": Source.NOISY, "detector_noise": Source.BACKSCATTER}
-    found: dict[str, dict[str, float]] = {}
+    budgets: dict[str, dict[str, float]] = {}
     for index, method in enumerate(methods):
         progress(f"retrieving without each cause of error, {method}", index / len(methods))
         winds = {}
@@ -186,8 +186,8 @@ def _budgets(
             pair = images["measured"].pair
             stiff = moved_rigidly(measured, pair, blurred, truth.wind, at_stride)
             winds |= {} if stiff is None else {"shear": stiff}
-        found[method] = error_budget(measured, winds, truth.wind, cores, perfect, flagged)
-    return found
+        budgets[method] = error_budget(measured, winds, truth.wind, cores, perfect, flagged)
+    return budgets
 
 
 def _images(
@@ -265,18 +265,18 @@ def platforms_without(platform: Platform) -> dict[str, Platform]:
     Errors of the reported pose that come from its age are zero without motion. Random numbers of
     the other causes are the same.
     """
-    found = {}
+    platforms = {}
     motion, reported = platform.motion or Motion(), platform.reported or Reported()
     # jitter is a cause of its own, which stays without motion
     still = Motion().model_copy(update={"scanner_jitter": motion.scanner_jitter})
     if motion != still:
-        found["motion"] = platform.model_copy(update={"motion": still})
+        platforms["motion"] = platform.model_copy(update={"motion": still})
     if motion.scanner_jitter > 0:
         steady = motion.model_copy(update={"scanner_jitter": 0.0})
-        found["scanner_jitter"] = platform.model_copy(update={"motion": steady})
+        platforms["scanner_jitter"] = platform.model_copy(update={"motion": steady})
     if reported != Reported():
-        found["navigation"] = platform.model_copy(update={"reported": None})
-    return found
+        platforms["navigation"] = platform.model_copy(update={"reported": None})
+    return platforms
 
 
 def _without_noise(

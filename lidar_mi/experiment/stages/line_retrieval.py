@@ -52,25 +52,25 @@ def line_winds(
     from lidar_mi.retrieval.ground_winds.winds import fit_winds_to_lines
 
     log.bar("fitting winds to lines of sight", None)
-    found = fit_winds_to_lines(coherent_lines, interval=doppler_interval)
-    true = np.full((3, found.sizes["time"], found.sizes["height"]), np.nan)
+    winds = fit_winds_to_lines(coherent_lines, interval=doppler_interval)
+    true = np.full((3, winds.sizes["time"], winds.sizes["height"]), np.nan)
     groups = coherent_lines["sweep"].values
     if doppler_interval is not None:
         seconds = _seconds(coherent_lines["time"])
         groups = (seconds - seconds[0]) // doppler_interval
     numbers = np.unique(groups)
-    if len(numbers) != found.sizes["time"]:
+    if len(numbers) != winds.sizes["time"]:
         raise InputError(
-            f"doppler.scan: {found.sizes['time']} of {len(numbers)} scans have winds; expected all "
+            f"doppler.scan: {winds.sizes['time']} of {len(numbers)} scans have winds; expected all "
             "(a stronger doppler.signal)"
         )
     for k, number in enumerate(numbers):
         one = coherent_lines.isel(time=np.flatnonzero(groups == number))
-        true[:, k] = _mean_wind(one, found["height"].values, passing_air)
+        true[:, k] = _mean_wind(one, winds["height"].values, passing_air)
     for k, name in enumerate("uvw"):
-        attributes = {"units": "m s-1", "long_name": f"true {found[name].attrs['long_name']}"}
-        found[f"{name}_true"] = ("time", "height"), true[k], attributes
-    return found
+        attributes = {"units": "m s-1", "long_name": f"true {winds[name].attrs['long_name']}"}
+        winds[f"{name}_true"] = ("time", "height"), true[k], attributes
+    return winds
 
 
 def line_vortices(
@@ -94,29 +94,29 @@ def line_vortices(
 
     log.bar("fitting vortices to lines of sight", None)
     ground = -doppler.position[2] if doppler.passage.ground and wake.vortex_pair else None
-    found = fit_vortices_to_lines(coherent_lines, ground=ground, notice=log.bar)
-    found = _flagged(found, coherent_lines)
-    seconds = _seconds(found["time"])
-    peer = _by_peer(coherent_lines, doppler, passing_air, found.attrs["profile"])
+    vortices = fit_vortices_to_lines(coherent_lines, ground=ground, notice=log.bar)
+    vortices = _flagged(vortices, coherent_lines)
+    seconds = _seconds(vortices["time"])
+    peer = _by_peer(coherent_lines, doppler, passing_air, vortices.attrs["profile"])
     true = _nearer_first(doppler, passing_air, np.stack([seconds, seconds], -1))
     at_peer = _nearer_first(doppler, passing_air, peer[..., 3])
     both = "scan", "vortex"
     for k, name in enumerate(("y", "z", "circulation_5_15")):
-        about = found[name].attrs
+        about = vortices[name].attrs
         text = about["long_name"]
-        found[f"{name}_true"] = both, true[..., k], about | {"long_name": f"true {text}"}
+        vortices[f"{name}_true"] = both, true[..., k], about | {"long_name": f"true {text}"}
         by = f"{text}, by the method of radial velocities"
-        found[f"{name}_rv"] = both, peer[..., k], about | {"long_name": by}
+        vortices[f"{name}_rv"] = both, peer[..., k], about | {"long_name": by}
         then = f"true {text} at its time"
-        found[f"{name}_rv_true"] = both, at_peer[..., k], about | {"long_name": then}
+        vortices[f"{name}_rv_true"] = both, at_peer[..., k], about | {"long_name": then}
     age = {"units": "s", "long_name": "age of the wake"}
-    found["age"] = "scan", doppler.passage.age + seconds, age
+    vortices["age"] = "scan", doppler.passage.age + seconds, age
     # of a wake near the ground it grows
     first = true_vortices(doppler, passing_air, np.zeros(1))[0]
     separation = (
         wake.vortex_pair.separation if wake.vortex_pair else np.hypot(*np.ptp(first, 0)[:2])
     )
-    return found.assign_attrs(separation=float(separation))
+    return vortices.assign_attrs(separation=float(separation))
 
 
 def _nearer_first(doppler: CoherentDoppler, air: PassingWake, seconds: np.ndarray) -> np.ndarray:
@@ -130,7 +130,7 @@ def _nearer_first(doppler: CoherentDoppler, air: PassingWake, seconds: np.ndarra
     return true
 
 
-def _flagged(found: xr.Dataset, lines: xr.Dataset) -> xr.Dataset:
+def _flagged(vortices: xr.Dataset, lines: xr.Dataset) -> xr.Dataset:
     """Slices whose echo is uneven have the flag uneven_echo.
 
     A fit takes the echo for even within a gate. Of exhaust in the cores, which scatters more than
@@ -139,11 +139,11 @@ def _flagged(found: xr.Dataset, lines: xr.Dataset) -> xr.Dataset:
     ratio, sweep = lines["snr"].values, lines["sweep"].values
     away = np.abs(np.log(ratio / np.median(ratio, axis=0)))
     spread = np.array([np.quantile(away[sweep == number], _PART) for number in np.unique(sweep)])
-    flag = found["flag"]
+    flag = vortices["flag"]
     masks = np.append(flag.attrs["flag_masks"], _UNEVEN_ECHO).astype(np.uint16)
     about = {"flag_masks": masks, "flag_meanings": f"{flag.attrs['flag_meanings']} uneven_echo"}
     uneven = np.where(spread > math.log(_UNEVEN), _UNEVEN_ECHO, 0).astype(flag.dtype)
-    return found.assign(flag=("scan", flag.values | uneven, flag.attrs | about))
+    return vortices.assign(flag=("scan", flag.values | uneven, flag.attrs | about))
 
 
 def _by_peer(
@@ -169,11 +169,11 @@ def _by_peer(
         guess = _nearer_first(doppler, air, middle)[0]
         cores = np.full((2, 1), np.log(given.core_radius))
         with threadpool_limits(1, "blas"):
-            found = by_radial_velocities(scan, lidar, given, np.hstack([guess, cores]))
-        if found is not None:
-            row[:, :3] = found * [1, 1, part]
+            vortices = by_radial_velocities(scan, lidar, given, np.hstack([guess, cores]))
+        if vortices is not None:
+            row[:, :3] = vortices * [1, 1, part]
             # when the lines pass there
-            angle = np.arctan2(found[:, 1], found[:, 0])
+            angle = np.arctan2(vortices[:, 1], vortices[:, 0])
             row[:, 3] = start + np.interp(angle, scan.angle, scan.time)
     return rows
 

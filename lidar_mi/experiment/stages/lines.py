@@ -202,7 +202,7 @@ def with_speeds(
     streams = [seed, _DRIFTS + scan]
     drift, drift_std = drifts(doppler, pulses, streams, range(len(v_los)), PULSES)
     # all at once: each variable that a data set takes later copies and aligns it again
-    found: dict[str, tuple[Any, ...]] = {
+    variables: dict[str, tuple[Any, ...]] = {
         "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),
         # independent errors: variances add
         "v_los_std": ("line", np.hypot(std, drift_std), lines.variables["v_los_std"].attrs),
@@ -216,5 +216,5 @@ def with_speeds(
     if shared is not None:
         text = "covariance of the random errors of v_los by the laser's frames, beside v_los_std"
         about = {"units": "m2 s-2", "long_name": text}
-        found["v_los_covariance"] = ("line", "other_line"), shared, about
-    return lines.assign(found)
+        variables["v_los_covariance"] = ("line", "other_line"), shared, about
+    return lines.assign(variables)

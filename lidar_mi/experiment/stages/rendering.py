@@ -74,11 +74,11 @@ def scattering_air(
     """
     check_variant(render.variant)
     log.bar("reading scattering matrices", None)
-    found = scatterer(scattering, search_path, lidar.wavelength, log.bar)
-    if isinstance(found.phase.get("table"), str):
+    medium = scatterer(scattering, search_path, lidar.wavelength, log.bar)
+    if isinstance(medium.phase.get("table"), str):
         # a file that the plugin alone reads
         use_variant(render.variant)
-    return found
+    return medium
 
 
 def environment_extinction(wake: Wake, truth: Truth) -> float:
@@ -317,11 +317,11 @@ def batches_of(
         name = names[index]
 
         def load() -> dict[str, Any] | None:
-            found = store.unfinished(name)
-            if not found or found.pop("samples", samples) != samples:
+            unfinished = store.unfinished(name)
+            if not unfinished or unfinished.pop("samples", samples) != samples:
                 return None
-            log(f"resuming {name}: {found['passes']} passes are stored from an earlier run")
-            return found
+            log(f"resuming {name}: {unfinished['passes']} passes are stored from an earlier run")
+            return unfinished
 
         def save(arrays: dict[str, Any]) -> None:
             number = {} if samples is None else {"samples": np.array(samples)}
@@ -392,7 +392,7 @@ def with_pair_stderr(scans: Sequence[xr.Dataset], wind: xr.Dataset, dt: float) -
             for a, b, c in zip(*(one.values.astype(float) for one in errors), strict=True)
         ]
     )
-    found = []
+    images = []
     for scan in scans:
         fraction = xr.DataArray(fractions, first["S0_stderr"].coords, ("gate", "z", "y"))
         if places:
@@ -402,8 +402,8 @@ def with_pair_stderr(scans: Sequence[xr.Dataset], wind: xr.Dataset, dt: float) -
             fraction = fraction.interp(at).drop_vars(["z", "y"], errors="ignore")
         error = scan["S0_stderr"].transpose("gate", "z", "y")
         values = (error.values * np.sqrt(fraction.values)).astype(np.float32)
-        found.append(scan.assign(S0_pair_stderr=(("gate", "z", "y"), values)))
-    return found
+        images.append(scan.assign(S0_pair_stderr=(("gate", "z", "y"), values)))
+    return images
 
 
 def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:
@@ -421,8 +421,8 @@ def gridded_scans(platform: Platform, detected: Sequence[xr.Dataset]) -> list[xr
     # times in double precision, so that those of a node are not rounded twice
     scans = [scan.assign(beam_time=scan["beam_time"].astype(float)) for scan in detected]
     image = "Y_noisy" if "Y_noisy" in scans[0] else "Y"
-    found = synchronised(scans, [platform.dt], image)
-    return [scan.assign_attrs(gridded=1) for scan in found]
+    gridded = synchronised(scans, [platform.dt], image)
+    return [scan.assign_attrs(gridded=1) for scan in gridded]
 
 
 def detector_noise(

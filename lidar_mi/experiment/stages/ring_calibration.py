@@ -41,11 +41,11 @@ def calibration_file(doppler: Doppler, rings: Rings, search_path: Path) -> "Cali
     if asked is None or asked.file is None:
         return None
     try:
-        found = calibration_of(read_netcdf(find_file(asked.file, search_path, "file")))
-        calibrated(rings.model, found)
+        calibration = calibration_of(read_netcdf(find_file(asked.file, search_path, "file")))
+        calibrated(rings.model, calibration)
     except InputError as error:
         raise InputError(f"doppler.calibration.file: {error}") from None
-    return found
+    return calibration
 
 
 def assumed_rings(
@@ -67,8 +67,8 @@ def assumed_rings(
     from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
 
     air, laser = ring_models(doppler)
-    asked, found = doppler.calibration, calibration_file
-    if asked is not None and found is None:
+    asked, calibration = doppler.calibration, calibration_file
+    if asked is not None and calibration is None:
         log(f"calibrating the instrument from {asked.frames} frames of the laser")
         line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
         light = reference_photons(doppler, rings)
@@ -81,7 +81,7 @@ def assumed_rings(
             )
         frames = exposed_frames(doppler, rings, mean, 1, seed, numbers)
         try:
-            found = calibrate_rings(
+            calibration = calibrate_rings(
                 frames,
                 laser,
                 pixel_noise(doppler.ccd, rings.modes),
@@ -90,22 +90,22 @@ def assumed_rings(
             )
         except InputError as error:
             raise InputError(f"doppler.calibration: {error}") from None
-        log(_summary(found))
-    if found is None:
+        log(_summary(calibration))
+    if calibration is None:
         return rings._replace(model=air, laser=laser)
-    response = torch.from_numpy(found.response.astype(float))
+    response = torch.from_numpy(calibration.response.astype(float))
     return rings._replace(
-        model=calibrated(air, found),
-        laser=calibrated(laser, found),
+        model=calibrated(air, calibration),
+        laser=calibrated(laser, calibration),
         # pixels of one response need no cells of their own
         response=None if bool((response == 1).all()) else response,
     )
 
 
-def _summary(found: "Calibration") -> str:
+def _summary(calibration: "Calibration") -> str:
     text = (
-        f"calibration: focal length {found.focal_length * 1e3:.4f} mm, finesse "
-        f"{found.finesse:.3g}, chi-square {found.chi_square:.3f}"
+        f"calibration: focal length {calibration.focal_length * 1e3:.4f} mm, finesse "
+        f"{calibration.finesse:.3g}, chi-square {calibration.chi_square:.3f}"
     )
-    missing = ", ".join(found.undetermined)
+    missing = ", ".join(calibration.undetermined)
     return f"{text}; not determined: {missing}" if missing else text

@@ -99,10 +99,10 @@ def shared_covariance(
         return None
     group, slot = np.divmod(np.arange(len(laser_std)), sharing)
     weight = _reached(slot, averaged, 1, every)
-    found = np.outer(laser_std, laser_std) + step_speed(doppler) ** 2 * weight @ weight.T
-    found[group[:, None] != group] = 0
-    np.fill_diagonal(found, 0)
-    return found
+    covariance = np.outer(laser_std, laser_std) + step_speed(doppler) ** 2 * weight @ weight.T
+    covariance[group[:, None] != group] = 0
+    np.fill_diagonal(covariance, 0)
+    return covariance
 
 
 def calibration_drift(doppler: Doppler, frames: int, seed: int) -> np.ndarray:

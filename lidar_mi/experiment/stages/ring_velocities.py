@@ -65,12 +65,12 @@ def line_of_sight_winds(
     """
     rings = assumed_rings
     expected = [expected_image(image, rings.photons) for image in lit_rings.received]
-    found = velocities(doppler, rings, lit_rings, expected, seed, log)
-    found.attrs |= {
+    winds = velocities(doppler, rings, lit_rings, expected, seed, log)
+    winds.attrs |= {
         "title": f"Line-of-sight wind of the experiment {name}",
         "source": f"lidar-mi {__version__}",
     }
-    return found
+    return winds
 
 
 def ring_budget(doppler: Doppler, rings: Rings, lit_rings: RingImages, log: Log) -> RingBudget:
@@ -118,7 +118,7 @@ def _bounds(doppler: Doppler, rings: Rings) -> dict[str, tuple[float, float]]:
         (rings.model, rings.photons, doppler.v_los[0]),
         (rings.laser, reference_photons(doppler, rings), 0.0),
     )
-    found = [
+    bounds = [
         cramer_rao_of(
             model,
             efficiency * photons,
@@ -131,7 +131,7 @@ def _bounds(doppler: Doppler, rings: Rings) -> dict[str, tuple[float, float]]:
     ]
     return {
         centre: (air["v_los"], laser["v_los"])
-        for centre, air, laser in zip(centres, *found, strict=True)
+        for centre, air, laser in zip(centres, *bounds, strict=True)
     }
 
 
@@ -213,7 +213,7 @@ def velocities(
                         count = len(images) if name == RingMethod.ANNULAR else few
                         if count:
                             place = places[name], c, j, k, slice(first, first + count)
-                            found = speeds_to_laser(
+                            to_laser = speeds_to_laser(
                                 frames[:count],
                                 laser[:count],
                                 doppler,
@@ -223,9 +223,9 @@ def velocities(
                                 centre,
                                 refused=partial(reasons.setdefault, name),
                             )
-                            v[place] = found[0] + drifted[:count] + shift
-                            v_std[place] = np.hypot(found[1], drift_std[:count])
-                            v_systematic[place] = np.hypot(found[2], unknown)
+                            v[place] = to_laser[0] + drifted[:count] + shift
+                            v_std[place] = np.hypot(to_laser[1], drift_std[:count])
+                            v_systematic[place] = np.hypot(to_laser[2], unknown)
                     for i in range(few if peaks else 0):
                         received, zero = (
                             _peak_radii(one[i].numpy(), doppler, centre) for one in (frames, laser)

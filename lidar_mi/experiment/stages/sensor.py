@@ -50,13 +50,13 @@ def combined_wind(
     try:
         images = crossflow(sensor, detector, wind)
         settings = combine_settings(observation, sensor, images)
-        found = with_truth(name, observation.scan, slab_wind, lines, images, settings)
+        combined = with_truth(name, observation.scan, slab_wind, lines, images, settings)
     except InputError as error:
         log.remark(f"no wind from both lidars: {error}")
         return None
-    if not (found["flag"] == 0).any():
-        log.remark(f"no vector from both lidars is valid; {commonest_flag(found['flag'])}")
-    return found
+    if not (combined["flag"] == 0).any():
+        log.remark(f"no vector from both lidars is valid; {commonest_flag(combined['flag'])}")
+    return combined
 
 
 def doppler_alone(lines: xr.Dataset, log: Log) -> dict[str, xr.Dataset]:
@@ -93,7 +93,7 @@ def _shifted(lines: xr.Dataset) -> xr.Dataset | None:
     return lines.assign(v_los=lines["v_los"] + known)
 
 
-def with_systematic(found: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
+def with_systematic(combined: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
     """Vectors with the systematic standard errors of their components, m/s.
 
     Parameters
@@ -106,11 +106,11 @@ def with_systematic(found: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
     from lidar_mi.retrieval.combined.vectors import COMPONENTS
 
     for name in COMPONENTS:
-        found[f"{name}_systematic"] = abs(shifted[name] - found[name]).assign_attrs(
+        combined[f"{name}_systematic"] = abs(shifted[name] - combined[name]).assign_attrs(
             units="m s-1",
             long_name=f"systematic standard error of {name}, by that common to all lines of sight",
         )
-    return found
+    return combined
 
 
 def crossflow(sensor: Sensor, detector: Detector | None, wind: xr.Dataset) -> xr.Dataset:
@@ -161,12 +161,12 @@ def with_truth(
     from lidar_mi.retrieval.combined.combine import combine
     from lidar_mi.retrieval.combined.vectors import COMPONENTS
 
-    found, shifted = combine(crossflow, lines, **settings), _shifted(lines)
+    combined, shifted = combine(crossflow, lines, **settings), _shifted(lines)
     if shifted is not None:
-        found = with_systematic(found, combine(crossflow, shifted, **settings))
+        combined = with_systematic(combined, combine(crossflow, shifted, **settings))
     for component in COMPONENTS:
-        at = {axis: found[axis] for axis in ("z", "y")}
-        found[f"{component}_true"] = (
+        at = {axis: combined[axis] for axis in ("z", "y")}
+        combined[f"{component}_true"] = (
             truth[component]
             .interp(at)
             .assign_attrs(units="m s-1", long_name=f"true {component}, mean over the slab")
@@ -176,13 +176,13 @@ def with_truth(
         "long_name": "distance ahead of the first image's telescope",
         "axis": "X",
     }
-    found["x"] = (), scan.range + scan.thickness / 2, about
-    found = found.set_coords("x")
-    found.attrs |= {
+    combined["x"] = (), scan.range + scan.thickness / 2, about
+    combined = combined.set_coords("x")
+    combined.attrs |= {
         "title": f"Wind from both lidars of the experiment {name}",
         "source": f"lidar-mi {__version__}",
     }
-    return found
+    return combined
 
 
 def limits_of_u(
@@ -208,7 +208,7 @@ def mean_squares_without(
     truth: xr.Dataset,
     lines: xr.Dataset,
     crossflow: xr.Dataset,
-    found: xr.Dataset,
+    combined: xr.Dataset,
     cores: Sequence[Core],
 ) -> dict[str, float]:
     """Mean square error of u without each cause, and without all of them at once, m^2 s^-2.
@@ -238,8 +238,8 @@ def mean_squares_without(
     # exact vectors have no common error either
     known = crossflow.drop_vars(COMMON_ERRORS, errors="ignore")
     known = known.assign({name: (("z", "y"), field) for name, field in surely.items()})
-    z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
-    chosen = (found["flag"].values == 0) & outside_cores(y, z, list(cores))
+    z, y = np.meshgrid(combined["z"], combined["y"], indexing="ij")
+    chosen = (combined["flag"].values == 0) & outside_cores(y, z, list(cores))
 
     def square(causes: Sequence[str]) -> float:
         lidar, missed = line_scan.doppler.lidar, sensor.errors

@@ -66,7 +66,7 @@ def simulation_noise(
     times = pixel_times(wake, scan, scans)
     changes = []
     for method in retrieval.methods:
-        found = retrieve_wind(
+        noisy = retrieve_wind(
             pair[0],
             pair[1],
             dt=platform.dt,
@@ -78,11 +78,11 @@ def simulation_noise(
             **window_settings(retrieval, estimation.device),
         )
         first = wind.sel(source=source, algorithm=method)
-        valid = (found["flag"].values == 0) & (first["flag"].values == 0)
+        valid = (noisy["flag"].values == 0) & (first["flag"].values == 0)
         changes.append(
             xr.Dataset(
                 {
-                    name: (("z", "y"), np.where(valid, found[name] - first[name].values, np.nan))
+                    name: (("z", "y"), np.where(valid, noisy[name] - first[name].values, np.nan))
                     for name in ("v", "w")
                 }
             )

@@ -42,13 +42,13 @@ def timed_plans(
         return list(plans)
     by_angle = scan.aim == "angles"
     pose_at = _poses(platform, seed, search_path)
-    found = []
+    timed = []
     for number, plan in enumerate(plans):
         schedule = scan_schedule(scan, plan, search_path)
         _fits("scan.timing", schedule, platform.dt, "platform.dt")
         # a stream for each scan: what one draws does not depend on the other
         jitter = np.random.default_rng([seed, 3, 4, number + 1])
-        found.append(
+        timed.append(
             replace(
                 plan,
                 beams=_beams(
@@ -65,7 +65,7 @@ def timed_plans(
                 ),
             )
         )
-    return found
+    return timed
 
 
 def scan_schedule(scan: Scan, plan: ScanPlan, search_path: Path) -> Schedule:

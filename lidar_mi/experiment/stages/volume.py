@@ -241,18 +241,18 @@ def volume_winds(
             )
         # attributes of single methods are not those of all
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
-    found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
-    found = found.assign_coords(source=list(volumes.pairs), algorithm=list(volume.methods))
+    winds = xr.concat(sources, "source", combine_attrs="drop_conflicts")
+    winds = winds.assign_coords(source=list(volumes.pairs), algorithm=list(volume.methods))
     # the gates move with the mean wind, which is 0 in their frame
-    about = found["u"].attrs
-    found["u"] = (found["u"] + scan.follow).assign_attrs(about)
-    for component, values in true_wind(flows[0], found).items():
-        found[f"{component}_true"] = values
-    found.attrs |= {
+    about = winds["u"].attrs
+    winds["u"] = (winds["u"] + scan.follow).assign_attrs(about)
+    for component, values in true_wind(flows[0], winds).items():
+        winds[f"{component}_true"] = values
+    winds.attrs |= {
         "title": f"Wind in three dimensions of the experiment {name}",
         "source": f"lidar-mi {__version__}",
     }
-    return found
+    return winds
 
 
 def true_wind(flow: xr.Dataset, places: xr.Dataset) -> dict[str, xr.DataArray]:
@@ -261,12 +261,12 @@ def true_wind(flow: xr.Dataset, places: xr.Dataset) -> dict[str, xr.DataArray]:
     at = [(places[axis].values - n[0]) / (n[1] - n[0]) for axis, n in zip("xyz", axes, strict=True)]
     mesh = np.stack(np.meshgrid(*at, indexing="ij"))
     coords = {axis: places[axis] for axis in ("x", "z", "y")}
-    found = {}
+    means = {}
     for name in ("u", "v", "w"):
         values = flow[name].transpose("x", "y", "z").values
         values = scipy.ndimage.map_coordinates(values, mesh, order=3, mode="nearest").transpose(
             0, 2, 1
         )
         about = {"long_name": f"true {name}", "units": "m s-1"}
-        found[name] = xr.DataArray(values.astype(np.float32), coords, ("x", "z", "y"), attrs=about)
-    return found
+        means[name] = xr.DataArray(values.astype(np.float32), coords, ("x", "z", "y"), attrs=about)
+    return means

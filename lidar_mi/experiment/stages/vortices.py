@@ -63,8 +63,8 @@ def image_vectors(retrieval: Retrieval, wind: xr.Dataset) -> xr.Dataset | None:
     method = vectors_method(None, retrieval)
     if method is None:
         return None
-    found = wind.isel(source=-1).sel(algorithm=method)
-    return found.set_coords(["y_vector", "z_vector"])
+    vectors = wind.isel(source=-1).sel(algorithm=method)
+    return vectors.set_coords(["y_vector", "z_vector"])
 
 
 def vectors_method(sensor: Sensor | None, retrieval: Retrieval) -> str | None:
@@ -107,14 +107,14 @@ def fit_pairs(
     refused: dict[str, str] = {}
     for origin, way in ways.items():
         try:
-            found = way()
+            fit = way()
         except InputError as error:
             refused[str(origin)] = str(error)
             continue
-        if found.success:
-            fits[str(origin)] = found
+        if fit.success:
+            fits[str(origin)] = fit
         else:
-            refused[str(origin)] = "; ".join(found.reasons)
+            refused[str(origin)] = "; ".join(fit.reasons)
 
     for name, reason in refused.items():
         log.remark(f"no vortex pair from the {ORIGIN_NAMES[Origin(name)]}: {reason}")

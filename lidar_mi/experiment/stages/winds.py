@@ -134,17 +134,17 @@ def cross_flow_winds(
             wind = wind.rename({METHODS[method].score[0]: "score"})
             methods.append(wind.reset_coords(["y_vector", "z_vector"]))
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
-    found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
-    found = found.assign_coords(source=list(pairs), algorithm=list(retrieval.methods))
-    found["score"].attrs = {
+    winds = xr.concat(sources, "source", combine_attrs="drop_conflicts")
+    winds = winds.assign_coords(source=list(pairs), algorithm=list(retrieval.methods))
+    winds["score"].attrs = {
         "long_name": "; ".join(f"{one}: {METHODS[one].score[1]}" for one in retrieval.methods),
         "units": "1",
     }
-    found.attrs["title"] = f"Cross-flow wind of the experiment {name}"
-    found.attrs["source"] = f"lidar-mi {__version__}"
-    for text in vector_remarks(found):
+    winds.attrs["title"] = f"Cross-flow wind of the experiment {name}"
+    winds.attrs["source"] = f"lidar-mi {__version__}"
+    for text in vector_remarks(winds):
         log.remark(text)
-    return found
+    return winds
 
 
 def _image_pairs(
@@ -206,13 +206,13 @@ def rendered_pairs(
 def resampled_noise(scans: Sequence[xr.Dataset]) -> dict[str, tuple[xr.DataArray, xr.DataArray]]:
     """Noise of images of scattered beams without and with what resampling adds, by source."""
     noise = attenuated_backscatter_stderr(scans[0])
-    found: dict[str, tuple[xr.DataArray, xr.DataArray]] = {}
+    noises: dict[str, tuple[xr.DataArray, xr.DataArray]] = {}
     if "Y_resampling_std" in scans[0]:
-        found[Source.BACKSCATTER] = noise, with_resampling(noise, scans, "Y")
+        noises[Source.BACKSCATTER] = noise, with_resampling(noise, scans, "Y")
     if "Y_noisy_resampling_std" in scans[0]:
         noise = combined_noise(noise, scans[0]["Y_noise_std"])
-        found[Source.NOISY] = noise, with_resampling(noise, scans, "Y_noisy")
-    return found
+        noises[Source.NOISY] = noise, with_resampling(noise, scans, "Y_noisy")
+    return noises
 
 
 def with_resampling(noise: xr.DataArray, scans: Sequence[xr.Dataset], name: str) -> xr.DataArray:
@@ -304,13 +304,13 @@ def _warn_of_wide_beams(
         )
 
 
-def vector_remarks(found: xr.Dataset) -> list[str]:
+def vector_remarks(winds: xr.Dataset) -> list[str]:
     """Where rendered images gave no valid vector, and why, or too few for their stated errors."""
     without: dict[tuple[str, str], list[str]] = {}
     few = []
-    for source in (str(name) for name in found["source"].values if name in RENDERED):
-        for method in map(str, found["algorithm"].values):
-            wind = found.sel(source=source, algorithm=method)
+    for source in (str(name) for name in winds["source"].values if name in RENDERED):
+        for method in map(str, winds["algorithm"].values):
+            wind = winds.sel(source=source, algorithm=method)
             valid = (wind["flag"] == 0) & np.isfinite(wind["v"]) & np.isfinite(wind["w"])
             fraction = float(valid.mean())
             if not fraction:

@@ -46,22 +46,22 @@ class Standing(NamedTuple):
         """Whether the pattern is too strong for a correction."""
         return self.fraction > _LARGEST
 
-    def corrected(self, found: Displacement) -> Displacement:
+    def corrected(self, displacement: Displacement) -> Displacement:
         """Displacements without their bias, and with its uncertainty.
 
         Parameters
         ----------
-        found : Displacement
+        displacement : Displacement
             With a covariance.
         """
-        if not self.fraction or self.spoils or found.covariance is None:
-            return found
+        if not self.fraction or self.spoils or displacement.covariance is None:
+            return displacement
         left = 1 - self.fraction
-        d = found.d / left
+        d = displacement.d / left
         variance = self.stderr**2 + (_UNLIKE * self.fraction) ** 2
         unit = torch.eye(len(d)).to(d).reshape(len(d), len(d), *[1] * (d.ndim - 1))
         more = variance * d.square().sum(0) * unit
-        return found._replace(d=d, covariance=found.covariance / left**2 + more)
+        return displacement._replace(d=d, covariance=displacement.covariance / left**2 + more)
 
     def __str__(self) -> str:
         return f"{self.fraction:.1%} of the texture does not move" if self.fraction else ""
@@ -69,7 +69,7 @@ class Standing(NamedTuple):
 
 def standing(
     images: Sequence[torch.Tensor],
-    found: Displacement,
+    displacement: Displacement,
     windows: Windows,
     false_alarm: float = FALSE_ALARM,
 ) -> Standing:
@@ -93,14 +93,14 @@ def standing(
     ----------
     images : sequence of torch.Tensor, shape (z, y)
         The first two of them count. Of volumes none is found.
-    found : Displacement
+    displacement : Displacement
         A field fitted to the images as a whole.
     windows : Windows
     false_alarm : float
     """
     if windows.dims > 2:
         return Standing()
-    left, mean, known, d = residual(images[:2], found, windows)
+    left, mean, known, d = residual(images[:2], displacement, windows)
     speed = d.norm(dim=0)
     use = known & (speed > _SLOWEST) & inner(known, _RIM)
     if not bool(use.any()):
@@ -129,7 +129,7 @@ def standing(
 
 
 def residual(
-    images: Sequence[torch.Tensor], found: Displacement, windows: Windows
+    images: Sequence[torch.Tensor], displacement: Displacement, windows: Windows
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Difference and mean of two images over their means at mid-time, where known, the motion, px.
 
@@ -137,12 +137,12 @@ def residual(
     own in each image have structure across and along the motion too.
     """
     weights = [
-        linear_weights(windows.centres(axis).to(found.d), torch.arange(n).to(found.d))
+        linear_weights(windows.centres(axis).to(displacement.d), torch.arange(n).to(displacement.d))
         for axis, n in enumerate(windows.shape)
     ]
     one, two = (working(image) for image in images)
-    d = separable(found.d.nan_to_num(0.0), weights).to(one)
-    lost = separable((~torch.isfinite(found.d)).any(0).to(found.d), weights) > 0
+    d = separable(displacement.d.nan_to_num(0.0), weights).to(one)
+    lost = separable((~torch.isfinite(displacement.d)).any(0).to(displacement.d), weights) > 0
     known = torch.isfinite(one) & torch.isfinite(two) & ~lost
     one, two = (torch.where(known, i / i[known].mean(), 1.0) for i in (one, two))
     hole = (~known).to(one)

@@ -117,11 +117,11 @@ def fixed_pattern(
     """
     images = images[:2]
     relative = [_relative(image) for image in images]
-    found = {axis: _lines(_turned(relative, axis), false_alarm) for axis in (1, 0)}
-    prior = {axis: variance for axis, (variance, _) in found.items() if variance}
+    profiles = {axis: _lines(_turned(relative, axis), false_alarm) for axis in (1, 0)}
+    prior = {axis: variance for axis, (variance, _) in profiles.items() if variance}
     if not prior:
         return FixedPattern(_gain({}, images[0]))
-    gains = {axis: found[axis][1] for axis in prior}
+    gains = {axis: profiles[axis][1] for axis in prior}
     unknown = {}
     for _ in range(_ITERATIONS):
         now = [working(image) / _gain(gains, image) for image in images]

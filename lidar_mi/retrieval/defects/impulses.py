@@ -1,7 +1,7 @@
 """Pixels that stand out of all around them, as no image of air does that a beam or a lens blurs."""
 
 from collections.abc import Callable, Iterable
-from functools import reduce
+from functools import lru_cache, reduce
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ _ALIKE = 0.3
 _ADJACENT = (0, 1), (1, 0), (1, 2), (2, 1)
 
 
+@lru_cache(maxsize=256)
 def threshold(number: int) -> float:
     """Standard deviations that no one of so many normal values exceeds but for false alarms."""
     return float(norm.isf(FALSE_ALARM / 2 / max(number, 1)))
@@ -130,21 +131,23 @@ def median_scale(values: torch.Tensor, size: int = 1) -> torch.Tensor:
 
 def _faintest(values: torch.Tensor) -> float:
     """Scatter below which air is empty, in images without noise: nothing stands out of that."""
-    return _EMPTY * float(values[values.isfinite()].square().mean().sqrt())
+    known = values.isfinite()
+    square = torch.where(known, values, 0.0).square().sum() / known.sum()
+    return _EMPTY * float(square.sqrt())
 
 
 def _peeled(image: torch.Tensor, spread: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
     """Impulses of an image, and of what remains without them."""
-    found = torch.zeros_like(image, dtype=torch.bool)
+    impulses = torch.zeros_like(image, dtype=torch.bool)
     for _ in range(_PEELS):
-        remaining = torch.where(found, torch.nan, image)
+        remaining = torch.where(impulses, torch.nan, image)
         over = height(remaining)
         new = over.abs() > threshold(over.numel()) * spread(over)
         new &= unresolved(remaining, over)
         if not bool(new.any()):
             break
-        found |= new
-    return found
+        impulses |= new
+    return impulses
 
 
 def outstanding(pair: torch.Tensor) -> torch.Tensor:
@@ -162,30 +165,33 @@ def sharp(pair: torch.Tensor) -> torch.Tensor:
     resolved.
     """
     each = torch.stack([_peeled(image, median_scale) for image in pair])
-    found = each.all(0)
-    if not bool(found.any()):
-        return found
-    rows, columns = found.shape
+    common = each.all(0)
+    if not bool(common.any()):
+        return common
+    rows, columns = common.shape
     turned = [each[1].roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in THIRDS]
     # the median, as lines at rest fall on themselves
     chance = float(np.median([int((each[0] & other).sum()) for other in turned]))
-    if float(found.sum()) < _BEYOND_CHANCE * chance:
-        return torch.zeros_like(found)
-    known = torch.where(found, torch.nan, pair)
+    if float(common.sum()) < _BEYOND_CHANCE * chance:
+        return torch.zeros_like(common)
+    known = torch.where(common, torch.nan, pair)
     wide = pad(known[None], (2,) * 4, mode="replicate")[0]
     around = wide.unfold(1, 5, 1).unfold(2, 5, 1).flatten(3).nanmedian(-1).values
     excess, peak = pad(known - around, (1,) * 4, value=torch.nan), (pair - around).nan_to_num(0.0)
-    adjacent = [excess[:, i : i + found.shape[0], j : j + found.shape[1]] for i, j in _ADJACENT]
+    adjacent = [excess[:, i : i + common.shape[0], j : j + common.shape[1]] for i, j in _ADJACENT]
     adjacent_height = torch.stack(adjacent).nanmean(0).abs()
     alike = (peak[1] - peak[0]).abs() < _ALIKE * peak.abs().amin(0)
-    alone = (adjacent_height < _RESOLVED * peak.abs()).all(0) & alike & found
-    if int(alone.sum()) < _SHARP * int(found.sum()):
-        return torch.zeros_like(found)
+    alone = (adjacent_height < _RESOLVED * peak.abs()).all(0) & alike & common
+    if int(alone.sum()) < _SHARP * int(common.sum()):
+        return torch.zeros_like(common)
     return alone
 
 
 def stray(
-    pair: torch.Tensor, found: torch.Tensor, rest: torch.Tensor, motions: Iterable[torch.Tensor]
+    pair: torch.Tensor,
+    candidates: torch.Tensor,
+    rest: torch.Tensor,
+    motions: Iterable[torch.Tensor],
 ) -> torch.Tensor:
     """Of `outstanding` pixels (images, z, y) those that air does not advect from one to another.
 
@@ -195,23 +201,26 @@ def stray(
     those without a match count that are higher than all with one. Else all do that are not at
     `rest`.
     """
-    found = found & ~rest
-    if not bool(found.any()):
-        return found
+    candidates = candidates & ~rest
+    if not bool(candidates.any()):
+        return candidates
     heights = torch.stack([height(image) for image in torch.where(rest, torch.nan, pair)])
-    heights = heights.nan_to_num(0.0).abs() * found
+    heights = heights.nan_to_num(0.0).abs() * candidates
     for d in motions:
-        matched = found & torch.stack([_advected(heights, way, 0, 0, d) for way in (0, 1)])
+        matched = candidates & torch.stack([_advected(heights, way, 0, 0, d) for way in (0, 1)])
         rows, columns = d.shape[1:]
         chance = torch.stack(
             [
-                (found[0] & _advected(heights, 0, int(i * rows / 3), int(j * columns / 3), d)).sum()
+                (
+                    candidates[0]
+                    & _advected(heights, 0, int(i * rows / 3), int(j * columns / 3), d)
+                ).sum()
                 for i, j in THIRDS
             ]
         )
         if int(matched[0].sum()) > _BEYOND_CHANCE * float(chance.double().median()):
-            return found & ~matched & (heights > heights[matched].max())
-    return found
+            return candidates & ~matched & (heights > heights[matched].max())
+    return candidates
 
 
 def _advected(

@@ -84,17 +84,21 @@ class AtRest(NamedTuple):
 
     def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The same, with smooth values in place of what is no air."""
-        found = zip(self.masked(images), self.hidden, strict=False)
-        return [filled_in(i, pixels) if bool(pixels.any()) else i for i, pixels in found]
+        pairs = zip(self.masked(images), self.hidden, strict=False)
+        return [filled_in(i, pixels) if bool(pixels.any()) else i for i, pixels in pairs]
 
     def flags(
-        self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, masked: bool
+        self,
+        displacement: Displacement,
+        images: Sequence[torch.Tensor],
+        windows: Windows,
+        masked: bool,
     ) -> torch.Tensor:
         """The flags of vectors, with the reasons by their names.
 
         Parameters
         ----------
-        found : Displacement
+        displacement : Displacement
         images : sequence of torch.Tensor
             As they are.
         windows : Windows
@@ -103,14 +107,14 @@ class AtRest(NamedTuple):
             where the images themselves hold it. Otherwise the place in image 2 counts as well, and
             of saturated areas all of the search region.
         """
-        flag = found.flag
+        flag = displacement.flag
         bad = non_finite(images, windows)
         hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
         flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
         parts = self.clipped, self.saturated, self.structure, self.stray
         if not any(bool(part.any()) for part in parts) and not self.pattern.spoils:
             return flag
-        wide = ~torch.isfinite(found.d).all(0) & ~bad
+        wide = ~torch.isfinite(displacement.d).all(0) & ~bad
         clipped = windows.of_templates(working(self.clipped)).amax(0) > _SATURATED
         # an area of another brightness spoils a correlation from afar
         spoiled = torch.full_like(bad, self.pattern.spoils)
@@ -125,7 +129,7 @@ class AtRest(NamedTuple):
             here = here | (windows.of_templates(working(pixels)) > 0)
             here |= reach & (windows.of_regions(working(pixels)) > 0)
             if not masked:
-                here |= _matched(pixels, windows, found.d)
+                here |= _matched(pixels, windows, displacement.d)
             flag = flag | (bit * here).to(flag.dtype)
         return flag
 
@@ -158,8 +162,8 @@ def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
         even = pattern.removed(pair)
         structure, stray, d = at_rest(even[0], even[1], windows)
     more = torch.zeros_like(clipped[2:])
-    found = AtRest(clipped, areas, structure & ~areas, torch.cat([stray, more]), pattern)
-    return found._replace(pattern=pattern.with_pixels(found.filled(images)[:2], d))
+    defects = AtRest(clipped, areas, structure & ~areas, torch.cat([stray, more]), pattern)
+    return defects._replace(pattern=pattern.with_pixels(defects.filled(images)[:2], d))
 
 
 def nothing_at_rest(images: Sequence[torch.Tensor]) -> AtRest:
@@ -211,20 +215,23 @@ def at_rest(
     pair = torch.where(pair.isfinite(), pair, torch.nan)
     outstanding = impulses.outstanding(pair)
     pair = _normalised(pair, outstanding)
-    found = impulses.sharp(pair)
-    hidden = outstanding | _candidates(pair, found)
+    structure = impulses.sharp(pair)
+    fields = _fields(pair)
+    hidden = outstanding | _candidates(fields, structure)
     for _ in range(_ITERATIONS):
-        soft = [_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True)]
+        soft = [_soft(image, ~(p | structure)) for image, p in zip(pair, hidden, strict=True)]
         motions = _motions(soft, windows)
         d = next(motions)
         if not bool(d.any()):  # what stands out is all that there is
-            return found, torch.zeros_like(outstanding), d
-        stray = impulses.stray(pair, outstanding, found, chain([d], motions))
-        new = _still(torch.where(stray, torch.nan, pair), found, d)
-        if not bool((new & ~found).any()):
+            return structure, torch.zeros_like(outstanding), d
+        stray = impulses.stray(pair, outstanding, structure, chain([d], motions))
+        if bool(stray.any()):
+            fields = _fields(torch.where(stray, torch.nan, pair))
+        new = _still(fields, structure, d)
+        if not bool((new & ~structure).any()):
             break
-        found = found | new
-    return found, stray & ~found, d
+        structure = structure | new
+    return structure, stray & ~structure, d
 
 
 def _motions(images: Sequence[torch.Tensor], windows: Windows) -> Iterator[torch.Tensor]:
@@ -252,21 +259,42 @@ class _Field(NamedTuple):
     """What may stand out of two images.
 
     Its values (2, z, y), by how much these or the pixels themselves differ (z, y), its size in px,
-    and the pixels that it marks.
+    the pixels that it marks, and the height (z, y) that no value exceeds by chance.
     """
 
     pair: torch.Tensor
     change: torch.Tensor
     size: int
     marked: Callable[[torch.Tensor], torch.Tensor]
+    least: torch.Tensor
 
 
-def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
+_Of = Callable[[torch.Tensor], _Field]
+"""A field of two images without some pixels (z, y)."""
+
+
+def _fields(pair: torch.Tensor) -> list[_Of]:
+    """Those of `_all_fields`, each with the last one that was asked for."""
+
+    def stored(of: _Of) -> _Of:
+        last: list[tuple[torch.Tensor, _Field]] = []
+
+        def field(hidden: torch.Tensor) -> _Field:
+            if not (last and torch.equal(last[0][0], hidden)):
+                last[:] = [(hidden, of(hidden))]
+            return last[0][1]
+
+        return field
+
+    return [stored(of) for of in _all_fields(pair)]
+
+
+def _all_fields(pair: torch.Tensor) -> Iterator[_Of]:
     """Single pixels, lines, edges, spots: each from the images without what was found before."""
     same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
 
-    def known(found: torch.Tensor) -> torch.Tensor:
-        return torch.where(found, torch.nan, pair)
+    def known(hidden: torch.Tensor) -> torch.Tensor:
+        return torch.where(hidden, torch.nan, pair)
 
     def of(
         values: torch.Tensor,
@@ -275,18 +303,19 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         same: torch.Tensor | None = None,
     ) -> _Field:
         change = (values[1] - values[0]).nan_to_num(0.0).abs()
-        return _Field(values, change if same is None else change.minimum(same), size, marked)
+        change = change if same is None else change.minimum(same)
+        return _Field(values, change, size, marked, _least(values, size))
 
     last: list[tuple[torch.Tensor, torch.Tensor]] = []
 
-    def heights_of(found: torch.Tensor) -> torch.Tensor:
-        if not (last and torch.equal(last[0][0], found)):
-            heights = torch.stack([impulses.height(image) for image in known(found)])
-            last[:] = [(found, heights)]
+    def heights_of(hidden: torch.Tensor) -> torch.Tensor:
+        if not (last and torch.equal(last[0][0], hidden)):
+            heights = torch.stack([impulses.height(image) for image in known(hidden)])
+            last[:] = [(hidden, heights)]
         return last[0][1]
 
-    def pixels(found: torch.Tensor) -> _Field:
-        images, heights = known(found), heights_of(found)
+    def pixels(hidden: torch.Tensor) -> _Field:
+        images, heights = known(hidden), heights_of(hidden)
         soft = [~impulses.unresolved(i, h) for i, h in zip(images, heights, strict=True)]
         field = of(heights, 1, lambda new: new, same)
         change = field.change.masked_fill(torch.stack(soft).any(0), torch.inf)
@@ -295,15 +324,15 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
     yield pixels
     for axis in (-1, -2):
 
-        def lines(found: torch.Tensor, axis: int = axis) -> _Field:
-            means = _along(heights_of(found), axis)
+        def lines(hidden: torch.Tensor, axis: int = axis) -> _Field:
+            means = _along(heights_of(hidden), axis)
             return of(means, 3, lambda new: _along(new.double(), axis) > 0)
 
         yield lines
     for axis in (-1, -2):
 
-        def edges(found: torch.Tensor, axis: int = axis) -> _Field:
-            steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
+        def edges(hidden: torch.Tensor, axis: int = axis) -> _Field:
+            steps = pad(known(hidden).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
             either = same.minimum(same.roll(-1, axis))
             # smoke rises over several pixels: an adjacent step is as large and of its sign, which
             # that on the other side of a thin structure is not
@@ -317,8 +346,8 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         yield edges
     for size in _SIZES:
 
-        def spots(found: torch.Tensor, size: int = size) -> _Field:
-            return of(_spots(known(found), size), size, lambda new: _grown(new, size))
+        def spots(hidden: torch.Tensor, size: int = size) -> _Field:
+            return of(_spots(known(hidden), size), size, lambda new: _grown(new, size))
 
         yield spots
 
@@ -334,47 +363,48 @@ def _along(fields: torch.Tensor, axis: int) -> torch.Tensor:
     return box_sum(pad(fields.nan_to_num(0.0), rim), _LINE, axis) / _LINE
 
 
-def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
+def _candidates(fields: Sequence[_Of], hidden: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
-    for of in _fields(pair):
-        field = of(found)
-        least = _least(field)
-        alike = _beyond_chance(_alike(field, least), field, least)
-        found = found | field.marked(alike)
-    return _closed(found, _GAP)
+    for of in fields:
+        field = of(hidden)
+        alike = _beyond_chance(_alike(field, field.least), field)
+        hidden = hidden | field.marked(alike)
+    return _closed(hidden, _GAP)
 
 
-def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+def _still(fields: Sequence[_Of], structure: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots."""
-    sharp = found
-    for of in _fields(pair):
-        field = of(found)
+    sharp = structure
+    for of in fields:
+        field = of(structure)
         new = field.marked(_stays(field, d))
         if field.size == 1:
             sharp = sharp | new
-        found = found | new
-    return _with_sharp(_closed(found, 1), sharp)
+        structure = structure | new
+    return _with_sharp(_closed(structure, 1), sharp)
 
 
-def _with_sharp(found: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
+def _with_sharp(structure: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
     """Areas that hold something sharp: lines and spots without any may be smoke in calm air."""
     if not bool(sharp.any()):
         return sharp
     held = ndimage.binary_propagation(
-        (sharp & found).cpu().numpy(), np.ones((3, 3)), _grown(found, 3).cpu().numpy()
+        (sharp & structure).cpu().numpy(), np.ones((3, 3)), _grown(structure, 3).cpu().numpy()
     )
-    return torch.as_tensor(held, device=found.device) & found
+    return torch.as_tensor(held, device=structure.device) & structure
 
 
-def _least(field: _Field) -> torch.Tensor:
-    """Height that no value of the field exceeds by chance."""
-    limit = impulses.threshold(field.pair[0].numel() // field.size**2)
-    return limit * torch.maximum(*(impulses.median_scale(i, field.size) for i in field.pair))
+def _least(values: torch.Tensor, size: int) -> torch.Tensor:
+    """Height that no value (2, z, y) of a field exceeds by chance."""
+    limit = impulses.threshold(values[0].numel() // size**2)
+    return limit * torch.maximum(*(impulses.median_scale(i, size) for i in values))
 
 
 def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
-    least = _least(field)
+    alike = _alike(field, field.least)
+    if not bool(alike.any()):
+        return alike
     one, two = field.pair.nan_to_num(0.0)
     both = [
         torch.where(_inside(along), (here - moved(there, along)).abs(), torch.inf)
@@ -384,37 +414,34 @@ def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     off = torch.where(off.isfinite(), off, 0.0)
     chance = impulses.median_scale(off, field.size)
     limit = impulses.threshold(off.numel() // field.size**2) * chance
-    new = (
-        (off > limit)
-        & _alike(field, least)
-        & (field.change < _DIFFER * off)
-        & (_lower(field.pair) > off / 2)
-    )
+    new = (off > limit) & alike & (field.change < _DIFFER * off) & (_lower(field.pair) > off / 2)
     if not bool(new.any()):
         return new
-    new = _beyond_chance(new, field, least)
+    new = _beyond_chance(new, field)
     if field.size > 1 or not bool(new.any()):
         return new
     # a structure is at rest as a whole: also where the air moves along it, which tells nothing,
     # and where it changes with the air that it dims; not where its motion is the better match
-    stands_out = _alike(field, _WEAK * least) | (_lower(field.pair) > least)
+    stands_out = _alike(field, _WEAK * field.least) | (_lower(field.pair) > field.least)
     weak = stands_out & (field.change < off.maximum(chance))
     new = ndimage.binary_propagation(new.cpu(), np.ones((3, 3)), weak.cpu())
     return torch.as_tensor(new, device=weak.device)
 
 
-def _beyond_chance(new: torch.Tensor, field: _Field, least: torch.Tensor) -> torch.Tensor:
+def _beyond_chance(new: torch.Tensor, field: _Field) -> torch.Tensor:
     """Those pixels, or none if unrelated images have a third as many alike in one place.
 
     Among many bright particles some lie by chance where others were.
     """
+    if not bool(new.any()):
+        return new
     one, two = field.pair.nan_to_num(0.0)
     rows, columns = two.shape
     chance = []
     for i, j in impulses.THIRDS:
         other = two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1))
         rolled = field._replace(pair=torch.stack([one, other]), change=(other - one).abs())
-        chance.append(int(_alike(rolled, least).sum()))
+        chance.append(int(_alike(rolled, field.least).sum()))
     # the median, as lines at rest fall on themselves
     return new & (int(new.sum()) >= _BEYOND_CHANCE * float(np.median(chance)))
 

@@ -75,13 +75,13 @@ class Sampling(NamedTuple):
 
     def masked(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The images with NaN in place of hidden pixels."""
-        found = []
+        masked = []
         for image, pixels in zip(images, self.hidden, strict=True):
             if bool(pixels.any()):
                 image = image if image.is_floating_point() else working(image)
                 image = torch.where(pixels, torch.nan, image)
-            found.append(image)
-        return found
+            masked.append(image)
+        return masked
 
 
 def no_structure(images: Sequence[torch.Tensor]) -> Sampling:
@@ -143,8 +143,8 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
         else:
             spoilt = True
     if max(steps) == 1 and not spoilt:
-        found, remarks = _hidden(values, false_alarm)
-        hidden |= found
+        no_air, remarks = _hidden(values, false_alarm)
+        hidden |= no_air
         said += remarks
         known = [np.where(h, np.nan, v) for v, h in zip(values, hidden, strict=True)]
         for axis, name in enumerate(names):
@@ -185,12 +185,12 @@ def _ranks(values: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Values by their number among all; -1 at the ends of an image's range or if not finite."""
     known = [np.asarray(np.isfinite(v)) for v in values]
     levels = np.unique(np.concatenate([v[k] for v, k in zip(values, known, strict=True)]))
-    found = []
+    ranks = []
     for v, k in zip(values, known, strict=True):
         rank = np.searchsorted(levels, np.where(k, v, levels[0]))
         inside = k & (rank > rank[k].min(initial=0)) & (rank < rank[k].max(initial=0))
-        found.append(np.where(inside, rank, -1))
-    return found
+        ranks.append(np.where(inside, rank, -1))
+    return ranks
 
 
 def _chance(steps: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -208,24 +208,24 @@ def _copied(one: np.ndarray, other: np.ndarray, false_alarm: float) -> np.ndarra
     """Cubes of equal pixels that are larger than chance allows, and not constant."""
     known = (one >= 0) & (other >= 0)
     same = known & (one == other)
-    found = np.zeros_like(same)
+    copied = np.zeros_like(same)
     if not same.any():
-        return found
+        return copied
     cells = np.log(same.size / false_alarm) / -np.log(_chance(other - one, known))
     side = np.maximum(np.ceil(cells ** (1 / same.ndim)), _LEAST_SIDE[same.ndim])
     for size in np.unique(side[same & (side <= min(_TILE, *same.shape))]).astype(int):
-        found |= _opened(same, size) & (side <= size)
-    found &= ~_opened(_constant(one), 3)
+        copied |= _opened(same, size) & (side <= size)
+    copied &= ~_opened(_constant(one), 3)
     # air that calms down without noise changes by a step or less around
-    label, number = ndimage.label(found)
+    label, number = ndimage.label(copied)
     if not number:
-        return found
-    ring = np.where(found | ~known, 0, ndimage.grey_dilation(label, 5))
+        return copied
+    ring = np.where(copied | ~known, 0, ndimage.grey_dilation(label, 5))
     index = np.unique(ring)
     calm = np.zeros(number + 1)
     calm[index] = ndimage.mean(np.abs(other - one) <= 1, ring, index)
     calm[0] = 0.0
-    return found & ~(calm > _CALM)[label]
+    return copied & ~(calm > _CALM)[label]
 
 
 def _opened(pixels: np.ndarray, size: int) -> np.ndarray:
@@ -268,10 +268,10 @@ def _without_picture(values: np.ndarray) -> np.ndarray:
     if len(index):
         step[index] = ndimage.median(off, np.where(rim, wide, 0), index)
         steps[index] = ndimage.median(levels_off, np.where(rim, wide, 0), index)
-    found = ((step > _STEP * typical) & (steps > 1))[label] & (label > 0)
-    for one in np.unique(values[found]):
-        found |= ndimage.binary_propagation(found & (values == one), mask=values == one)
-    return ndimage.binary_dilation(found, cube)
+    blank = ((step > _STEP * typical) & (steps > 1))[label] & (label > 0)
+    for one in np.unique(values[blank]):
+        blank |= ndimage.binary_propagation(blank & (values == one), mask=values == one)
+    return ndimage.binary_dilation(blank, cube)
 
 
 def _repeats(values: np.ndarray, axis: int) -> np.ndarray:
@@ -315,7 +315,7 @@ def _statistics(lines: np.ndarray) -> list[np.ndarray]:
         line - around,
         signs * (line - around),
     ]
-    found = []
+    means = []
     for field in fields:
         known = np.isfinite(field)
         number = known.sum(1)
@@ -324,8 +324,8 @@ def _statistics(lines: np.ndarray) -> list[np.ndarray]:
         level /= np.maximum(ndimage.gaussian_filter1d(number.astype(float), _AROUND), 1e-9)
         level = np.maximum(level, 1e-300)[:, None]
         field = np.clip(field / level, -_CLIPPED, _CLIPPED)
-        found.append(field.sum(1) / np.maximum(number, 1))
-    return found
+        means.append(field.sum(1) / np.maximum(number, 1))
+    return means
 
 
 def _period(images: Sequence[np.ndarray], axis: int, false_alarm: float) -> tuple[float, int]:
@@ -364,7 +364,7 @@ def _period(images: Sequence[np.ndarray], axis: int, false_alarm: float) -> tupl
             periods.append((1 / _refined(one, best, size), pair[0] if number == 0 else None))
     if not periods:
         return 0.0, 0
-    period, energy = max(periods, key=lambda found: found[0])
+    period, energy = max(periods, key=lambda entry: entry[0])
     whole = round(period)
     if energy is None or whole > _THINNED:
         return period, 0
@@ -397,7 +397,7 @@ def _gridded(rank: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Tiles in which more neighbours are equal than chance allows, in images that vary."""
     known = known & (rank >= 0) & ~_opened(_constant(rank), _BLANK)
     size = [min(_TILE, n) for n in rank.shape]
-    found = np.zeros_like(known)
+    gridded = np.zeros_like(known)
     for axis in range(rank.ndim):
         steps = np.diff(rank, axis=axis, append=-1)
         both = known & np.roll(known, -1, axis)
@@ -413,5 +413,5 @@ def _gridded(rank: np.ndarray, known: np.ndarray) -> np.ndarray:
             for part in (np.abs(steps) > 1, np.abs(steps) == 1)
         )
         excess = (equal > _GRIDDED) & (equal > 2 * chance + 5 * scatter) & (number > 0.25)
-        found |= excess & (more > 2 * single)
-    return found
+        gridded |= excess & (more > 2 * single)
+    return gridded

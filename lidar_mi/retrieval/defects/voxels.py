@@ -49,20 +49,20 @@ def outstanding(volume: torch.Tensor, false_alarm: float = FALSE_ALARM) -> torch
     size = ndimage.maximum_filter(values, footprint=around) - ndimage.minimum_filter(
         values, footprint=around
     )
-    found = known & (np.abs(height) > limit * scale) & (np.abs(height) > _UNRESOLVED * size)
+    impulses = known & (np.abs(height) > limit * scale) & (np.abs(height) > _UNRESOLVED * size)
     constant = (size == 0) & (height == 0)
-    found &= ~ndimage.binary_dilation(constant, np.ones((3, 3, 3)))
-    if found.sum() > _MOST * known.sum():
-        found[:] = False
-    return torch.as_tensor(found, device=volume.device)
+    impulses &= ~ndimage.binary_dilation(constant, np.ones((3, 3, 3)))
+    if impulses.sum() > _MOST * known.sum():
+        impulses[:] = False
+    return torch.as_tensor(impulses, device=volume.device)
 
 
 def _medians(values: np.ndarray) -> np.ndarray:
     """Medians over cubes, at every voxel of them."""
-    found = np.empty_like(values)
+    medians = np.empty_like(values)
     starts = [range(0, n, _TILE) for n in values.shape]
     for place in np.ndindex(*map(len, starts)):
         cube = tuple(slice(s[i], s[i] + _TILE) for s, i in zip(starts, place, strict=True))
         part = values[cube]
-        found[cube] = np.median(part[np.isfinite(part)]) if np.isfinite(part).any() else np.nan
-    return found
+        medians[cube] = np.median(part[np.isfinite(part)]) if np.isfinite(part).any() else np.nan
+    return medians

@@ -44,6 +44,7 @@ class BandCholesky:
             found, _ = solve(self.lower, values.T, lower=True)
         return torch.as_tensor(found).reshape(ordered.shape).transpose(-1, -3).to(right)
 
+    @cached_property
     def single(self) -> "BandCholesky":
         """The same in single precision."""
         return BandCholesky(self.lower.astype(np.float32), self.rows, self.columns)

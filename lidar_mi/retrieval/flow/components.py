@@ -44,7 +44,7 @@ _REGION = 8
 """Standard deviation of the Gaussian mean of the squares, and the separation of its places, px."""
 _TAPER = 4.0
 """Standard deviation, px, of the Gaussian by which spectra fade next to invalid pixels."""
-_STORED = 1 << 20
+_STORED = 1 << 21
 """Random numbers of a field that is stored for the next time: to draw them takes as long as the
 transforms of a small image."""
 _RATIO_OF_TWO = (2 - 3**0.5) ** 2
@@ -116,24 +116,26 @@ def differences(
     width = 0.5 * template
     times = float(images.time.square().sum())
     time = images.time.to(linear.warped).reshape(-1, *[1] * mesh.dims)
-    difference = working((time * linear.warped).sum(0) / times * valid)
+    difference = (time * linear.warped).sum(0) / times * valid
     # outliers, which count little in the fit, are none of the components
-    regular = difference * working(linear.regular)
+    regular = difference * linear.regular
     unresolved = _variance_beyond(prior, mesh)
     squares = _Squares(valid)
     found = squares(regular[None])[0]
     use = squares.inside & (found > 0)
     if not bool(use.any()):
         return Differences(images, torch.zeros_like(unresolved), {})
+    draws = _DRAWS[mesh.dims]
     kinds = _drawn(images, linear, mesh, unresolved, times, width)
     told = images.known_noise**2
     absorb = _residual_operator(linear, mesh, response)
-    rests = {name: absorb(draws) for name, draws in kinds.items()}
+    # of all at once, which takes less time
+    rests = dict(zip(kinds, absorb(torch.cat([*kinds.values()])).split(draws), strict=True))
     own = _flows_left(linear, mesh, prior, response)
     held = squares(own).mean(0)
-    drawn = {name: squares(draws) for name, draws in rests.items()}
+    drawn = {name: squares(fields) for name, fields in rests.items()}
     number = (1 / _chance(drawn["noise"])).expand_as(found)
-    terms = {name: draws.mean(0) for name, draws in drawn.items()}
+    terms = {name: fields.mean(0) for name, fields in drawn.items()}
     known = held + told * terms["noise"]
 
     # a noise that is known is not estimated
@@ -156,7 +158,7 @@ def differences(
     ratio = (weight * found / expected).sum(0)
     count = 1 / (weight.square() / number).sum(0).clamp(min=1e-30)
     local = squares.on_pixels(_shrunk(ratio, count, weight.sum(0) > 0.5))
-    steep = float(working(linear.slope).square().sum(0)[valid].mean()) / mesh.dims
+    steep = float(linear.slope.square().sum(0)[valid].mean()) / mesh.dims
     floor = _LEAST_MOTION**2 * steep
     level = (
         times / max(spline.passed, 1e-6) * local * averaged(noise.square().mean(0), valid, width)
@@ -170,10 +172,10 @@ def differences(
     mismatch = None
     # in a thin volume few shells hold the texture, and edges make most of what is in them
     if mesh.dims == 2:
-        whiten = (weight * times).sqrt() * _tapered(valid)
-        mismatch = _spectrum(
-            spline,
-            *(whiten * part for part in (noise * local.sqrt(), after * local.sqrt(), difference)),
+        whiten = (weight * times).sqrt().to(noise) * _tapered(valid)
+        scaled = whiten * local.sqrt().to(noise)
+        mismatch = working(
+            _spectrum(spline, scaled * noise, scaled * after, whiten * difference)
         ).clamp(min=max(floor, _LEAST_DENSITY * mean))
         mismatch = flat_if_better(
             spectrum_of(images.stack, weight.sqrt(), spline.settings),
@@ -216,7 +218,7 @@ def _drawn(
 ) -> dict[str, torch.Tensor]:
     """Random differences in dt of unit amplitude, (draws, ...), after the images' filter."""
     spline, valid = images.spline, linear.valid
-    slope = working(linear.slope)
+    slope = linear.slope
     like, shape = slope, (_DRAWS[mesh.dims], *slope.shape[1:])
     steep = averaged(slope.square().sum(0), valid, width)
     # texture is stronger where slopes are
@@ -228,8 +230,8 @@ def _drawn(
 
     texture = _texture_density(images, linear)
     wave = wavenumbers(texture, spline.shape)
-    white = normal_fields(shape, like, 1) / images.given_weight.sqrt()
-    finer = _motion_beyond(shape, mesh, like, 4) * unresolved.sqrt()
+    white = normal_fields(shape, like, 1) / images.given_weight.sqrt().to(like)
+    finer = _motion_beyond(shape, mesh, like, 4) * unresolved.sqrt().to(like)
     kinds = {
         "noise": spline.filtered(white) / times**0.5,
         "replaced": textured(texture, 2),
@@ -289,7 +291,7 @@ def _normal_fields(
     shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, seed: int
 ) -> torch.Tensor:
     random = torch.Generator().manual_seed(seed)
-    return torch.randn(shape, generator=random, dtype=dtype).to(device)
+    return torch.randn(shape, generator=random, dtype=torch.float64).to(device, dtype)
 
 
 def _texture_density(images: Images, linear: Linear) -> torch.Tensor:
@@ -299,7 +301,7 @@ def _texture_density(images: Images, linear: Linear) -> torch.Tensor:
     """
     spline = images.spline
     sizes = transform_sizes(spline.shape, spline.settings)
-    first, last = working(linear.warped[0]), working(linear.warped[-1])
+    first, last = linear.warped[0], linear.warped[-1]
     _, shell = radii(tuple(sizes), spline.shape, first.dtype, first.device)
     both = torch.stack([(first + last) / 2, (first - last) / 2]) * _tapered(linear.valid)
     (mean, uncertainty), (half, _) = (
@@ -316,7 +318,7 @@ def _tapered(valid: torch.Tensor) -> torch.Tensor:
 
     A step would spread the power of long waves over all others.
     """
-    share = averaged(valid.double(), torch.ones_like(valid), _TAPER)
+    share = averaged(valid.float(), torch.ones_like(valid), _TAPER)
     weight = (2 * share - 1).clamp(min=0.0) * valid
     return weight / weight.square().mean().sqrt().clamp(min=1e-6)
 
@@ -347,7 +349,8 @@ def _unresolved_fraction(mesh: Mesh, like: torch.Tensor) -> tuple[torch.Tensor, 
     wave = torch.exp(torch.linspace(math.log(lowest), math.log(highest), 24).to(like))
     per_knot = wave * knots / (2 * math.pi)
     power = torch.sinc(per_knot[:, None] + torch.arange(-8, 9).to(like)).pow(8)
-    return wave, 1 - torch.sinc(per_knot).pow(8) / power.sum(1)
+    # of long waves next to none is left, which rounding may make negative
+    return wave, (1 - torch.sinc(per_knot).pow(8) / power.sum(1)).clamp(min=0.0)
 
 
 def _variance_beyond(prior: Prior, mesh: Mesh) -> torch.Tensor:
@@ -383,12 +386,12 @@ def _residual_operator(
     linear: Linear, mesh: Mesh, response: Response | None
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """Residuals of a fit to differences (draws, ...), to first order."""
-    slope, weight = working(linear.slope), working(linear.weight)
+    slope, weight = linear.slope, linear.weight
 
     def left(differences: torch.Tensor) -> torch.Tensor:
         if response is None:
             return differences * linear.valid
-        differences = working(differences) * linear.valid
+        differences = differences.to(slope) * linear.valid
         changes = response(mesh.transposed(-differences[:, None] * (slope * weight)))
         return (differences + (slope * mesh.field(changes)).sum(1)) * linear.valid
 
@@ -399,12 +402,12 @@ def _flows_left(
     linear: Linear, mesh: Mesh, prior: Prior, response: Response | None
 ) -> torch.Tensor:
     """Residuals of a fit to the differences by flows drawn from the prior, (draws, ...)."""
-    slope = working(linear.slope)
+    slope = linear.slope
     if response is None:
         return torch.zeros_like(slope[:1]).expand(_DRAWS[mesh.dims], *slope.shape[1:])
     weights = prior.weights
     drawn = weights.sqrt() * normal_fields((_DRAWS[mesh.dims], *weights.shape), weights, 5)
-    flows = prior.rates_transposed(drawn)
+    flows = prior.rates_transposed(drawn).to(slope)
     return (slope * mesh.field(response(flows))).sum(1) * linear.valid
 
 

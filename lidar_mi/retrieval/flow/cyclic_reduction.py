@@ -46,11 +46,11 @@ class CyclicFactor(NamedTuple):
     band: Band
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Coefficients that solve the system, of right hand sides (..., 2, Z, Y)."""
+        """Coefficients that solve the system, of right hand sides (..., 2, Z, Y), in their type."""
         band, shape = self.band, right.shape
         size, number = self.last.shape[-1], -(-band.columns // REACH)
         # (knot y, component and knot z, right hand side), a block for every three knots along y
-        values = right.reshape(-1, 2 * band.rows, band.columns).permute(2, 1, 0)
+        values = right.to(self.last).reshape(-1, 2 * band.rows, band.columns).permute(2, 1, 0)
         values = pad(values, (0, 0, 0, 0, 0, number * REACH - band.columns))
         values = values.reshape(number, size, -1)
         halves = []
@@ -67,7 +67,7 @@ class CyclicFactor(NamedTuple):
             own = torch.linalg.solve_triangular(root.mT, half, upper=True)
             values = _merged(values, own)
         found = values.reshape(number * REACH, 2 * band.rows, -1)[: band.columns]
-        return found.permute(2, 1, 0).reshape(shape)
+        return found.permute(2, 1, 0).reshape(shape).to(right)
 
     def covariance(self) -> torch.Tensor:
         """The inverse within the band, as a form is held: (2, 2, 7, Z, 4, Y).

@@ -66,8 +66,9 @@ class Posterior(NamedTuple):
         return variances(self.before.covariance() - after, self.prior), energy
 
     def response(self, gradients: torch.Tensor) -> torch.Tensor:
-        """Changes of the coefficients by gradients (..., components, knots)."""
-        return self.root.solve(gradients)
+        """Changes of the coefficients by gradients (..., components, knots), to a thousandth."""
+        root = self.root.single if isinstance(self.root, BandCholesky) else self.root
+        return root.solve(gradients)
 
     def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
         """The prior's precision times coefficients (n, 2, Z, Y)."""
@@ -110,7 +111,7 @@ def by_lapack(form: torch.Tensor) -> bool:
 def covariance_near(root: Root, form: torch.Tensor) -> torch.Tensor:
     """That of a form's factor to `_INVERSE`, where it is, in single precision."""
     if isinstance(root, BandCholesky):
-        found = root.single().covariance().to(form)
+        found = root.single.covariance().to(form)
         band = Band(form.shape[3], form.shape[5])
         # the product of both matrices has ones on its diagonal
         ones = band.apply(found * form, form.new_ones(2, form.shape[3], form.shape[5]))

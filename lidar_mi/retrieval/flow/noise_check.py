@@ -10,7 +10,7 @@ from lidar_mi.retrieval.flow.components import Response, normal_fields
 from lidar_mi.retrieval.flow.flow_spline import Mesh
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
 from lidar_mi.retrieval.images.band_limit import even_fast_len
-from lidar_mi.retrieval.images.windows import Windows, averaged, working
+from lidar_mi.retrieval.images.windows import Windows, averaged
 
 # Random fields of noise that are sent through the fit.
 _DRAWS = 12
@@ -40,10 +40,9 @@ def variance_by_coloured_noise(
     ``linear`` is about the flow that was found. The variance is in px^2; the lines that have an
     offset each are "columns", "rows", both or none.
     """
-    slope, weight, valid = working(linear.slope), working(linear.weight), linear.valid
+    slope, weight, valid = linear.slope, linear.weight, linear.valid
     time = images.time.to(linear.warped).reshape(-1, 1, 1)
     residual = (time * linear.warped).sum(0) / time.square().sum() * valid
-    residual = working(residual)
     steep = slope.square().sum(0)
     around = averaged(steep, valid, _WIDTH).clamp(min=1e-30)
     use = valid / (1 + steep / (_LOW * around))

@@ -63,22 +63,26 @@ def better_elsewhere(
     rim = reach // 2 + 1
     pixels = [torch.arange(n).to(linear.warped) for n in windows.shape]
     places = [place.expand(2, -1, -1) for place in torch.meshgrid(*pixels, indexing="ij")]
-    fields = *images.spline.values(*places), linear.weight * linear.valid / 2, *images.usable
-    one, two, weight, *known = (pad(field.to(linear.warped), (rim,) * 4) for field in fields)
-    fitted = pad((linear.warped[1] - linear.warped[0]).square(), (rim,) * 4)
+    # in single precision, which suffices to compare sums of squares
     gauss = [
-        torch.exp(-(c[:, None] + rim - torch.arange(n).to(c)).square() / 2 / size**2)
-        for c, n in zip(centres, one.shape, strict=True)
+        torch.exp(-(c[:, None] - pixel).square() / 2 / size**2).float()
+        for c, pixel in zip(centres, pixels, strict=True)
     ]
+    one, two, *known = (
+        pad(field.float(), (rim,) * 4) for field in (*images.spline.values(*places), *images.usable)
+    )
+    weight = (linear.weight * linear.valid / 2).float()
+    fitted = (linear.warped[1] - linear.warped[0]).float().square()
+
+    def at_shift(field: torch.Tensor, z: int, y: int) -> torch.Tensor:
+        rows, columns = windows.shape
+        return field[rim - z : rim - z + rows, rim - y : rim - y + columns]
 
     def excess(z: int, y: int) -> torch.Tensor:
         """Minus the log-likelihood of a displacement over that of the flow, by the same pixels."""
         back, on = (z // 2, y // 2), (z // 2 - z, y // 2 - y)
-        first, second, seen1, seen2 = (
-            field.roll(shift, (0, 1))
-            for field, shift in ((one, back), (two, on), (known[0], back), (known[1], on))
-        )
-        off = weight * seen1 * seen2 * ((second - first).square() - fitted)
+        off = (at_shift(two, *on) - at_shift(one, *back)).square_().sub_(fitted).mul_(weight)
+        off.mul_(at_shift(known[0], *back)).mul_(at_shift(known[1], *on))
         return separable(off, gauss)
 
     shifts = range(-reach - 1, reach + 2)

@@ -221,9 +221,16 @@ def _fitted(
         in_single = images.single()
         for iteration in range(rounds):
             if posterior is not None and iteration in noise_rounds:
-                linear = linearised(in_single, single, coefficients.float(), settings)
+                flow_in_single = coefficients.float()
+                linear = linearised(in_single, single, flow_in_single, settings)
                 found = differences(
-                    images, linear, mesh, coefficients, prior, windows.template, posterior.response
+                    images,
+                    linear,
+                    single,
+                    flow_in_single,
+                    prior,
+                    windows.template,
+                    posterior.response,
                 )
                 images, unresolved = found.images, found.unresolved
                 in_single = images.single()
@@ -235,8 +242,8 @@ def _fitted(
                 prior = prior.updated(*posterior.evidence(), settings)
         flow = mesh.field(coefficients)
     assert prior is not None  # settings have a level at least
-    linear = linearised(images, mesh, coefficients, settings)
-    posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
+    linear = linearised(in_single, single, coefficients.float(), settings)
+    posterior = solve(linear, single, coefficients, prior, settings, settings.rounds[-1])
     if sought and len(stack) == 2 and windows.dims == 2 and posterior.response is not None:
         offsets = line_offsets(
             images, linear, mesh, coefficients, settings, posterior.response, offsets
@@ -247,7 +254,7 @@ def _fitted(
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     # never narrower: one ratio scatters by half in flows of few vortices
-    check = prior_check(posterior, linear, mesh)
+    check = prior_check(posterior, linear, single)
     factor = check.factor(centres).to(covariance).clamp(min=1.0)
     covariance = factor * covariance
     score = agreement(linear, windows)
@@ -258,7 +265,7 @@ def _fitted(
     lines, coloured = "", torch.zeros_like(finer)
     if windows.dims == 2 and posterior.response is not None:
         coloured, lines = variance_by_coloured_noise(
-            linear, images, mesh, windows, posterior.response
+            linear, images, single, windows, posterior.response
         )
         finer = finer + coloured.to(finer)
     additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
@@ -274,7 +281,7 @@ def _fitted(
     bare = interpolated(bare, pixels, centres) > 0.5
     flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * bare).short()
     if len(stack) == 2:
-        other = better_elsewhere(images, linear, d, windows)
+        other = better_elsewhere(in_single, linear, d, windows)
         flag = flag | (Flag.OTHER_MOTION * other.to(flag.device)).short()
     result = result._replace(flag=flag)
     if bare.double().mean() > 0.5 or not (keep and isinstance(posterior, direct.Posterior)):

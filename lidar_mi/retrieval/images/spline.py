@@ -72,7 +72,7 @@ class Spline(NamedTuple):
         spectrum = torch.fft.rfft(field, n=sizes[-1])
         for axis, size in zip(dims[:-1], sizes[:-1], strict=True):
             spectrum = torch.fft.fft(spectrum, n=size, dim=axis)
-        spectrum = spectrum * self.gain[shell]
+        spectrum = spectrum * self.gain.to(field)[shell]
         for axis, n in zip(dims[:-1], self.shape[:-1], strict=True):
             spectrum = torch.fft.ifft(spectrum, dim=axis).narrow(axis, 0, n)
         return torch.fft.irfft(spectrum, n=sizes[-1])[..., : self.shape[-1]]

@@ -60,10 +60,10 @@ def step_limits(y: np.ndarray, z: np.ndarray, profile: Profile, dt: float = 0.0)
     return allowed
 
 
-def within(limits: Limits, parameters: torch.Tensor, found: Solution | None) -> Solution | None:
+def within(limits: Limits, parameters: torch.Tensor, solution: Solution | None) -> Solution | None:
     """The solution if the limits allow the step to it; it may have further parameters behind."""
-    if found and limits(parameters, found.parameters[: len(parameters)] - parameters):
-        return found
+    if solution and limits(parameters, solution.parameters[: len(parameters)] - parameters):
+        return solution
     return None
 
 
@@ -76,7 +76,7 @@ def no_fit(profile: Profile, reason: str) -> VortexPairFit:
 
 
 def checked_fit(
-    found: Solution,
+    solution: Solution,
     covariance: np.ndarray,
     profile: Profile,
     chi2: float,
@@ -90,9 +90,9 @@ def checked_fit(
     further: float = 0.0,
 ) -> VortexPairFit:
     """The fit, with the reasons for which it is not accepted."""
-    theta = found.parameters[:10].cpu().numpy()
+    theta = solution.parameters[:10].cpu().numpy()
     reasons = []
-    if not found.converged and far_from_minimum(found, covariance):
+    if not solution.converged and far_from_minimum(solution, covariance):
         reasons.append("did not converge")
     if not match >= _MATCH:
         reasons.append(f"correlation {match:.2f}; expected at least {_MATCH:g}")

@@ -161,13 +161,13 @@ class AmbientErrors(NamedTuple):
 
 
 def in_ambient_wind(
-    found: Solution, y: torch.Tensor, z: torch.Tensor, dt: float, known: AmbientWind | None = None
+    calm: Solution, y: torch.Tensor, z: torch.Tensor, dt: float, known: AmbientWind | None = None
 ) -> Ambient:
     """The solution of a fit with the ambient wind in its model, linear in it.
 
     Parameters
     ----------
-    found : Solution
+    calm : Solution
         Without it. Its first ten parameters are those of a pair, without a prior.
     y, z : torch.Tensor, shape (z, y)
         Of the residuals, m.
@@ -176,9 +176,9 @@ def in_ambient_wind(
     known : AmbientWind, optional
         With which the residuals were computed.
     """
-    misfit = found.misfit
+    misfit = calm.misfit
     # one scale: weights may state less or more noise than the residuals have
-    weight = found.weight / _scale(found)
+    weight = calm.weight / _scale(calm)
     slope, residual, jacobian = misfit.slope, misfit.residual, misfit.jacobian
     if residual.ndim == 2:
         slope, residual, jacobian, weight = (
@@ -190,7 +190,7 @@ def in_ambient_wind(
     # exact winds would leave nothing but rounding
     sharpest = float((weight * slope.square()).sum(0).amax()) * dt**2
     weight = weight * min(1.0, (_FINEST * float(_SPREADS[0])) ** -2 / sharpest)
-    middle_y, middle_z = (float(found.parameters[[k, k + 4]].mean()) for k in (2, 3))
+    middle_y, middle_z = (float(calm.parameters[[k, k + 4]].mean()) for k in (2, 3))
     centre = middle_y, middle_z
     if known is not None:
         residual = residual - dt * (slope * known.linear(y, z)[:, None]).sum(0)
@@ -222,7 +222,7 @@ def in_ambient_wind(
     normal = normal + torch.diag(prior)
 
     # turbulence is that relative to the place of the pair, whose air the mean wind is
-    here = blocks.at_pair(found.parameters)
+    here = blocks.at_pair(calm.parameters)
     # as the parameters follow: what they leave of stiffness and force
     followed = _solve(normal, torch.cat([coupling, gradient[:, None]], 1))
     free = stiffness - coupling.T @ followed[:, :-1]
@@ -254,8 +254,8 @@ def in_ambient_wind(
         remains = remains - (stored[:, None] * slope).sum(0)
     if misfit.residual.ndim == 2:
         remains, projected, weight = remains[0], projected[:, 0], weight[0]
-    moved = torch.cat([found.parameters, found.parameters.new_zeros(4)]) + step.to(found.parameters)
-    solution = found._replace(
+    moved = torch.cat([calm.parameters, calm.parameters.new_zeros(4)]) + step.to(calm.parameters)
+    solution = calm._replace(
         parameters=moved,
         misfit=misfit._replace(residual=misfit.valid * remains, jacobian=projected),
         weight=weight,
@@ -267,7 +267,7 @@ def in_ambient_wind(
         air,
         float(variances.sum().sqrt()),
         float((variances * lengths.log()).sum().div(variances.sum()).exp()),
-        Elimination(blocks, y, z, dt, found.parameters, variances, covariance, free, push, prior),
+        Elimination(blocks, y, z, dt, calm.parameters, variances, covariance, free, push, prior),
     )
 
 
@@ -312,17 +312,17 @@ class _Blocks(NamedTuple):
     def spread(self, values: torch.Tensor) -> torch.Tensor:
         """Values (..., rows, columns) of the blocks at their grid points (..., z, y)."""
         rows, columns = self.grid
-        found = values.repeat_interleave(self.side, -2).repeat_interleave(self.side, -1)
-        return found[..., :rows, :columns]
+        pixels = values.repeat_interleave(self.side, -2).repeat_interleave(self.side, -1)
+        return pixels[..., :rows, :columns]
 
     def at_pair(self, parameters: torch.Tensor) -> torch.Tensor:
         """Weights (rows x columns,) of the wind's mean over both vortices' places."""
-        found = self.z.new_zeros(self.shape)
+        weights = self.z.new_zeros(self.shape)
         for first in (0, 4):
             row = (self.z - float(parameters[first + 3])).abs().argmin()
             column = (self.y - float(parameters[first + 2])).abs().argmin()
-            found[row, column] += 0.5
-        return found.flatten()
+            weights[row, column] += 0.5
+        return weights.flatten()
 
     @property
     def steps(self) -> tuple[float, float]:
@@ -358,12 +358,12 @@ def _matrix(parts: torch.Tensor) -> torch.Tensor:
     return torch.cat([torch.cat([yy, yz], 1), torch.cat([yz, zz], 1)])
 
 
-def _scale(found: Solution) -> float:
+def _scale(solution: Solution) -> float:
     """Mean square of the residuals over what their weights state."""
-    misfit = found.misfit
-    used = misfit.valid & (found.weight > 0)
+    misfit = solution.misfit
+    used = misfit.valid & (solution.weight > 0)
     # weights are of the noise before a filter, with the departure from the model
-    stated = (1 / found.weight - misfit.variance + misfit.scatter)[used]
+    stated = (1 / solution.weight - misfit.variance + misfit.scatter)[used]
     return max(float((misfit.residual[used].square() / stated).mean()), 1e-6)
 
 
@@ -398,12 +398,12 @@ def _log_likelihoods(stiffness: np.ndarray, force: np.ndarray, root: np.ndarray)
     reflectors, diagonal, beside, scales, _ = lapack.dsytrd(matrix, 1, 64 * len(matrix))
     turned = root.T @ force
     turned[1:] = lapack.dormqr("L", "T", reflectors[1:, :-1], scales, turned[1:], 64)[0]
-    found = np.empty(len(_SPREADS))
+    likelihoods = np.empty(len(_SPREADS))
     for number, variance in enumerate(_SPREADS**2):
         pivots, _, solution, _ = lapack.dptsv(1 + variance * diagonal, variance * beside, turned)
         gain = variance * float((turned * solution).sum())
-        found[number] = (gain - np.log(pivots).sum()) / 2
-    return found
+        likelihoods[number] = (gain - np.log(pivots).sum()) / 2
+    return likelihoods
 
 
 def _further_vortex(known: Elimination) -> float:
@@ -458,7 +458,7 @@ def _spread(
     # columns of a real transform stand for both signs, but for the first and the last
     double = torch.full(waves.shape[-2:], 2.0, dtype=response.dtype, device=y.device)
     double[:, 0] = double[:, -1] = 1.0
-    found = []
+    spreads = []
     for along in (0.0, ALONG):
         vv, vw, ww = torch.stack(
             [
@@ -469,8 +469,8 @@ def _spread(
         v, w = (waves[:, 0] * vv + waves[:, 1] * vw), (waves[:, 0] * vw + waves[:, 1] * ww)
         both = torch.view_as_real(torch.stack([v, w], 1) * double).flatten(1)
         matrix = torch.view_as_real(waves).flatten(1) @ both.T / (sizes[0] * sizes[1])
-        found.append(((matrix + matrix.T) / 2).double())
-    return found[0], found[1]
+        spreads.append(((matrix + matrix.T) / 2).double())
+    return spreads[0], spreads[1]
 
 
 def _relative(fields: torch.Tensor, here: torch.Tensor) -> torch.Tensor:
@@ -524,8 +524,8 @@ def _spectra(
 ) -> torch.Tensor:
     """Transform (3, ...) of the covariances vv, vw and ww by lags that wrap."""
     lag_z, lag_y = (np.fft.fftfreq(n, 1 / n) * step for n, step in zip(sizes, steps, strict=True))
-    found = np.fft.rfft2(_of_lags(lag_z, lag_y, length, along)).real
-    return torch.as_tensor(found, dtype=dtype, device=device)
+    spectra = np.fft.rfft2(_of_lags(lag_z, lag_y, length, along)).real
+    return torch.as_tensor(spectra, dtype=dtype, device=device)
 
 
 def _of_lags(lag_z: np.ndarray, lag_y: np.ndarray, length: float, along: float) -> np.ndarray:

@@ -24,7 +24,7 @@ _LEAST_CURVATURE = 0.1
 
 
 def model_error_of(
-    found: Solution, shortest: float, *, changes: bool = False, before: ModelError | None = None
+    solution: Solution, shortest: float, *, changes: bool = False, before: ModelError | None = None
 ) -> ModelError:
     """Departure of the flow from the model, from the residuals of a fit; see `model_error`.
 
@@ -40,8 +40,8 @@ def model_error_of(
     """
     if changes and before is not None and not before.variances:
         return before
-    misfit = found.misfit
-    residual, slope, weight = misfit.residual, misfit.slope, found.weight
+    misfit = solution.misfit
+    residual, slope, weight = misfit.residual, misfit.slope, solution.weight
     if residual.ndim == 2:
         residual, slope, weight = residual[None], slope[:, None], weight[None]
     force = (slope * weight * residual).sum(1)
@@ -49,12 +49,12 @@ def model_error_of(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
     # residuals lack the part of the departure that the parameters have followed
-    follow = (_responses(found), _inverse(found)) if before is not None else None
+    follow = (_responses(solution), _inverse(solution)) if before is not None else None
 
     def of_forces(even: torch.Tensor | float, tested: bool) -> ModelError:
         change, response = None, follow and Response(*follow, even)
         if changes:
-            steep = even * found.weight * misfit.slope
+            steep = even * solution.weight * misfit.slope
             change = of_change(misfit.residual, steep, misfit.valid)
         return model_error(even * force, even * stiffness, shortest, change, response, tested)
 
@@ -68,7 +68,7 @@ def model_error_of(
 
 
 def parameter_covariance(
-    found: Solution,
+    solution: Solution,
     residual_error: ModelError,
     departure: ModelError,
     excess: float,
@@ -81,16 +81,16 @@ def parameter_covariance(
     The part by noise is multiplied by `excess`: for H of noisy slopes, 1 / `curvature`^2. The part
     of the departure in the residuals is `residual_error`.
     """
-    spread = _noise_spread(found, residual_error).double() * excess
-    spread = spread + spread_of(_responses(found), departure).double()
+    spread = _noise_spread(solution, residual_error).double() * excess
+    spread = spread + spread_of(_responses(solution), departure).double()
     # the sandwich: its errors hold although the weights are not the inverse covariance
-    inverse = _inverse(found)
+    inverse = _inverse(solution)
     covariance = (inverse @ spread @ inverse)[:10, :10] + ambient
-    attenuation = _attenuation(found)
+    attenuation = _attenuation(solution)
     # a bias of unknown size: fully correlated between the parameters
     covariance = covariance + torch.outer(attenuation, attenuation)
-    if not found.converged:
-        remaining = _remaining_step(found)
+    if not solution.converged:
+        remaining = _remaining_step(solution)
         covariance = covariance + torch.outer(remaining, remaining)
     return covariance.cpu().numpy()
 
@@ -105,15 +105,15 @@ def shared_error(errors: AmbientErrors) -> tuple[np.ndarray, float]:
     return here, -ALONG / np.log(correlation)
 
 
-def _responses(found: Solution) -> torch.Tensor:
+def _responses(solution: Solution) -> torch.Tensor:
     """Force (p, 2, z, y) on the parameters by a displacement (m/s of vectors) of the flow."""
-    misfit, weight = found.misfit, found.weight
+    misfit, weight = solution.misfit, solution.weight
     if weight.ndim == 2:
         return weight * misfit.jacobian[:, None] * misfit.slope
     return torch.einsum("ozy,pozy,aozy->pazy", weight, misfit.jacobian, misfit.slope)
 
 
-def curvature(found: Solution, spacing: tuple[float, float]) -> float:
+def curvature(solution: Solution, spacing: tuple[float, float]) -> float:
     """Curvature of the misfit of two images over that by the slopes alone, from 0 to 1.
 
     The mean of both images' slopes has noise and change of its own, which are half of the slopes of
@@ -123,12 +123,12 @@ def curvature(found: Solution, spacing: tuple[float, float]) -> float:
 
     Parameters
     ----------
-    found : Solution
+    solution : Solution
         Of images (z, y).
     spacing : (float, float)
         Of the pixels along y and z, m.
     """
-    residual, weight = found.misfit.residual, found.weight
+    residual, weight = solution.misfit.residual, solution.weight
     steep = 0.0
     for step, axis in zip(spacing, (1, 0), strict=True):
         # half way between pixels, to the fourth order
@@ -136,7 +136,7 @@ def curvature(found: Solution, spacing: tuple[float, float]) -> float:
         change = (27 * (r2 - r1) - (r3 - r0)) / (24 * step)
         least = torch.stack(_neighbours(weight, axis)).amin(0)
         steep += float((least * change.square()).sum())
-    whole = float((weight * found.misfit.slope.square().sum(0)).sum())
+    whole = float((weight * solution.misfit.slope.square().sum(0)).sum())
     # below the least curvature the images have no minimum to be certain of
     return max(1 - steep / (4 * whole), _LEAST_CURVATURE) if whole > 0 else 1.0
 
@@ -147,14 +147,14 @@ def _neighbours(field: torch.Tensor, axis: int) -> list[torch.Tensor]:
     return [field.narrow(axis, first, number) for first in range(4)]
 
 
-def _inverse(found: Solution) -> torch.Tensor:
+def _inverse(solution: Solution) -> torch.Tensor:
     # m^2/s and logarithms differ by powers of ten
-    scale = found.normal.diagonal().sqrt()
-    inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
+    scale = solution.normal.diagonal().sqrt()
+    inverse = torch.linalg.pinv(solution.normal / scale / scale[:, None], hermitian=True)
     return inverse / scale / scale[:, None]
 
 
-def change_by_flow(found: Solution, flow: torch.Tensor) -> np.ndarray:
+def change_by_flow(solution: Solution, flow: torch.Tensor) -> np.ndarray:
     """Change (10,) of the parameters by a small flow that the model does not have.
 
     Parameters
@@ -162,21 +162,21 @@ def change_by_flow(found: Solution, flow: torch.Tensor) -> np.ndarray:
     flow : torch.Tensor, shape (2, z, y)
         Along y and z: displacements (m) of images, winds (m/s) of vectors, at the residuals.
     """
-    misfit = found.misfit
+    misfit = solution.misfit
     flow = flow if misfit.slope.ndim == 3 else flow[:, None]
     change = (misfit.slope * flow.to(misfit.slope)).sum(0)
-    force = misfit.jacobian.flatten(1) @ (found.weight * change).flatten()
-    return (_inverse(found) @ force.double())[:10].cpu().numpy()
+    force = misfit.jacobian.flatten(1) @ (solution.weight * change).flatten()
+    return (_inverse(solution) @ force.double())[:10].cpu().numpy()
 
 
-def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
+def _noise_spread(solution: Solution, error: ModelError) -> torch.Tensor:
     """Covariance of the force by noise: from the residuals, of vectors if it exceeds that stated.
 
     By the residuals, each stands for its own variance (White 1980, Econometrica 48, 817), whatever
     pixels are noisier than stated. Of images it is their mean about each pixel: ten parameters
     absorb part of the few residuals in a core.
     """
-    misfit, weight = found.misfit, found.weight
+    misfit, weight = solution.misfit, solution.weight
     columns = misfit.jacobian.flatten(1)
     by_flow = error.variance * misfit.slope.square().sum(0)
     ratio = (misfit.residual.square() / (misfit.scatter + by_flow)).where(misfit.valid, 0.0)
@@ -187,29 +187,29 @@ def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
         (columns * (weight**2 * part).flatten()) @ columns.T
         for part in (misfit.variance, misfit.variance * ratio)
     )
-    scale = found.normal.diagonal()
+    scale = solution.normal.diagonal()
     excess = float((observed.diagonal() / scale).sum() / (stated.diagonal() / scale).sum())
     return observed if excess > 1 else stated
 
 
-def _remaining_step(found: Solution) -> torch.Tensor:
+def _remaining_step(solution: Solution) -> torch.Tensor:
     """The remaining step (10,) of a fit that interpolation noise has stopped."""
-    misfit, weight = found.misfit, found.weight
+    misfit, weight = solution.misfit, solution.weight
     force = -misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()
     force = force.double()
-    scale = found.normal.diagonal().sqrt()
-    scaled = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
+    scale = solution.normal.diagonal().sqrt()
+    scaled = torch.linalg.pinv(solution.normal / scale / scale[:, None], hermitian=True)
     return (scaled @ (force / scale) / scale)[:10]
 
 
-def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
+def far_from_minimum(solution: Solution, covariance: np.ndarray) -> bool:
     """Whether the remaining step is more than the other standard error of any parameter."""
-    square = _remaining_step(found).cpu().numpy() ** 2
+    square = _remaining_step(solution).cpu().numpy() ** 2
     # the remaining step is part of the covariance: it is compared with the rest
     return not (square < np.diagonal(covariance) - square).all()
 
 
-def _attenuation(found: Solution) -> torch.Tensor:
+def _attenuation(solution: Solution) -> torch.Tensor:
     """Possible bias of the circulations towards zero, as an error of all parameters (10,).
 
     Structure that has been wound up for long is aligned with the flow: the images change little,
@@ -219,7 +219,7 @@ def _attenuation(found: Solution) -> torch.Tensor:
     stated. The unexplained part of images counts only as far as it grows with the change, as air is
     replaced anywhere.
     """
-    misfit, theta = found.misfit, found.parameters
+    misfit, theta = solution.misfit, solution.parameters
     explained = (theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]).square()
     square = misfit.residual.square()
     if square.ndim == 2:
@@ -227,8 +227,8 @@ def _attenuation(found: Solution) -> torch.Tensor:
         steep = misfit.slope.square().sum(0)
         fraction = _increase(square - misfit.scatter, explained, steep, misfit.valid)
     else:
-        power = float((found.weight * explained)[misfit.valid].sum())
-        excess = float((found.weight * (square - misfit.scatter))[misfit.valid].sum())
+        power = float((solution.weight * explained)[misfit.valid].sum())
+        excess = float((solution.weight * (square - misfit.scatter))[misfit.valid].sum())
         fraction = max(0.0, excess / power) if power > 0 else 0.0
     attenuation = torch.zeros_like(theta[:10])
     attenuation[0], attenuation[4] = fraction * theta[0], fraction * theta[4]

@@ -32,11 +32,11 @@ class Detection(NamedTuple):
 
 def detect(make: Builder) -> Detection:
     """The detection of a pair in the images of a fit."""
-    found = likelihoods(make)
-    probability = probability_of(found.log_ratio)
-    if found.pair is None:
+    likelihoods_by_place = likelihoods(make)
+    probability = probability_of(likelihoods_by_place.log_ratio)
+    if likelihoods_by_place.pair is None:
         return Detection(probability, None)
-    pair = found.pair.clone()
+    pair = likelihoods_by_place.pair.clone()
     pair[[2, 6]] += float(make.y[0])
     pair[[3, 7]] += float(make.z[0])
     return Detection(probability, pair.to(make.pair.device))

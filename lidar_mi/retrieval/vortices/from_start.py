@@ -231,10 +231,10 @@ def _linear_power(misfit: Misfit, variance: float) -> float:
     return float(without_step(misfit, variance)[misfit.valid].square().mean())
 
 
-def agrees(start: VortexPairFit, found: VortexPairFit) -> bool:
+def agrees(start: VortexPairFit, fit: VortexPairFit) -> bool:
     """Whether a fit agrees with the start within both errors."""
-    off = found.parameters - start.parameters
-    spread = found.covariance + start.covariance
+    off = fit.parameters - start.parameters
+    spread = fit.covariance + start.covariance
     scale = np.sqrt(np.diagonal(spread))
     inverse = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
     square = float((off / scale) @ inverse @ (off / scale))

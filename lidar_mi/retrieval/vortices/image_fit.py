@@ -220,8 +220,8 @@ def _detected(first: torch.Tensor, second: torch.Tensor, taken: Acquisition) -> 
     make = make.single()
     probability, likeliest = detect(make)
     if likeliest is None or probability < _LEAST_PROBABILITY:
-        found = no_fit(taken.profile, f"probability of a vortex {probability:.1%}")
-        return replace(found, probability=probability)
+        refused = no_fit(taken.profile, f"probability of a vortex {probability:.1%}")
+        return replace(refused, probability=probability)
     theta = torch.cat([likeliest, likeliest.new_tensor(SAME_BRIGHTNESS)])
     limits = step_limits(make.y, make.z, make.profile, make.dt)
     for wider in _CORES:
@@ -230,8 +230,8 @@ def _detected(first: torch.Tensor, second: torch.Tensor, taken: Acquisition) -> 
         near = fit_near(start, make, limits, _NOISE_LAGS, _DETECTED, estimates=2)
         if near:
             return replace(_checked(make, *near), probability=probability)
-    found = no_fit(taken.profile, "no fit near the likeliest pair")
-    return replace(found, parameters=likeliest.cpu().numpy(), probability=probability)
+    refused = no_fit(taken.profile, "no fit near the likeliest pair")
+    return replace(refused, parameters=likeliest.cpu().numpy(), probability=probability)
 
 
 def started_fit(
@@ -325,16 +325,16 @@ def fit_pixels(
     if isinstance(make, str):
         return no_fit(taken.profile, make)
     limits = step_limits(taken.y, taken.z, taken.profile, taken.dt)
-    found, replaced = _searched(make, limits)
-    if found is None:
+    fit, replaced = _searched(make, limits)
+    if fit is None:
         return no_fit(taken.profile, "no vortex signature")
     # in air that is replaced there are many minima: a few steps may end in another one
     if not replaced:
-        near = fit_near(found.parameters, make, limits, _NOISE_LAGS, estimates=2)
+        near = fit_near(fit.parameters, make, limits, _NOISE_LAGS, estimates=2)
         pair = near and _checked(make, *near)
         if pair and pair.success:
             return pair
-    return _iterated(found, make, limits)
+    return _iterated(fit, make, limits)
 
 
 def _started(make: Builder | str, start: VortexPairFit) -> StartedFit | None:
@@ -382,19 +382,19 @@ def _searched(make: Builder, limits: Limits) -> tuple[Solution | None, bool]:
         return None, False
     variance = (_FIRST_MODEL_ERROR * spacing) ** 2
     white = make(*_LEVELS[1])
-    found, images = _refitted(white, best.parameters, variance, limits)
-    if _replaced(white.weighted(found.misfit)) < _REPLACED:
-        return found, False
+    pair, images = _refitted(white, best.parameters, variance, limits)
+    if _replaced(white.weighted(pair.misfit)) < _REPLACED:
+        return pair, False
     observed = condensed(white.at_least(float(images.scatter.mean())).differences())
     starts = starting_points(observed, STARTS, make.profile)
     others = _best(images, starts, limits, variance)
     # both are fits to the same images, so that costs compare
-    return (others if others and others.cost < found.cost else found), True
+    return (others if others and others.cost < pair.cost else pair), True
 
 
 def _best(images: Images, starts: torch.Tensor, limits: Limits, variance: float) -> Solution | None:
     """The fit of the least cost from starting points (n, 10), None if there are none."""
-    found = [
+    solutions = [
         fit(
             images,
             torch.cat([start, start.new_tensor(SAME_BRIGHTNESS)]).double(),
@@ -405,7 +405,7 @@ def _best(images: Images, starts: torch.Tensor, limits: Limits, variance: float)
         )
         for start in starts
     ]
-    return min(found, key=lambda solution: solution.cost, default=None)
+    return min(solutions, key=lambda solution: solution.cost, default=None)
 
 
 def _replaced(misfit: Misfit) -> float:
@@ -429,10 +429,10 @@ def _refitted(
     return fit(images, parameters, limits, variance, 12, TOLERANCE), images
 
 
-def _iterated(found: Solution, make: Builder, limits: Limits) -> VortexPairFit:
+def _iterated(solution: Solution, make: Builder, limits: Limits) -> VortexPairFit:
     """The fit from that to blurred images, by steps until it converges: far starts, no noise."""
     white = make(*_LEVELS[2])
-    best, images = _refitted(white, found.parameters, 0.0, limits)
+    best, images = _refitted(white, solution.parameters, 0.0, limits)
     # twice, as the filter follows from the residuals and the residuals from the filter
     for _ in range(2):
         error = model_error_of(best, _NOISE_LAGS, changes=True)

@@ -233,9 +233,9 @@ class Images:
             gain, offset = near._brightness(parameters)
             differences.append(second - gain * first - offset)
         linear = torch.tensordot((end - start).to(self.y), known.jacobian[:, *box], 1)
-        found = torch.zeros_like(known.residual)
-        found[box] = differences[1] - differences[0] - linear
-        return known.valid * found
+        curved = torch.zeros_like(known.residual)
+        curved[box] = differences[1] - differences[0] - linear
+        return known.valid * curved
 
     def _near_cores(self, parameters: torch.Tensor) -> tuple[slice, slice]:
         """Rows and columns within some core radii of one of the vortices or between them."""

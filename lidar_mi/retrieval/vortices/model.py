@@ -86,11 +86,11 @@ def widened(theta: torch.Tensor, width: float) -> torch.Tensor:
     The vorticity of a Lamb-Oseen vortex is a Gaussian of variance r_c^2 / (2 1.2564), to which that
     of the mean adds. That of Burnham and Hallock is widened as much, which is right far away.
     """
-    found = theta.clone()
+    wider = theta.clone()
     for radius in (1, 5):
         square = (2 * theta[radius]).exp() + 2 * _LAMB_OSEEN * width**2
-        found[radius] = square.log() / 2
-    return found
+        wider[radius] = square.log() / 2
+    return wider
 
 
 class Rotation(NamedTuple):
@@ -118,7 +118,7 @@ def rotations(
     theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile
 ) -> list[Rotation]:
     """About both vortices with the parameters (10,)."""
-    found = []
+    rotations_of_pairs = []
     for first in (0, 4):
         circulation, radius = theta[first], theta[first + 1].exp()
         dy, dz = y - theta[first + 2], z - theta[first + 3]
@@ -126,8 +126,8 @@ def rotations(
         value, slope = angular_velocity(square / radius**2, profile)
         unit = value / (2 * torch.pi * radius**2)
         omega_slope = circulation / (torch.pi * radius**4) * slope
-        found.append(Rotation(dy, dz, square, unit, circulation * unit, omega_slope))
-    return found
+        rotations_of_pairs.append(Rotation(dy, dz, square, unit, circulation * unit, omega_slope))
+    return rotations_of_pairs
 
 
 def gradient(about: Sequence[Rotation]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

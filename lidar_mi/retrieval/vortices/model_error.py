@@ -188,8 +188,8 @@ def model_error(
         return ModelError()
     distance = lags.distance()[: lags.rows]
     # in units of the stiffness at lag 0, so that the coefficients are the variances
-    found, square = observed.take(used) / scale, distance.take(used).square()
-    size = float(found.abs().max())
+    correlation, square = observed.take(used) / scale, distance.take(used).square()
+    size = float(correlation.abs().max())
     if not size > 0:
         return ModelError()
     relative = unit.take(used) / scale
@@ -200,7 +200,7 @@ def model_error(
     if change is not None:
         columns.append(change.take(used) / change.abs().max().clamp(min=1e-300))
     # normalised in both directions: least squares needs numbers near one
-    amplitudes, _ = nnls(torch.stack(columns, 1).cpu().numpy(), (found / size).cpu().numpy())
+    amplitudes, _ = nnls(torch.stack(columns, 1).cpu().numpy(), (correlation / size).cpu().numpy())
     variances = amplitudes[: len(lengths)] * size
     if change is not None and tested:
         explained = scale * sum(
@@ -309,8 +309,8 @@ class Response:
             # half of the last term: both orders of x and x + h are added below
             cross = coarse.transform(moved) - torch.tensordot(spread.to(waves), waves, 1) / 2
             power = 2 * (cross.conj() * waves).real.sum((0, 1))
-            found = coarse.by_lags(power) / side**2
-            yield separable(torch.fft.fftshift(found, 1), to_lags)
+            absorbed = coarse.by_lags(power) / side**2
+            yield separable(torch.fft.fftshift(absorbed, 1), to_lags)
 
 
 def _sums(field: torch.Tensor, side: int) -> torch.Tensor:

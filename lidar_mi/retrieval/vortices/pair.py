@@ -109,16 +109,16 @@ class VortexPairFit(Tabular):
 
     def tables(self) -> list[Table]:
         """Both vortices and the pair, with standard errors, after whether the fit is accepted."""
-        found = self.quantities
+        tables = self.quantities
 
         def shown(name: str) -> str:
-            return with_error(found[name].value, found[name].stderr, _SIGNS[found[name].units])
+            return with_error(tables[name].value, tables[name].stderr, _SIGNS[tables[name].units])
 
         sides = [
             (name.replace("_", " "), shown(f"port_{name}"), shown(f"starboard_{name}"))
             for name in ("circulation", "circulation_5_15", "core_radius", "y", "z")
         ]
-        names = [name for name in found if not name.startswith(("port_", "starboard_"))]
+        names = [name for name in tables if not name.startswith(("port_", "starboard_"))]
         verdict = f"no fit: {', '.join(self.reasons)}" if self.reasons else "vortex pair"
         return [
             Table(f"{verdict} ({self.profile})", sides, ("", "port", "starboard")),

@@ -67,7 +67,7 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     uniform = torch.linalg.qr(observed.everywhere * root[:, None])[0]
     value = observed.value * root
     value = value - uniform @ (uniform.T @ value)
-    found = []
+    points = []
     for fraction in _RADII:
         radius = fraction * min(sides)
         normal, across = (
@@ -90,11 +90,13 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
                     (second, q, value.new_tensor(radius).log()),
                 )
             ]
-            found.append((float(gain[p, q]), torch.cat([*vortices, value.new_zeros(2)])))
-    found.sort(key=lambda pair: -pair[0])
+            points.append((float(gain[p, q]), torch.cat([*vortices, value.new_zeros(2)])))
+    points.sort(key=lambda pair: -pair[0])
     return (
-        torch.stack([_with_mean_wind(theta, observed, root, profile) for _, theta in found[:count]])
-        if found
+        torch.stack(
+            [_with_mean_wind(theta, observed, root, profile) for _, theta in points[:count]]
+        )
+        if points
         else value.new_empty(0, 10)
     )
 

@@ -288,25 +288,25 @@ class Track:
         places, times = (np.array([getattr(s, name) for s in self.slabs]) for name in ("x", "time"))
         nearest = np.abs(x[..., None] - places).argmin(-1)
         states = np.stack([state[:_MOVING] for state, _ in self._smoothed], -1)[:, nearest]
-        found = advected_states(states, x - places[nearest], time - times[nearest], self.profile)
-        return found[:MEASURED]
+        advected = advected_states(states, x - places[nearest], time - times[nearest], self.profile)
+        return advected[:MEASURED]
 
     @cached_property
     def _smoothed(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """State and covariance of every slab, given all fits."""
         # from the newest backwards: that one has no later fits
-        found = [(self.slabs[-1].state, self.slabs[-1].covariance)]
+        smoothed = [(self.slabs[-1].state, self.slabs[-1].covariance)]
         for slab, later in zip(self.slabs[-2::-1], self.slabs[:0:-1], strict=True):
-            found.append(
+            smoothed.append(
                 kalman.smoothed(
                     (slab.state, slab.covariance),
                     later.transition,
                     later.noise,
                     later.predicted,
-                    found[-1],
+                    smoothed[-1],
                 )
             )
-        return found[::-1]
+        return smoothed[::-1]
 
     @cached_property
     def _inductions(self) -> np.ndarray:

@@ -150,9 +150,9 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     flow_variance = float(np.square(value[:, usable]).mean()) / 4
     best = None
     for start in starting_points(_components(model, flow_variance), STARTS, profile):
-        found = fit(model, start, limits, flow_variance, 30, TOLERANCE)
-        if best is None or found.cost < best.cost:
-            best = found
+        solution = fit(model, start, limits, flow_variance, 30, TOLERANCE)
+        if best is None or solution.cost < best.cost:
+            best = solution
     if best is None:
         return no_fit(profile, "no vortex signature")
     # without standard errors their size follows from the residuals, robustly

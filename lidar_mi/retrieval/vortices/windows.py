@@ -50,12 +50,12 @@ def vortex_windows(
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
     taken = Acquisition(*axes, dt, noise, "lamb_oseen", times=times)
-    found = fit_pixels(image1, image2, taken)
+    pair = fit_pixels(image1, image2, taken)
     centres = [
         (axis[start := np.asarray(windows.starts(k))] + axis[start + template - 1]) / 2
         for k, axis in enumerate(axes)
     ]
-    values, covariance = found.wind_and_covariance(centres[1][None, :], centres[0][:, None])
+    values, covariance = pair.wind_and_covariance(centres[1][None, :], centres[0][:, None])
     pixel_z, pixel_y = (float(a[-1] - a[0]) / (len(a) - 1) / dt for a in axes)
 
     def tensor(array: np.ndarray) -> torch.Tensor:
@@ -66,21 +66,21 @@ def vortex_windows(
     vv, ww, wv = variance_v / pixel_y**2, variance_w / pixel_z**2, both / (pixel_y * pixel_z)
     flag = torch.zeros(windows.count, dtype=torch.int16, device=image1.device)
     flag[non_finite([image1, image2], windows)] |= Flag.NON_FINITE_INPUT.value
-    if not found.success:
+    if not pair.success:
         flag |= Flag.NO_MATCH.value
-    if "an image is constant" in found.reasons:
+    if "an image is constant" in pair.reasons:
         flag |= Flag.LOW_TEXTURE.value
     return Displacement(
         torch.stack([w / pixel_z, v / pixel_y]),
-        torch.full_like(v, found.correlation),
+        torch.full_like(v, pair.correlation),
         flag,
         torch.stack([torch.stack([ww, wv]), torch.stack([wv, vv])]),
-        found.quantities,
+        pair.quantities,
         {
-            "profile": found.profile,
-            "fit": "; ".join(found.reasons) or "accepted",
-            "chi2": found.chi2,
-            "model_error": found.model_error,
-            "model_error_length": found.model_error_length,
+            "profile": pair.profile,
+            "fit": "; ".join(pair.reasons) or "accepted",
+            "chi2": pair.chi2,
+            "model_error": pair.model_error,
+            "model_error_length": pair.model_error_length,
         },
     )

@@ -93,8 +93,8 @@ def test_thin_structure_changes_no_valid_vector(seed, sort):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("sort", sorted(SORTS))
-def test_no_sort_of_defect_changes_a_valid_vector(sort, method):
-    """Of eight pairs at most one breaks the property."""
-    broken = [line for seed in range(8) if (line := check(seed, sort, method))]
-    assert len(broken) <= 1, "\n".join(broken)
+def test_no_sort_of_defect_changes_a_valid_vector(method):
+    """Of two pairs of each sort: of 208 pairs two break it, four of 52 by chance once in 600."""
+    cases = [(seed, sort) for sort in sorted(SORTS) for seed in range(2)]
+    broken = [line for seed, sort in cases if (line := check(seed, sort, method))]
+    assert len(broken) <= 3, "\n".join(broken)
