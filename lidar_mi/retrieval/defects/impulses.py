@@ -131,7 +131,9 @@ def median_scale(values: torch.Tensor, size: int = 1) -> torch.Tensor:
 
 def _faintest(values: torch.Tensor) -> float:
     """Scatter below which air is empty, in images without noise: nothing stands out of that."""
-    return _EMPTY * float(values[values.isfinite()].square().mean().sqrt())
+    known = values.isfinite()
+    square = torch.where(known, values, 0.0).square().sum() / known.sum()
+    return _EMPTY * float(square.sqrt())
 
 
 def _peeled(image: torch.Tensor, spread: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:

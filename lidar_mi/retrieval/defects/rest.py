@@ -216,7 +216,8 @@ def at_rest(
     outstanding = impulses.outstanding(pair)
     pair = _normalised(pair, outstanding)
     structure = impulses.sharp(pair)
-    hidden = outstanding | _candidates(pair, structure)
+    fields = _fields(pair)
+    hidden = outstanding | _candidates(fields, structure)
     for _ in range(_ITERATIONS):
         soft = [_soft(image, ~(p | structure)) for image, p in zip(pair, hidden, strict=True)]
         motions = _motions(soft, windows)
@@ -224,7 +225,9 @@ def at_rest(
         if not bool(d.any()):  # what stands out is all that there is
             return structure, torch.zeros_like(outstanding), d
         stray = impulses.stray(pair, outstanding, structure, chain([d], motions))
-        new = _still(torch.where(stray, torch.nan, pair), structure, d)
+        if bool(stray.any()):
+            fields = _fields(torch.where(stray, torch.nan, pair))
+        new = _still(fields, structure, d)
         if not bool((new & ~structure).any()):
             break
         structure = structure | new
@@ -256,16 +259,37 @@ class _Field(NamedTuple):
     """What may stand out of two images.
 
     Its values (2, z, y), by how much these or the pixels themselves differ (z, y), its size in px,
-    and the pixels that it marks.
+    the pixels that it marks, and the height (z, y) that no value exceeds by chance.
     """
 
     pair: torch.Tensor
     change: torch.Tensor
     size: int
     marked: Callable[[torch.Tensor], torch.Tensor]
+    least: torch.Tensor
 
 
-def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
+_Of = Callable[[torch.Tensor], _Field]
+"""A field of two images without some pixels (z, y)."""
+
+
+def _fields(pair: torch.Tensor) -> list[_Of]:
+    """Those of `_all_fields`, each with the last one that was asked for."""
+
+    def stored(of: _Of) -> _Of:
+        last: list[tuple[torch.Tensor, _Field]] = []
+
+        def field(hidden: torch.Tensor) -> _Field:
+            if not (last and torch.equal(last[0][0], hidden)):
+                last[:] = [(hidden, of(hidden))]
+            return last[0][1]
+
+        return field
+
+    return [stored(of) for of in _all_fields(pair)]
+
+
+def _all_fields(pair: torch.Tensor) -> Iterator[_Of]:
     """Single pixels, lines, edges, spots: each from the images without what was found before."""
     same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
 
@@ -279,7 +303,8 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         same: torch.Tensor | None = None,
     ) -> _Field:
         change = (values[1] - values[0]).nan_to_num(0.0).abs()
-        return _Field(values, change if same is None else change.minimum(same), size, marked)
+        change = change if same is None else change.minimum(same)
+        return _Field(values, change, size, marked, _least(values, size))
 
     last: list[tuple[torch.Tensor, torch.Tensor]] = []
 
@@ -338,20 +363,19 @@ def _along(fields: torch.Tensor, axis: int) -> torch.Tensor:
     return box_sum(pad(fields.nan_to_num(0.0), rim), _LINE, axis) / _LINE
 
 
-def _candidates(pair: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
+def _candidates(fields: Sequence[_Of], hidden: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
-    for of in _fields(pair):
+    for of in fields:
         field = of(hidden)
-        least = _least(field)
-        alike = _beyond_chance(_alike(field, least), field, least)
+        alike = _beyond_chance(_alike(field, field.least), field)
         hidden = hidden | field.marked(alike)
     return _closed(hidden, _GAP)
 
 
-def _still(pair: torch.Tensor, structure: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+def _still(fields: Sequence[_Of], structure: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots."""
     sharp = structure
-    for of in _fields(pair):
+    for of in fields:
         field = of(structure)
         new = field.marked(_stays(field, d))
         if field.size == 1:
@@ -370,15 +394,17 @@ def _with_sharp(structure: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
     return torch.as_tensor(held, device=structure.device) & structure
 
 
-def _least(field: _Field) -> torch.Tensor:
-    """Height that no value of the field exceeds by chance."""
-    limit = impulses.threshold(field.pair[0].numel() // field.size**2)
-    return limit * torch.maximum(*(impulses.median_scale(i, field.size) for i in field.pair))
+def _least(values: torch.Tensor, size: int) -> torch.Tensor:
+    """Height that no value (2, z, y) of a field exceeds by chance."""
+    limit = impulses.threshold(values[0].numel() // size**2)
+    return limit * torch.maximum(*(impulses.median_scale(i, size) for i in values))
 
 
 def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
-    least = _least(field)
+    alike = _alike(field, field.least)
+    if not bool(alike.any()):
+        return alike
     one, two = field.pair.nan_to_num(0.0)
     both = [
         torch.where(_inside(along), (here - moved(there, along)).abs(), torch.inf)
@@ -388,37 +414,34 @@ def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     off = torch.where(off.isfinite(), off, 0.0)
     chance = impulses.median_scale(off, field.size)
     limit = impulses.threshold(off.numel() // field.size**2) * chance
-    new = (
-        (off > limit)
-        & _alike(field, least)
-        & (field.change < _DIFFER * off)
-        & (_lower(field.pair) > off / 2)
-    )
+    new = (off > limit) & alike & (field.change < _DIFFER * off) & (_lower(field.pair) > off / 2)
     if not bool(new.any()):
         return new
-    new = _beyond_chance(new, field, least)
+    new = _beyond_chance(new, field)
     if field.size > 1 or not bool(new.any()):
         return new
     # a structure is at rest as a whole: also where the air moves along it, which tells nothing,
     # and where it changes with the air that it dims; not where its motion is the better match
-    stands_out = _alike(field, _WEAK * least) | (_lower(field.pair) > least)
+    stands_out = _alike(field, _WEAK * field.least) | (_lower(field.pair) > field.least)
     weak = stands_out & (field.change < off.maximum(chance))
     new = ndimage.binary_propagation(new.cpu(), np.ones((3, 3)), weak.cpu())
     return torch.as_tensor(new, device=weak.device)
 
 
-def _beyond_chance(new: torch.Tensor, field: _Field, least: torch.Tensor) -> torch.Tensor:
+def _beyond_chance(new: torch.Tensor, field: _Field) -> torch.Tensor:
     """Those pixels, or none if unrelated images have a third as many alike in one place.
 
     Among many bright particles some lie by chance where others were.
     """
+    if not bool(new.any()):
+        return new
     one, two = field.pair.nan_to_num(0.0)
     rows, columns = two.shape
     chance = []
     for i, j in impulses.THIRDS:
         other = two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1))
         rolled = field._replace(pair=torch.stack([one, other]), change=(other - one).abs())
-        chance.append(int(_alike(rolled, least).sum()))
+        chance.append(int(_alike(rolled, field.least).sum()))
     # the median, as lines at rest fall on themselves
     return new & (int(new.sum()) >= _BEYOND_CHANCE * float(np.median(chance)))
 

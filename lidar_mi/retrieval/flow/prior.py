@@ -245,7 +245,7 @@ def _gamma_mean(known: torch.Tensor, square: torch.Tensor) -> torch.Tensor:
     square : torch.Tensor
         Sum S of their squares.
     """
-    half, energy = known.reshape(1, -1) / 2, square.reshape(1, -1) / 2
+    half, energy = (part.reshape(1, -1).float() / 2 for part in (known, square))
     energy = energy.clamp(min=1e-30)
     shape = _SHAPES.to(half)[:, None]
     rate = shape * (energy / half.clamp(min=1e-9)).median()
@@ -255,7 +255,7 @@ def _gamma_mean(known: torch.Tensor, square: torch.Tensor) -> torch.Tensor:
     likelihood = likelihood - (shape + half) * (rate + energy).log()
     best = likelihood.mean(1).argmax()[None]
     shape, rate = shape.index_select(0, best), rate.index_select(0, best)
-    return ((shape + half) / (rate + energy)).reshape(known.shape)
+    return ((shape + half) / (rate + energy)).reshape(known.shape).to(known)
 
 
 def _cells(mesh: Mesh) -> float:
