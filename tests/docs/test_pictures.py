@@ -34,7 +34,7 @@ def test_makers_name_what_there_is():
         assert command in ("run", "fly")
         assert (ROOT / "scenes" / f"{experiment}.yaml").is_file()
         assert f'"{Path(place).stem}"' in figures
-    for campaign, _ in SCRIPT["PARTS"].values():
+    for campaign, *_ in SCRIPT["PARTS"].values():
         assert (ROOT / "scenes/campaigns" / f"{campaign}.yaml").is_file()
     for example in SCRIPT["EXAMPLES"]:
         assert (ROOT / "examples" / f"{example}.py").is_file()
