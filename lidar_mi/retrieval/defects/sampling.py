@@ -142,8 +142,9 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
             first[axis] = int(starts[0] if lengths[0] == steps[axis] else starts[1])
         else:
             spoilt = True
-    if max(steps) == 1 and not spoilt:
-        no_air, remarks = _hidden(values, false_alarm)
+    ranks = _ranks(values) if max(steps) == 1 and not spoilt else []
+    if ranks:
+        no_air, remarks = _hidden(values, ranks, false_alarm)
         hidden |= no_air
         said += remarks
         known = [np.where(h, np.nan, v) for v, h in zip(values, hidden, strict=True)]
@@ -158,7 +159,6 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
             else:
                 spoilt = True
     if max(steps) == 1 and not spoilt:
-        ranks = _ranks(values)
         gridded = np.all([_gridded(r, ~h) for r, h in zip(ranks, hidden, strict=True)], 0)
         if gridded.any():
             said.append(f"neighbours are equal on {gridded.mean():.2g} of the pixels")
@@ -168,12 +168,14 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
     return Sampling(masks, spoilt, tuple(steps), tuple(first), tuple(middle), ", ".join(said))
 
 
-def _hidden(values: Sequence[np.ndarray], false_alarm: float) -> tuple[np.ndarray, list[str]]:
+def _hidden(
+    values: Sequence[np.ndarray], ranks: Sequence[np.ndarray], false_alarm: float
+) -> tuple[np.ndarray, list[str]]:
     """Pixels of each image without a picture or copied, and what to say of them."""
     blank = np.stack([_without_picture(v) for v in values])
     said = [f"no picture on {blank.mean():.2g} of the pixels"] * bool(blank.any())
     hidden = blank.copy()
-    for n, (one, other) in enumerate(pairwise(_ranks(values)), 1):
+    for n, (one, other) in enumerate(pairwise(ranks), 1):
         copied = _copied(one, other, false_alarm) & ~blank[n - 1 : n + 1].any(0)
         if copied.any() and not copied.all():
             hidden[n - 1 : n + 1] |= copied
@@ -184,12 +186,15 @@ def _hidden(values: Sequence[np.ndarray], false_alarm: float) -> tuple[np.ndarra
 def _ranks(values: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Values by their number among all; -1 at the ends of an image's range or if not finite."""
     known = [np.asarray(np.isfinite(v)) for v in values]
-    levels = np.unique(np.concatenate([v[k] for v, k in zip(values, known, strict=True)]))
+    together = np.concatenate([v[k] for v, k in zip(values, known, strict=True)])
+    _, numbers = np.unique(together, return_inverse=True)
+    ends = np.cumsum([k.sum() for k in known])
     ranks = []
-    for v, k in zip(values, known, strict=True):
-        rank = np.searchsorted(levels, np.where(k, v, levels[0]))
-        inside = k & (rank > rank[k].min(initial=0)) & (rank < rank[k].max(initial=0))
-        ranks.append(np.where(inside, rank, -1))
+    for k, number in zip(known, np.split(numbers, ends[:-1]), strict=True):
+        rank = np.full(k.shape, -1)
+        inside = (number > number.min(initial=0)) & (number < number.max(initial=0))
+        rank[k] = np.where(inside, number, -1)
+        ranks.append(rank)
     return ranks
 
 

@@ -51,6 +51,8 @@ _RATIO_OF_TWO = (2 - 3**0.5) ** 2
 """Median ratio of the eigenvalues of the structure tensor of two independent slopes."""
 _LEAST_DENSITY = 1e-6
 """Of the differences, over their mean: what is less is rounding."""
+_MOST = 1e60
+"""Of an amplitude, whose root is a number in single precision."""
 _LEAST_MOTION = 0.015
 """px: differences that are finer than those of this motion are of interpolation and ringing."""
 
@@ -144,7 +146,9 @@ def differences(
     square, means, half, rest = (field[..., use].cpu().numpy() for field in fields)
     most = np.array([1.0 if name == "unresolved" else np.inf for name in names])
     _, factors = most_likely(square, means, most, half, rest)
-    amplitudes = {name: max(float(a), 0.0) for name, a in zip(names, factors, strict=True)}
+    # that of fields that are zero may be any number, of which single precision has no root
+    factors = factors.clip(0.0, _MOST)
+    amplitudes = {name: float(a) for name, a in zip(names, factors, strict=True)}
     amplitudes["noise"] = amplitudes.get("noise", 0.0) + told
 
     def total(parts: Mapping[str, torch.Tensor]) -> torch.Tensor:

@@ -66,9 +66,8 @@ class Posterior(NamedTuple):
         return variances(self.before.covariance() - after, self.prior), energy
 
     def response(self, gradients: torch.Tensor) -> torch.Tensor:
-        """Changes of the coefficients by gradients (..., components, knots), to a thousandth."""
-        root = self.root.single if isinstance(self.root, BandCholesky) else self.root
-        return root.solve(gradients)
+        """Changes of the coefficients by gradients (..., components, knots)."""
+        return self.root.solve(gradients)
 
     def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
         """The prior's precision times coefficients (n, 2, Z, Y)."""
