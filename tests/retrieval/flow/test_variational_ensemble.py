@@ -46,7 +46,8 @@ def reduced_errors(seed, amount, **changes):
         **window_settings(experiment.retrieval, None),
     )
     good = wind["flag"].values == 0
-    assert good.mean() > 0.9
+    # in some planes a fifth of the air, around the vortices, has no texture
+    assert good.mean() > 0.75
     reduced, errors = [], []
     for name in ("v", "w"):
         true = truth.wind[name].interp(z=wind["z"], y=wind["y"]).transpose("z", "y").values
