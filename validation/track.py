@@ -144,6 +144,7 @@ def other_wakes(effort):
             ("Crow waves of 2.4 m", {**angles, "crow": 2.4}, {}),
             ("Crow waves of 5 m", {**angles, "crow": 5.0}, {}),
             ("Crow waves of 10 m", {**angles, "crow": 10.0}, {}),
+            ("Crow waves of 20 m", {**angles, "crow": 20.0}, {}),
             ("10 degrees, fits to vectors", angles, {"measure": fits}),
         )
     ):
