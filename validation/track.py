@@ -158,7 +158,9 @@ def other_wakes(effort):
             rows.append(
                 Row(f"{name}: within 2 sigma at the wing", reference, 0.975, two, sigma, 0.025)
             )
-        bent = np.mean([t.inflation.max() > 1 or t.rejected > 0 or len(t.slabs) < 16 for t in tracks])
+        bent = np.mean(
+            [t.inflation.max() > 1 or t.rejected > 0 or len(t.slabs) < 16 for t in tracks]
+        )
         values = (
             np.mean(found["innovations"]) / 10,
             np.mean(found["state"]) / 10,

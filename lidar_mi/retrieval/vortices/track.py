@@ -277,7 +277,9 @@ class Track:
         # a straight pair has the same induction in all slabs
         by_curvature = self._inductions[:, nearest] - self._inductions.mean(1)
         root = np.sqrt(self.inflation)
-        covariance = np.outer(root, root) * covariance + unsteady(state, dt, wandering, by_curvature)
+        covariance = np.outer(root, root) * covariance + unsteady(
+            state, dt, wandering, by_curvature
+        )
         return replace(
             self.fit,
             parameters=state[:MEASURED],
