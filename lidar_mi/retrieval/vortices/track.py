@@ -418,7 +418,8 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         track.settings.wandering,
         fit or track.fit,
     )
-    predicted, square, by_kind, used = state, None, (), None
+    predicted, square, used = state, None, None
+    by_kind: tuple[float, ...] = ()
     if fit is not None:
         measured = fit.parameters, _own(fit), _OBSERVED
         # also of what is rejected below: `Track.inflation` counts it
