@@ -217,7 +217,7 @@ def _timing(one: SensorSamples, delay_steps: int) -> Variables:
 
 def _numbers(flights: Sequence[SensorSamples], fits: Sequence[FilterFit]) -> Variables:
     """Parameters of the axes, with standard errors; taps and lags that an axis lacks are 0."""
-    own = {"units": "of the axis"}
+    per_axis = {"units": "of the axis"}
     square = {"units": "square of the axis' units"}
     ratio = {"units": "1"}
 
@@ -236,7 +236,7 @@ def _numbers(flights: Sequence[SensorSamples], fits: Sequence[FilterFit]) -> Var
     errors = np.sqrt([np.diag(fit.covariance) for fit in fits]).T
     tap, lag = ("axis", "tap"), ("axis", "lag")
     texts = {
-        "offset": (own, "mean error; not part of A, B, C, D"),
+        "offset": (per_axis, "mean error; not part of A, B, C, D"),
         "gain": (ratio, "of a constant wind: the sum of taps"),
         "decay_before": (ratio, "r: of taps from plane to plane before the estimated one"),
         "decay_after": (ratio, "s: of taps from plane to plane after the estimated one"),

@@ -69,8 +69,10 @@ def line_images(doppler: Doppler, rings: Rings, slowest: float, fastest: float) 
         for speed in middle + half * _nodes()
     ]
     line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
-    own = fringe_image(doppler.camera, doppler.etalon, line, 0.0, reference_photons(doppler, rings))
-    return LineImages(middle, half, torch.stack(air), own)
+    emitted = fringe_image(
+        doppler.camera, doppler.etalon, line, 0.0, reference_photons(doppler, rings)
+    )
+    return LineImages(middle, half, torch.stack(air), emitted)
 
 
 def line_frames(

@@ -173,19 +173,25 @@ def measure_lines(line_scan: LineScan, rings: Rings, assumed_rings: Rings, log: 
     for start in range(0, len(true), FRAMES):
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
         chunk = slice(start, min(start + FRAMES, len(true)))
-        air, laser, own = line_frames(
+        air, laser, reference = line_frames(
             doppler, rings, images, lines, range(chunk.start, chunk.stop), sensor.pulses, seed
         )
         retrieved[:, chunk] = speeds_to_laser(
-            air, laser[own], doppler, assumed_rings, noises, RingMethod.ANNULAR, RingCentre.FREE
+            air,
+            laser[reference],
+            doppler,
+            assumed_rings,
+            noises,
+            RingMethod.ANNULAR,
+            RingCentre.FREE,
         )
     return with_speeds(lines, retrieved, doppler, sensor.pulses, seed)
 
 
 def line_noises(doppler: Doppler, pulses: int, rings: Rings) -> "list[PixelNoise]":
     """Noise of the pixels of a line's frame, and of the frame of the laser."""
-    own, _ = reference_frames(pulses, doppler.reference.every, PULSES)
-    return [pixel_noise(doppler.ccd, rings.modes, number) for number in (pulses, own)]
+    averaged, _ = reference_frames(pulses, doppler.reference.every, PULSES)
+    return [pixel_noise(doppler.ccd, rings.modes, number) for number in (pulses, averaged)]
 
 
 def with_speeds(

@@ -224,13 +224,13 @@ def stray(
 
 
 def _advected(
-    heights: torch.Tensor, own: int, row: int, column: int, d: torch.Tensor
+    heights: torch.Tensor, image: int, row: int, column: int, d: torch.Tensor
 ) -> torch.Tensor:
     """Pixels of an image that the other, rolled, has a match of."""
     side = 2 * _NEAR + 1
-    most = max_pool2d(heights[1 - own].roll((row, column), (0, 1))[None], side, 1, _NEAR)[0]
-    there = nearest(most[None], _places(d if own == 0 else -d))[0]
-    return there >= heights[own] / 2
+    most = max_pool2d(heights[1 - image].roll((row, column), (0, 1))[None], side, 1, _NEAR)[0]
+    there = nearest(most[None], _places(d if image == 0 else -d))[0]
+    return there >= heights[image] / 2
 
 
 def _places(d: torch.Tensor) -> list[torch.Tensor]:

@@ -388,10 +388,10 @@ def _with_sharp(structure: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
     """Areas that hold something sharp: lines and spots without any may be smoke in calm air."""
     if not bool(sharp.any()):
         return sharp
-    held = ndimage.binary_propagation(
+    areas = ndimage.binary_propagation(
         (sharp & structure).cpu().numpy(), np.ones((3, 3)), _grown(structure, 3).cpu().numpy()
     )
-    return torch.as_tensor(held, device=structure.device) & structure
+    return torch.as_tensor(areas, device=structure.device) & structure
 
 
 def _least(values: torch.Tensor, size: int) -> torch.Tensor:

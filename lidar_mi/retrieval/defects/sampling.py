@@ -264,10 +264,10 @@ def _without_picture(values: np.ndarray) -> np.ndarray:
     )
     wide = ndimage.grey_dilation(label, 3)
     rim = (wide > 0) & (label == 0) & finite
-    own = np.r_[0.0, ndimage.maximum(values, label, np.arange(1, number + 1))][wide]
+    level = np.r_[0.0, ndimage.maximum(values, label, np.arange(1, number + 1))][wide]
     levels = np.unique(values[finite])
-    off = np.abs(values - own)
-    levels_off = np.abs(np.searchsorted(levels, values) - np.searchsorted(levels, own))
+    off = np.abs(values - level)
+    levels_off = np.abs(np.searchsorted(levels, values) - np.searchsorted(levels, level))
     index = np.unique(wide[rim])
     step, steps = np.zeros((2, number + 1))
     if len(index):

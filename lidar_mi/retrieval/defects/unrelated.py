@@ -127,12 +127,12 @@ class _Search(NamedTuple):
 
 
 def _of_images(spline: Spline, finite: torch.Tensor, windows: Windows, wide: bool) -> _Search:
-    own = windows.template
-    frame = Windows(windows.shape, own, windows.search, max(1, own // 2))
+    template = windows.template
+    frame = Windows(windows.shape, template, windows.search, max(1, template // 2))
     if wide:
         frame = coarse_windows(windows)
-    elif min(windows.shape) >= own + windows.search:
-        frame = Windows(windows.shape, 2 * own, own + windows.search, own)
+    elif min(windows.shape) >= template + windows.search:
+        frame = Windows(windows.shape, 2 * template, template + windows.search, template)
     along = [torch.arange(n).to(spline.coefficients) for n in windows.shape]
     places = [place.expand(2, -1, -1) for place in torch.meshgrid(*along, indexing="ij")]
 

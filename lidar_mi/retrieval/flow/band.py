@@ -36,12 +36,12 @@ def form(
         here = slice(knots.start - cells.start, knots.stop - cells.start)
         product = part.flatten(0, 1) @ weight[..., nodes, :]
         middle[..., here, :] += product.unflatten(-2, part.shape[:2])
-    found = weight.new_zeros(*middle.shape[:-1], len(along_y), along_y.shape[1])
+    products = weight.new_zeros(*middle.shape[:-1], len(along_y), along_y.shape[1])
     for knots, nodes in mesh.groups(1):
         part = along_y[:, knots, nodes]
         product = middle[..., nodes] @ part.flatten(0, 1).T
-        found[..., knots] += product.unflatten(-1, part.shape[:2])
-    return found
+        products[..., knots] += product.unflatten(-1, part.shape[:2])
+    return products
 
 
 def spread(band: torch.Tensor, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
@@ -50,10 +50,10 @@ def spread(band: torch.Tensor, mesh: Mesh, cells: slice | None = None) -> torch.
     Of a band of the knots of some cells along z (see `form`) at the nodes in these cells.
     """
     middle = along_z(band, mesh, 0, 0, cells)
-    own = along_y(middle[..., :1, :], mesh, 0, 0)
+    diagonal = along_y(middle[..., :1, :], mesh, 0, 0)
     ahead = along_y(middle[..., 1:, :], mesh, 0, 0, first_shift=1)
     # shifts back along y are those ahead with the components exchanged
-    return own + ahead + ahead.transpose(0, 1)
+    return diagonal + ahead + ahead.transpose(0, 1)
 
 
 def along_z(
@@ -66,14 +66,14 @@ def along_z(
     cells = cells or slice(0, mesh.axes[0].cells)
     _, places = mesh.within(0, cells)
     products, sizes = mesh.products(0, first, second), band.shape[-2:]
-    found = band.new_empty(*band.shape[:-4], places.stop - places.start, *sizes)
+    rows = band.new_empty(*band.shape[:-4], places.stop - places.start, *sizes)
     for knots, nodes in mesh.groups(0, cells):
         here = slice(knots.start - cells.start, knots.stop - cells.start)
         there = slice(nodes.start - places.start, nodes.stop - places.start)
         part = products[:, knots, nodes].flatten(0, 1).T
         of_group = part @ band[..., here, :, :].flatten(-4, -3).flatten(-2)
-        found[..., there, :, :] = of_group.unflatten(-1, sizes)
-    return found
+        rows[..., there, :, :] = of_group.unflatten(-1, sizes)
+    return rows
 
 
 def along_y(
@@ -82,11 +82,11 @@ def along_y(
     """The sum over shifts along y, from this one on, of what `along_z` gives: (..., z, y)."""
     shifts = slice(REACH + first_shift, REACH + first_shift + middle.shape[-2])
     products = mesh.products(1, first, second)[shifts]
-    found = middle.new_empty(*middle.shape[:-2], products.shape[-1])
+    columns = middle.new_empty(*middle.shape[:-2], products.shape[-1])
     for knots, nodes in mesh.groups(1):
         part = products[:, knots, nodes].flatten(0, 1)
-        found[..., nodes] = middle[..., knots].flatten(-2) @ part
-    return found
+        columns[..., nodes] = middle[..., knots].flatten(-2) @ part
+    return columns
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,8 @@ class Band:
 
     def solve(self, root: Factor, right: torch.Tensor) -> torch.Tensor:
         """Coefficients that solve the systems, of some right hand sides (n, ..., 2, Z, Y) each."""
-        found = root.solve(right.movedim((0, -1), (-1, 0)).flatten(-3, -2))
-        return found.unflatten(-2, (2, self.rows)).movedim((0, -1), (-1, 0))
+        solution = root.solve(right.movedim((0, -1), (-1, 0)).flatten(-3, -2))
+        return solution.unflatten(-2, (2, self.rows)).movedim((0, -1), (-1, 0))
 
     def form_of(self, columns: torch.Tensor) -> torch.Tensor:
         """The transpose of `columns_of`: a form from its blocks."""

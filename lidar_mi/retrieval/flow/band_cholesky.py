@@ -38,11 +38,11 @@ class BandCholesky:
         values = ordered.reshape(-1, self.lower.shape[1]).numpy().astype(self.lower.dtype)
         if len(values) > 1:
             # LAPACK takes one right hand side after the other
-            found = self._solved(np.ascontiguousarray(values.T)).T
+            solution = self._solved(np.ascontiguousarray(values.T)).T
         else:
             (solve,) = get_lapack_funcs(("pbtrs",), (self.lower,))
-            found, _ = solve(self.lower, values.T, lower=True)
-        return torch.as_tensor(found).reshape(ordered.shape).transpose(-1, -3).to(right)
+            solution, _ = solve(self.lower, values.T, lower=True)
+        return torch.as_tensor(solution).reshape(ordered.shape).transpose(-1, -3).to(right)
 
     @cached_property
     def single(self) -> "BandCholesky":
@@ -53,8 +53,8 @@ class BandCholesky:
         """The inverse within the band, as a form is held: (2, 2, 7, Z, 4, Y)."""
         there, _ = _places(self.rows, self.columns)
         inverse = torch.as_tensor(self._inverse())
-        found = torch.index_select(inverse.reshape(-1), 0, there.reshape(-1))
-        return found.reshape(there.shape)
+        covariance = torch.index_select(inverse.reshape(-1), 0, there.reshape(-1))
+        return covariance.reshape(there.shape)
 
     @cached_property
     def _blocks(self) -> tuple[np.ndarray, np.ndarray]:
@@ -85,15 +85,15 @@ class BandCholesky:
         roots, ratios = self._blocks
         n = roots.shape[-1]
         # blocks beyond the last one, which count nothing, spare the loops their exceptions
-        found = np.concatenate([right, np.zeros((REACH * n, right.shape[1]), right.dtype)])
-        parts = [found[k * n : (k + 1) * n] for k in range(self.columns)]
-        ahead = [found[(k + 1) * n : (k + 1 + REACH) * n] for k in range(self.columns)]
+        solution = np.concatenate([right, np.zeros((REACH * n, right.shape[1]), right.dtype)])
+        parts = [solution[k * n : (k + 1) * n] for k in range(self.columns)]
+        ahead = [solution[(k + 1) * n : (k + 1 + REACH) * n] for k in range(self.columns)]
         for ratio, part, others in zip(ratios, parts, ahead, strict=True):
             others -= ratio.T @ part
-        found[len(right) :] = 0.0
+        solution[len(right) :] = 0.0
         for k in range(self.columns - 1, -1, -1):
             parts[k][:] = roots[k].T @ (roots[k] @ parts[k]) - ratios[k] @ ahead[k]
-        return found[: len(right)]
+        return solution[: len(right)]
 
     def _inverse(self) -> np.ndarray:
         """The inverse's blocks on and below the diagonal, (blocks, n, 4 n), transposed.
@@ -104,7 +104,7 @@ class BandCholesky:
         """
         roots, ratios = self._blocks
         n = roots.shape[-1]
-        found = np.empty((self.columns, n, (1 + REACH) * n), roots.dtype)
+        columns = np.empty((self.columns, n, (1 + REACH) * n), roots.dtype)
         around = np.zeros((REACH * n, REACH * n), roots.dtype)
         for k in range(self.columns - 1, -1, -1):
             turned = (k + 1) % REACH * n
@@ -113,12 +113,12 @@ class BandCholesky:
             here = roots[k].T @ roots[k] + below @ ratio.T
             # what is not symmetric by rounding would grow
             here = (here + here.T) / 2
-            own = slice(k % REACH * n, (k % REACH + 1) * n)
+            block = slice(k % REACH * n, (k % REACH + 1) * n)
             np.negative(below, out=below)
-            around[own], around[:, own] = below, below.T
-            around[own, own] = here
-            found[k, :, :n], found[k, :, n:] = here, _turned(below, REACH * n - turned)
-        return found
+            around[block], around[:, block] = below, below.T
+            around[block, block] = here
+            columns[k, :, :n], columns[k, :, n:] = here, _turned(below, REACH * n - turned)
+        return columns
 
 
 def _turned(row: np.ndarray, by: int) -> np.ndarray:
@@ -170,19 +170,19 @@ def solved_near(
     (solve,) = get_lapack_funcs(("pbtrs",), (lower,))
     residual = right.detach().cpu().permute(2, 1, 0).reshape(-1).numpy().astype(kind)
     enough = left * np.linalg.norm(residual)
-    found, along, before = np.zeros_like(residual), None, 0.0
+    solution, along, before = np.zeros_like(residual), None, 0.0
     for _ in range(most):
         nearer, _ = solve(root.lower, residual, lower=True)
         energy = float(residual @ nearer)
         along = nearer if along is None else nearer + energy / before * along
         pushed = product(len(lower) - 1, 1.0, lower, along, lower=True)
         part = energy / float(along @ pushed)
-        found += part * along
+        solution += part * along
         residual -= part * pushed
         before = energy
         if not np.linalg.norm(residual) > enough:
             shape = root.columns, root.rows, 2
-            return torch.as_tensor(found).reshape(shape).permute(2, 1, 0).to(right)
+            return torch.as_tensor(solution).reshape(shape).permute(2, 1, 0).to(right)
     return None
 
 

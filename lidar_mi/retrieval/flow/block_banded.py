@@ -41,8 +41,8 @@ class Factor(NamedTuple):
         some[:, blocks * n :] = 0.0
         for k in range(blocks - 1, -1, -1):
             parts[k].baddbmm_(ratios[k].mT, beyond[k], alpha=-1)
-        found = some[:, : blocks * n].unflatten(1, (blocks, n)).transpose(0, 1)
-        return found.reshape(right.shape)
+        solution = some[:, : blocks * n].unflatten(1, (blocks, n)).transpose(0, 1)
+        return solution.reshape(right.shape)
 
 
 def factor(columns: torch.Tensor) -> Factor:

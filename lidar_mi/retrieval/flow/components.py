@@ -123,43 +123,43 @@ def differences(
     regular = difference * linear.regular
     unresolved = _variance_beyond(prior, mesh)
     squares = _Squares(valid)
-    found = squares(regular[None])[0]
-    use = squares.inside & (found > 0)
+    observed = squares(regular[None])[0]
+    use = squares.inside & (observed > 0)
     if not bool(use.any()):
         return Differences(images, torch.zeros_like(unresolved), {})
     draws = _DRAWS[mesh.dims]
     kinds = _drawn(images, linear, mesh, unresolved, times, width)
-    told = images.known_noise**2
+    known_variance = images.known_noise**2
     absorb = _residual_operator(linear, mesh, response)
     # of all at once, which takes less time
     rests = dict(zip(kinds, absorb(torch.cat([*kinds.values()])).split(draws), strict=True))
-    own = _flows_left(linear, mesh, prior, response)
-    held = squares(own).mean(0)
+    by_flows = _flows_left(linear, mesh, prior, response)
+    of_flows = squares(by_flows).mean(0)
     drawn = {name: squares(fields) for name, fields in rests.items()}
-    number = (1 / _chance(drawn["noise"])).expand_as(found)
+    number = (1 / _chance(drawn["noise"])).expand_as(observed)
     terms = {name: fields.mean(0) for name, fields in drawn.items()}
-    known = held + told * terms["noise"]
+    known = of_flows + known_variance * terms["noise"]
 
     # a noise that is known is not estimated
     names = [name for name in kinds if not (name == "noise" and images.noise_known)]
-    fields = (found, torch.stack([terms[name] for name in names]), number, known)
+    fields = (observed, torch.stack([terms[name] for name in names]), number, known)
     square, means, half, rest = (field[..., use].cpu().numpy() for field in fields)
     most = np.array([1.0 if name == "unresolved" else np.inf for name in names])
     _, factors = most_likely(square, means, most, half, rest)
     # that of fields that are zero may be any number, of which single precision has no root
     factors = factors.clip(0.0, _MOST)
     amplitudes = {name: float(a) for name, a in zip(names, factors, strict=True)}
-    amplitudes["noise"] = amplitudes.get("noise", 0.0) + told
+    amplitudes["noise"] = amplitudes.get("noise", 0.0) + known_variance
 
     def total(parts: Mapping[str, torch.Tensor]) -> torch.Tensor:
         return reduce(torch.add, (amplitudes[name] ** 0.5 * parts[name] for name in parts))
 
-    noise, after = total(kinds), total(rests) + own
+    noise, after = total(kinds), total(rests) + by_flows
     expected = squares(after).mean(0).clamp(min=1e-30)
     # noise counts in the scales of the texture, which inform the flow
     weight = (terms["replaced"] / expected).where(use, 0.0)
     weight = weight / weight.sum(0).clamp(min=1e-30)
-    ratio = (weight * found / expected).sum(0)
+    ratio = (weight * observed / expected).sum(0)
     count = 1 / (weight.square() / number).sum(0).clamp(min=1e-30)
     local = squares.on_pixels(_shrunk(ratio, count, weight.sum(0) > 0.5))
     steep = float(linear.slope.square().sum(0)[valid].mean()) / mesh.dims
@@ -169,7 +169,7 @@ def differences(
     )
     if mesh.dims == 2:
         # a noise that is known is there, however little the fit leaves
-        level = level.maximum(told / working(images.given_weight))
+        level = level.maximum(known_variance / working(images.given_weight))
     level = level.clamp(min=max(floor, 1e-30))
     mean = float(level[valid].mean())
     weight = (mean / level).to(images.weight)
@@ -197,7 +197,7 @@ def differences(
 
 
 def _spectrum(
-    spline: Spline, noise: torch.Tensor, expected: torch.Tensor, found: torch.Tensor
+    spline: Spline, noise: torch.Tensor, expected: torch.Tensor, observed: torch.Tensor
 ) -> torch.Tensor:
     """Spectral density of the differences before the filter of a spline, (shells,).
 
@@ -210,7 +210,7 @@ def _spectrum(
         return shell_means(fields, shell, sizes, spline.settings.smoothing)
 
     (of_noise, _), (of_rest, _), (of_found, uncertainty) = (
-        density(part) for part in (noise, expected, found[None])
+        density(part) for part in (noise, expected, observed[None])
     )
     ratio = of_found / of_rest.clamp(min=1e-30)
     colour = _shrunk(ratio, uncertainty**-2, torch.ones_like(ratio, dtype=torch.bool))
@@ -276,11 +276,11 @@ def without_texture(images: Images, template: int) -> torch.Tensor:
     noisy = images.noise**2 / 2 / working(images.weight)
     weak, strong = (part - noisy for part in eigenvalues(zz, zy, yy))
     # where the slopes are of noise nothing is said, and next to none is none
-    told = strong > (2 * noisy).clamp(min=_LEAST_MOTION**2 * float(strong[valid].mean()))
-    single = told & (weak < _RATIO_OF_TWO * strong)
-    share = [averaged(working(part), valid, 2 * template) for part in (single, told)]
-    bare = share[0] > 0.5 * share[1]
-    return bare | (single[valid].sum() > 0.5 * told[valid].sum())
+    determined = strong > (2 * noisy).clamp(min=_LEAST_MOTION**2 * float(strong[valid].mean()))
+    single = determined & (weak < _RATIO_OF_TWO * strong)
+    share = [averaged(working(part), valid, 2 * template) for part in (single, determined)]
+    untextured = share[0] > 0.5 * share[1]
+    return untextured | (single[valid].sum() > 0.5 * determined[valid].sum())
 
 
 def normal_fields(shape: Sequence[int], like: torch.Tensor, seed: int) -> torch.Tensor:

@@ -64,10 +64,10 @@ class CyclicFactor(NamedTuple):
         ):
             ahead = _of_behind(values, len(root))
             half = half - before @ values[: len(root)] - behind @ ahead
-            own = torch.linalg.solve_triangular(root.mT, half, upper=True)
-            values = _merged(values, own)
-        found = values.reshape(number * REACH, 2 * band.rows, -1)[: band.columns]
-        return found.permute(2, 1, 0).reshape(shape).to(right)
+            block = torch.linalg.solve_triangular(root.mT, half, upper=True)
+            values = _merged(values, block)
+        solution = values.reshape(number * REACH, 2 * band.rows, -1)[: band.columns]
+        return solution.permute(2, 1, 0).reshape(shape).to(right)
 
     def covariance(self) -> torch.Tensor:
         """The inverse within the band, as a form is held: (2, 2, 7, Z, 4, Y).
@@ -75,27 +75,27 @@ class CyclicFactor(NamedTuple):
         Of an eliminated block it follows from that of the two that it was coupled to (Takahashi et
         al. 1973, Proc. 8th PICA Conf., 63-69).
         """
-        own = torch.cholesky_inverse(self.last)
+        diagonal = torch.cholesky_inverse(self.last)
         # [k + 1, k] of the blocks of a round, 0 behind the last one
-        below = torch.zeros_like(own)
+        below = torch.zeros_like(diagonal)
         for root, before, behind in reversed(self.rounds):
             number = len(root)
             one, other = (
                 torch.linalg.solve_triangular(root.mT, part, upper=True)
                 for part in (before, behind)
             )
-            ahead, between = _of_behind(own, number), below[:number]
-            with_before = -(one @ own[:number] + other @ between)
+            ahead, between = _of_behind(diagonal, number), below[:number]
+            with_before = -(one @ diagonal[:number] + other @ between)
             with_behind = -(one @ between.mT + other @ ahead)
             middle = torch.cholesky_inverse(root)
             middle = middle - with_before @ one.mT - with_behind @ other.mT
             # what is not symmetric by rounding would grow
             middle = (middle + middle.mT) / 2
-            own, below = (
-                _merged(own, middle),
-                _merged(_of_before(with_before, len(own)), with_behind.mT),
+            diagonal, below = (
+                _merged(diagonal, middle),
+                _merged(_of_before(with_before, len(diagonal)), with_behind.mT),
             )
-        return self.band.form_of(_columns_of(own, below, self.band))
+        return self.band.form_of(_columns_of(diagonal, below, self.band))
 
 
 def factored(forms: torch.Tensor) -> list[CyclicFactor]:
@@ -108,7 +108,7 @@ def factored(forms: torch.Tensor) -> list[CyclicFactor]:
     """
     band = Band(forms.shape[-3], forms.shape[-1])
     # (block, form, m, m)
-    own, below = _blocks_of(band.columns_of(forms))
+    diagonal, below = _blocks_of(band.columns_of(forms))
     rounds, failures = [], []
 
     def root_of(blocks: torch.Tensor) -> torch.Tensor:
@@ -116,8 +116,8 @@ def factored(forms: torch.Tensor) -> list[CyclicFactor]:
         failures.append(info)
         return root
 
-    while len(own) > 1:
-        root = root_of(own[1::2])
+    while len(diagonal) > 1:
+        root = root_of(diagonal[1::2])
         number = len(root)
         before, behind = (
             torch.linalg.solve_triangular(root, part, upper=False)
@@ -125,9 +125,9 @@ def factored(forms: torch.Tensor) -> list[CyclicFactor]:
         )
         rounds.append(Round(root, before, behind))
         between = -behind.mT @ before
-        own = _less(own[0::2], before.mT @ before, behind.mT @ behind)
-        below = torch.cat([between, torch.zeros_like(own)])[: len(own)]
-    last = root_of(own)
+        diagonal = _less(diagonal[0::2], before.mT @ before, behind.mT @ behind)
+        below = torch.cat([between, torch.zeros_like(diagonal)])[: len(diagonal)]
+    last = root_of(diagonal)
     if bool(torch.cat([info.flatten() for info in failures]).any()):
         raise LinAlgError("the quadratic form of a flow is not positive definite")
     return [
@@ -156,9 +156,9 @@ def _of_before(odd: torch.Tensor, number: int) -> torch.Tensor:
 
 def _merged(even: torch.Tensor, odd: torch.Tensor) -> torch.Tensor:
     """Blocks left and eliminated, in their order."""
-    found = even.new_empty(len(even) + len(odd), *even.shape[1:])
-    found[0::2], found[1::2] = even, odd
-    return found
+    merged = even.new_empty(len(even) + len(odd), *even.shape[1:])
+    merged[0::2], merged[1::2] = even, odd
+    return merged
 
 
 def _blocks_of(columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -175,27 +175,27 @@ def _blocks_of(columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     padded[:knots] = columns
     padded[knots:, ..., :n, :].diagonal(dim1=-2, dim2=-1).fill_(1.0)
     parts = padded.reshape(number, REACH, *batch, REACH + 1, n, n)
-    own, below = (columns.new_zeros(number, *batch, REACH, n, REACH, n) for _ in range(2))
+    diagonal, below = (columns.new_zeros(number, *batch, REACH, n, REACH, n) for _ in range(2))
     for j in range(REACH):
         for shift in range(REACH + 1):
             whole, i = divmod(j + shift, REACH)
             part = parts[:, j, ..., shift, :, :]
-            (below if whole else own)[..., i, :, j, :] = part
+            (below if whole else diagonal)[..., i, :, j, :] = part
             if not whole and shift:
-                own[..., j, :, i, :] = part.mT
+                diagonal[..., j, :, i, :] = part.mT
     m = REACH * n
     # nothing is behind the last one
     below[-1] = 0.0
-    return own.reshape(number, *batch, m, m), below.reshape(number, *batch, m, m)
+    return diagonal.reshape(number, *batch, m, m), below.reshape(number, *batch, m, m)
 
 
-def _columns_of(own: torch.Tensor, below: torch.Tensor, band: Band) -> torch.Tensor:
+def _columns_of(diagonal: torch.Tensor, below: torch.Tensor, band: Band) -> torch.Tensor:
     """The transpose of `_blocks_of`: (knots y, 4 n, n)."""
-    n, number = 2 * band.rows, len(own)
-    own, below = (part.reshape(number, REACH, n, REACH, n) for part in (own, below))
-    parts = own.new_empty(number, REACH, REACH + 1, n, n)
+    n, number = 2 * band.rows, len(diagonal)
+    diagonal, below = (part.reshape(number, REACH, n, REACH, n) for part in (diagonal, below))
+    parts = diagonal.new_empty(number, REACH, REACH + 1, n, n)
     for j in range(REACH):
         for shift in range(REACH + 1):
             whole, i = divmod(j + shift, REACH)
-            parts[:, j, shift] = (below if whole else own)[:, i, :, j]
+            parts[:, j, shift] = (below if whole else diagonal)[:, i, :, j]
     return parts.reshape(number * REACH, (REACH + 1) * n, n)[: band.columns]

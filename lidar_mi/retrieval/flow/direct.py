@@ -110,12 +110,12 @@ def by_lapack(form: torch.Tensor) -> bool:
 def covariance_near(root: Root, form: torch.Tensor) -> torch.Tensor:
     """That of a form's factor to `_INVERSE`, where it is, in single precision."""
     if isinstance(root, BandCholesky):
-        found = root.single.covariance().to(form)
+        covariance = root.single.covariance().to(form)
         band = Band(form.shape[3], form.shape[5])
         # the product of both matrices has ones on its diagonal
-        ones = band.apply(found * form, form.new_ones(2, form.shape[3], form.shape[5]))
+        ones = band.apply(covariance * form, form.new_ones(2, form.shape[3], form.shape[5]))
         if bool(((ones - 1).abs() < _INVERSE).all()):
-            return found
+            return covariance
     return root.covariance()
 
 
@@ -271,15 +271,15 @@ def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None
     covariance[..., 1:, :] *= 2
     # motions share derivatives: each is taken once
     middles: dict[tuple[int, ...], torch.Tensor] = {}
-    found: dict[tuple[int, int, tuple[int, ...], tuple[int, ...]], torch.Tensor] = {}
+    forms: dict[tuple[int, int, tuple[int, ...], tuple[int, ...]], torch.Tensor] = {}
 
     def of(a: int, b: int, first: tuple[int, ...], second: tuple[int, ...]) -> torch.Tensor:
         key = a, b, first[0], second[0]
         if key not in middles:
             middles[key] = along_z(covariance[a, b], mesh, first[0], second[0], cells)
-        if (a, b, first, second) not in found:
-            found[a, b, first, second] = along_y(middles[key], mesh, first[1], second[1])
-        return found[a, b, first, second]
+        if (a, b, first, second) not in forms:
+            forms[a, b, first, second] = along_y(middles[key], mesh, first[1], second[1])
+        return forms[a, b, first, second]
 
     return prior.by_kind(
         torch.stack(

@@ -69,7 +69,7 @@ class Posterior(NamedTuple):
             self.settings.ridge,
         )
         ready = _preconditioner(self.curvature.to(weaker.local), weaker, ridge)
-        found = conjugate_gradients(
+        solution = conjugate_gradients(
             lambda c: self.informed(c) + _stiff(c, weaker, ridge),
             gradients.to(weaker.local),
             ready,
@@ -77,7 +77,7 @@ class Posterior(NamedTuple):
             self.settings.solver.tolerance,
             self.settings.solver.steps,
         )
-        return found.to(gradients)
+        return solution.to(gradients)
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before.
@@ -125,8 +125,8 @@ class Posterior(NamedTuple):
         mesh, ridge = self.single.mesh, self.settings.ridge
 
         def applied(c: torch.Tensor) -> torch.Tensor:
-            found = mesh.transposed(_times(curvature, mesh.field(c)))
-            return found + _stiff(c, self.single, ridge)
+            product = mesh.transposed(_times(curvature, mesh.field(c)))
+            return product + _stiff(c, self.single, ridge)
 
         ready = _preconditioner(curvature, self.single, ridge)
         return conjugate_gradients(applied, right, ready, tolerance, steps)

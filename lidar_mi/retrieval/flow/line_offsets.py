@@ -169,10 +169,10 @@ def _symmetric(matrix: torch.Tensor) -> torch.Tensor:
 
 def _padded(offsets: LineOffsets | None, number: int, like: torch.Tensor) -> torch.Tensor:
     """Values of so many lines, 0 where none are known."""
-    found = torch.zeros(number).to(like)
+    values = torch.zeros(number).to(like)
     if offsets:
-        found[: len(offsets.values)] = offsets.values
-    return found
+        values[: len(offsets.values)] = offsets.values
+    return values
 
 
 def _excess(white: torch.Tensor, axis: int) -> float:
@@ -189,8 +189,8 @@ def _lines(images: Images, places: torch.Tensor, time: torch.Tensor, axis: int) 
     one = torch.eye(shape[axis]).to(images.spline.coefficients)
     one = one.unsqueeze(2 - axis).expand(-1, *shape).contiguous()
     spline, _ = splines_of_values_and_slopes(one, images.chosen, images.spline.settings)
-    found = [
+    fields = [
         weight * spline.values(*(place[image].expand_as(one).contiguous() for place in places))
         for image, weight in enumerate(time)
     ]
-    return working(torch.cat(found))
+    return working(torch.cat(fields))

@@ -261,11 +261,11 @@ def next_flow(
     # errors learnt from other images follow the misfit of these
     covariance = worse * placed.factor * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
-    found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
+    displacement = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
     covariance = covariance + placed.additional
-    flag = found.flag | unskilled(found.d, covariance)
-    found = found._replace(covariance=covariance, flag=flag)
-    return found, replace(start, coefficients=coefficients)
+    flag = displacement.flag | unskilled(displacement.d, covariance)
+    displacement = displacement._replace(covariance=covariance, flag=flag)
+    return displacement, replace(start, coefficients=coefficients)
 
 
 def _as_informed(ready: ExpectedFlow, linear: Linear) -> torch.Tensor:
@@ -275,13 +275,13 @@ def _as_informed(ready: ExpectedFlow, linear: Linear) -> torch.Tensor:
     the variance before that the images removed, and r times the information, it changes by
     1 / (1 + f (r - 1)).
     """
-    found, before, windows = ready.covariance, ready.placed.before, ready.start.windows
+    covariance, before, windows = ready.covariance, ready.placed.before, ready.start.windows
     known = information_near(linear.slope, linear.weight, ready.mesh)
-    ratio = (known / ready.information.clamp(min=1e-30)).to(found)
-    pixels, centres = _pixels(windows, found), _centres(windows, found)
+    ratio = (known / ready.information.clamp(min=1e-30)).to(covariance)
+    pixels, centres = _pixels(windows, covariance), _centres(windows, covariance)
     ratio = interpolated(ratio, pixels, centres)
-    removed = 1 - found.diagonal().sum(-1) / before.diagonal().sum(-1)
-    return found / (1 + removed.clamp(0, 1) * (ratio - 1))
+    removed = 1 - covariance.diagonal().sum(-1) / before.diagonal().sum(-1)
+    return covariance / (1 + removed.clamp(0, 1) * (ratio - 1))
 
 
 def _of_pixels(axes: Sequence[Axis], windows: Windows, like: torch.Tensor) -> Mesh:

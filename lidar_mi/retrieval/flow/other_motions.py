@@ -102,14 +102,14 @@ def better_elsewhere(
     # a pattern that repeats: a displacement explains it, and those next to the flow do not
     beside = torch.where((far > 1.5) & (far < 3), misfit, torch.inf).amin((0, 1))
     alike = ((far >= 3) & (least < AS_WELL * beside)).any(0).any(0) & (beside > sure)
-    found = better.any(0).any(0)
+    elsewhere = better.any(0).any(0)
     if alike.any():
         finer = _between_pixels(wide[:, :, alike])
         apart = far[1:-1, 1:-1, alike] >= 3
         again = torch.where(apart, finer, torch.inf).amin((0, 1))
-        found[alike] |= again < FINER * beside[alike] - math.log(AS_LIKELY)
+        elsewhere[alike] |= again < FINER * beside[alike] - math.log(AS_LIKELY)
     around = 2 * math.ceil(2 * size / step) + 1
-    wrong = max_pool2d(found.to(flow)[None], around, 1, around // 2)[0]
+    wrong = max_pool2d(elsewhere.to(flow)[None], around, 1, around // 2)[0]
     return separable(wrong, [linear_weights(c, a) for a, c in pairs]) > 0
 
 

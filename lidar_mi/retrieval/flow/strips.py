@@ -116,16 +116,16 @@ class Posterior(NamedTuple):
     def _alone(self, strip: Strip) -> torch.Tensor:
         """The bands (2, ...) of prior and posterior as if image and prior ended with a strip."""
         cells, last = strip.cells, self.prior.mesh.axes[0].cells
-        own = torch.stack([band[:, :, :, strip.knots] for band in (self.stiff, self.both)])
+        bands = torch.stack([band[:, :, :, strip.knots] for band in (self.stiff, self.both)])
         # splines at the strip's ends reach into three cells beyond
         if cells.start:
             beyond = self._of(slice(max(0, cells.start - REACH), cells.start))
             # forms are sums over cells: those outside the strip are subtracted
-            own[..., :REACH, :, :] -= beyond[..., -REACH:, :, :]
+            bands[..., :REACH, :, :] -= beyond[..., -REACH:, :, :]
         if cells.stop < last:
             beyond = self._of(slice(cells.stop, min(cells.stop + REACH, last)))
-            own[..., -REACH:, :, :] -= beyond[..., :REACH, :, :]
-        return own
+            bands[..., -REACH:, :, :] -= beyond[..., :REACH, :, :]
+        return bands
 
     def _of(self, cells: slice) -> torch.Tensor:
         """The bands (2, ...) of prior and posterior of some cells."""
@@ -196,8 +196,8 @@ def _inverse(both: torch.Tensor, prior: Prior, settings: VariationalSettings) ->
 
     def preconditioned(right: torch.Tensor) -> torch.Tensor:
         total = torch.zeros_like(right)
-        found = mapped(lambda part: inverse(part, right), list(zip(some, roots, strict=True)))
-        for members, parts in zip(some, found, strict=True):
+        solved = mapped(lambda part: inverse(part, right), list(zip(some, roots, strict=True)))
+        for members, parts in zip(some, solved, strict=True):
             for strip, part in zip(members, parts.unbind(1), strict=True):
                 total[..., strip.knots, :] += part
         return total

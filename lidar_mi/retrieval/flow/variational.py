@@ -170,11 +170,13 @@ def variational_and_flow(
         settings=settings,
         keep=keep,
     )
-    found = fitted(stack)
-    while isinstance(found, LineOffsets):
-        unexplained = found.settled
-        found = fitted(stack, sought=False) if unexplained else fitted(found.images, offsets=found)
-    return found
+    result = fitted(stack)
+    while isinstance(result, LineOffsets):
+        unexplained = result.settled
+        result = (
+            fitted(stack, sought=False) if unexplained else fitted(result.images, offsets=result)
+        )
+    return result
 
 
 def _fitted(
@@ -200,7 +202,7 @@ def _fitted(
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
     like = images.spline.coefficients[:0]
-    bare = without_texture(images, windows.template).to(like) if windows.dims == 2 else None
+    untextured = without_texture(images, windows.template).to(like) if windows.dims == 2 else None
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.smooth, windows, Grid(windows.shape, 0.0, like))
     prior: Prior | None = None
@@ -223,7 +225,7 @@ def _fitted(
             if posterior is not None and iteration in noise_rounds:
                 flow_in_single = coefficients.float()
                 linear = linearised(in_single, single, flow_in_single, settings)
-                found = differences(
+                components = differences(
                     images,
                     linear,
                     single,
@@ -232,7 +234,7 @@ def _fitted(
                     windows.template,
                     posterior.response,
                 )
-                images, unresolved = found.images, found.unresolved
+                images, unresolved = components.images, components.unresolved
                 in_single = images.single()
             linear = linearised(in_single, single, coefficients.float(), settings)
             posterior = solve(linear, single, coefficients, prior, settings, iteration)
@@ -276,15 +278,15 @@ def _fitted(
     covariance = covariance + additional
     said = {"noise_of_lines": lines} if lines else {}
     result = result._replace(covariance=covariance, attributes=said)
-    if bare is None:
+    if untextured is None:
         return result, None
-    bare = interpolated(bare, pixels, centres) > 0.5
-    flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * bare).short()
+    untextured = interpolated(untextured, pixels, centres) > 0.5
+    flag = result.flag | unskilled(result.d, covariance) | (Flag.LOW_TEXTURE * untextured).short()
     if len(stack) == 2:
         other = better_elsewhere(in_single, linear, d, windows)
         flag = flag | (Flag.OTHER_MOTION * other.to(flag.device)).short()
     result = result._replace(flag=flag)
-    if bare.double().mean() > 0.5 or not (keep and isinstance(posterior, direct.Posterior)):
+    if untextured.double().mean() > 0.5 or not (keep and isinstance(posterior, direct.Posterior)):
         return result, None
     return result, flow_of(posterior, linear, images, before, additional, factor, windows, settings)
 

@@ -147,11 +147,11 @@ def fit_near(
         for _ in range(_STEPS):
             misfit = thin(theta)
             images = thin.at_least(_linear_power(misfit, variance))
-            found = within(limits, theta, stepped(theta, images.weighted(misfit), variance))
-            if found is None:
+            near = within(limits, theta, stepped(theta, images.weighted(misfit), variance))
+            if near is None:
                 return None
-            far = _displaced(found.parameters - theta, misfit, make)
-            theta = found.parameters
+            far = _displaced(near.parameters - theta, misfit, make)
+            theta = near.parameters
             # blurred images need not be nearer than their own resolution
             if far < _CLOSE * max(1.0, 2 * blur):
                 break
@@ -184,10 +184,10 @@ def fit_near(
             images = make.with_change(white, images, solution.misfit, moves)
             if not images.passed > 0:
                 return None
-            found = within(limits, theta, stepped(theta, images.whitened(misfit), moves))
-            if found is None:
+            near = within(limits, theta, stepped(theta, images.whitened(misfit), moves))
+            if near is None:
                 return None
-            solution = found
+            solution = near
         ambient = in_ambient_wind(solution, white.y, white.z, make.dt, white.ambient)
         reached = ambient.solution.parameters[: len(theta)]
         step = reached - theta
