@@ -40,6 +40,10 @@ def to_xarray(image: Any, scene: Any) -> xr.Dataset:
     >>> scan = lm.to_xarray(mi.render(scene), scene)  # doctest: +SKIP
     >>> scan["Y"].plot()  # doctest: +SKIP
     """
+    if not hasattr(scene, "sensors"):
+        raise InputError(
+            f"scene: {type(scene).__name__} is not allowed; expected a scene of mi.load_file"
+        )
     sensor: Any = next(iter(scene.sensors()), None)
     integrator = scene.integrator()
     lidar, camera = hasattr(sensor, "beam_frame"), hasattr(sensor, "sample_towards_scene")

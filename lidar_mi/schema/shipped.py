@@ -6,6 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.text import read_text
 from lidar_mi.io.yaml import read_yaml
@@ -112,6 +113,7 @@ def campaigns() -> list[str]:
     return _names(_CAMPAIGN)
 
 
+@checked_arguments
 def experiment_file(name: str | Path) -> Path:
     """The experiment file of a path or of a shipped experiment's name.
 
@@ -125,6 +127,7 @@ def experiment_file(name: str | Path) -> Path:
     return _file_of(name, [_EXPERIMENT])
 
 
+@checked_arguments
 def campaign_file(name: str | Path) -> Path:
     """As `experiment_file`, for a campaign, or for an experiment with variants.
 
@@ -136,6 +139,7 @@ def campaign_file(name: str | Path) -> Path:
     return _file_of(name, [_CAMPAIGN, _EXPERIMENT])
 
 
+@checked_arguments
 def scene_file(name: str | Path) -> Path:
     """The file of a Mitsuba scene of the package (``slab``), or of one's own (its path).
 

@@ -267,7 +267,7 @@ def scene_cases(draw: st.DrawFn) -> Case:
         text = draw(damaged(text))
     files = {n: shipped[n] for n in ("cone.txt", "fringes_lens.txt", "puff.vol")}
     call = ("render", "a.xml", "-s", "2", "-o", "o.exr")
-    return Case("xml", call, files | {"a.xml": text}, ("o.exr",))
+    return Case("xml", call, files | {"a.xml": text}, ("o.exr", "o.png"))
 
 
 def small_film(text: str) -> str:

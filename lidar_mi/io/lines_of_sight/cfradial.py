@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.lines_of_sight.dataset import scan_kind
 from lidar_mi.io.netcdf import write_netcdf
@@ -19,6 +20,7 @@ _STANDARD = {
 }
 
 
+@checked_arguments
 def write_cfradial(lines: xr.Dataset, path: str | Path) -> None:
     r"""Write lines of sight as a CfRadial 1.4 file.
 
