@@ -354,7 +354,7 @@ def test_largest_cause_of_error_of_u_is_reported(amplitude, noise, errors, limit
             line_beams=None,
             lines=lines,
             crossflow=crossflow,
-            found=found,
+            combined=found,
             cores=[],
         )
     )
@@ -429,7 +429,7 @@ def test_the_fraction_of_noise_is_between_those_of_draws_and_of_the_lines():
                 line_beams=None,
                 lines=lines,
                 crossflow=crossflow,
-                found=found,
+                combined=found,
                 cores=[],
             )
         )
