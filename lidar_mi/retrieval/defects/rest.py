@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from lidar_mi.retrieval.defects.fixed_pattern import FixedPattern, fixed_pattern
 from lidar_mi.retrieval.defects.saturation import saturated, saturated_areas
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.inpainting import filled_in
-from lidar_mi.retrieval.images.quality import non_finite, thick
+from lidar_mi.retrieval.images.quality import nan_at, non_finite, thick
 from lidar_mi.retrieval.images.windows import Windows, averaged, box_sum, working
 
 # Fraction of a template at the largest value that leaves too little to see.
@@ -80,7 +80,7 @@ class AtRest(NamedTuple):
     def masked(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The images without the fixed pattern, NaN in place of what is no air."""
         pairs = zip(self.pattern.removed(images), self.hidden, strict=False)
-        return [_masked(image, pixels) for image, pixels in pairs]
+        return [nan_at(image, pixels) for image, pixels in pairs]
 
     def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The same, with smooth values in place of what is no air."""
@@ -154,10 +154,10 @@ def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     areas = saturated_areas(clipped, windows)
     if windows.dims > 2:
         return nothing_at_rest(images)._replace(clipped=clipped, saturated=areas)
-    pair = [_masked(image, areas) for image in images[:2]]
+    pair = [nan_at(image, areas) for image in images[:2]]
     structure, stray, d = at_rest(pair[0], pair[1], windows)
     hidden = stray | structure
-    pattern = fixed_pattern([_masked(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
+    pattern = fixed_pattern([nan_at(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
     if pattern.columns or pattern.rows:
         even = pattern.removed(pair)
         structure, stray, d = at_rest(even[0], even[1], windows)
@@ -171,13 +171,6 @@ def nothing_at_rest(images: Sequence[torch.Tensor]) -> AtRest:
     none = torch.zeros_like(images[0], dtype=torch.bool)
     all_none = torch.stack([none] * len(images))
     return AtRest(all_none, none, none, all_none, FixedPattern(torch.ones(1)))
-
-
-def _masked(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-    if not bool(pixels.any()):
-        return image
-    image = image if image.is_floating_point() else working(image)
-    return torch.where(pixels, torch.nan, image)
 
 
 def at_rest(
@@ -216,7 +209,7 @@ def at_rest(
     outstanding = impulses.outstanding(pair)
     pair = _normalised(pair, outstanding)
     structure = impulses.sharp(pair)
-    fields = _fields(pair)
+    fields = [*map(_stored, _fields(pair))]
     hidden = outstanding | _candidates(fields, structure)
     for _ in range(_ITERATIONS):
         soft = [_soft(image, ~(p | structure)) for image, p in zip(pair, hidden, strict=True)]
@@ -225,9 +218,8 @@ def at_rest(
         if not bool(d.any()):  # what stands out is all that there is
             return structure, torch.zeros_like(outstanding), d
         stray = impulses.stray(pair, outstanding, structure, chain([d], motions))
-        if bool(stray.any()):
-            fields = _fields(torch.where(stray, torch.nan, pair))
-        new = _still(fields, structure, d)
+        known = torch.where(stray, torch.nan, pair)
+        new = _still([*_fields(known)] if bool(stray.any()) else fields, structure, d)
         if not bool((new & ~structure).any()):
             break
         structure = structure | new
@@ -271,25 +263,22 @@ class _Field(NamedTuple):
 
 _Of = Callable[[torch.Tensor], _Field]
 """A field of two images without some pixels (z, y)."""
+R = TypeVar("R")
 
 
-def _fields(pair: torch.Tensor) -> list[_Of]:
-    """Those of `_all_fields`, each with the last one that was asked for."""
+def _stored(function: Callable[[torch.Tensor], R]) -> Callable[[torch.Tensor], R]:
+    """A function of pixels (z, y) that computes what it gave last only once."""
+    last: list[tuple[torch.Tensor, R]] = []
 
-    def stored(of: _Of) -> _Of:
-        last: list[tuple[torch.Tensor, _Field]] = []
+    def of_last(hidden: torch.Tensor) -> R:
+        if not (last and torch.equal(last[0][0], hidden)):
+            last[:] = [(hidden, function(hidden))]
+        return last[0][1]
 
-        def field(hidden: torch.Tensor) -> _Field:
-            if not (last and torch.equal(last[0][0], hidden)):
-                last[:] = [(hidden, of(hidden))]
-            return last[0][1]
-
-        return field
-
-    return [stored(of) for of in _all_fields(pair)]
+    return of_last
 
 
-def _all_fields(pair: torch.Tensor) -> Iterator[_Of]:
+def _fields(pair: torch.Tensor) -> Iterator[_Of]:
     """Single pixels, lines, edges, spots: each from the images without what was found before."""
     same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
 
@@ -306,13 +295,9 @@ def _all_fields(pair: torch.Tensor) -> Iterator[_Of]:
         change = change if same is None else change.minimum(same)
         return _Field(values, change, size, marked, _least(values, size))
 
-    last: list[tuple[torch.Tensor, torch.Tensor]] = []
-
+    @_stored
     def heights_of(hidden: torch.Tensor) -> torch.Tensor:
-        if not (last and torch.equal(last[0][0], hidden)):
-            heights = torch.stack([impulses.height(image) for image in known(hidden)])
-            last[:] = [(hidden, heights)]
-        return last[0][1]
+        return torch.stack([impulses.height(image) for image in known(hidden)])
 
     def pixels(hidden: torch.Tensor) -> _Field:
         images, heights = known(hidden), heights_of(hidden)

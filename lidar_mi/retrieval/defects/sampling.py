@@ -13,7 +13,7 @@ import torch
 from scipy import ndimage
 from scipy.stats import f as fisher
 
-from lidar_mi.retrieval.images.windows import working
+from lidar_mi.retrieval.images.quality import nan_at
 
 FALSE_ALARM = 1e-4
 """Probability that images of independent samples count as structured, of each test."""
@@ -75,13 +75,7 @@ class Sampling(NamedTuple):
 
     def masked(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The images with NaN in place of hidden pixels."""
-        masked = []
-        for image, pixels in zip(images, self.hidden, strict=True):
-            if bool(pixels.any()):
-                image = image if image.is_floating_point() else working(image)
-                image = torch.where(pixels, torch.nan, image)
-            masked.append(image)
-        return masked
+        return [nan_at(*pair) for pair in zip(images, self.hidden, strict=True)]
 
 
 def no_structure(images: Sequence[torch.Tensor]) -> Sampling:

@@ -54,9 +54,7 @@ def variance_by_coloured_noise(
     white = torch.fft.rfft2(normal_fields((_DRAWS, *sizes), residual, 11))
     coloured = torch.fft.irfft2(white * density.sqrt(), s=sizes)[:, :rows, :columns]
     # of the likelihood itself: the variance of a pixel's difference is that of its information
-    independent = (
-        normal_fields((_DRAWS, rows, columns), residual, 12) / weight.clamp(min=1e-30).sqrt()
-    )
+    drawn = normal_fields((_DRAWS, rows, columns), residual, 12) / weight.clamp(min=1e-30).sqrt()
     places = [windows.centres(axis).to(residual) for axis in range(windows.dims)]
     centres = Mesh(mesh.axes, places)
     inside = torch.ones(windows.count, dtype=torch.bool, device=residual.device)
@@ -66,10 +64,8 @@ def variance_by_coloured_noise(
         square = centres.field(response(gradient)).square().mean((0, 1))
         return averaged(square, inside, _AROUND / windows.stride)
 
-    coloured_variance, expected = variance(level * coloured), variance(independent)
-    return torch.where(
-        coloured_variance > _LEAST * expected, coloured_variance - expected, 0.0
-    ), lines
+    observed, expected = variance(level * coloured), variance(drawn)
+    return torch.where(observed > _LEAST * expected, observed - expected, 0.0), lines
 
 
 def _periods(field: torch.Tensor) -> list[int]:

@@ -200,6 +200,14 @@ def non_finite(images: Sequence[torch.Tensor], windows: Windows) -> torch.Tensor
     return windows.of_regions(working(bad)) > 0
 
 
+def nan_at(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """The image, as it is without such pixels, with NaN in their place."""
+    if not bool(pixels.any()):
+        return image
+    image = image if image.is_floating_point() else working(image)
+    return torch.where(pixels, torch.nan, image)
+
+
 def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
     """Pixels (images, ...) that are three or more away from a non-finite one."""
     bad = torch.stack([~torch.isfinite(image) for image in images])

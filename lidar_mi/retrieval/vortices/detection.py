@@ -32,11 +32,11 @@ class Detection(NamedTuple):
 
 def detect(make: Builder) -> Detection:
     """The detection of a pair in the images of a fit."""
-    likelihoods_by_place = likelihoods(make)
-    probability = probability_of(likelihoods_by_place.log_ratio)
-    if likelihoods_by_place.pair is None:
+    likeliest = likelihoods(make)
+    probability = probability_of(likeliest.log_ratio)
+    if likeliest.pair is None:
         return Detection(probability, None)
-    pair = likelihoods_by_place.pair.clone()
+    pair = likeliest.pair.clone()
     pair[[2, 6]] += float(make.y[0])
     pair[[3, 7]] += float(make.z[0])
     return Detection(probability, pair.to(make.pair.device))

@@ -382,14 +382,14 @@ def _searched(make: Builder, limits: Limits) -> tuple[Solution | None, bool]:
         return None, False
     variance = (_FIRST_MODEL_ERROR * spacing) ** 2
     white = make(*_LEVELS[1])
-    pair, images = _refitted(white, best.parameters, variance, limits)
-    if _replaced(white.weighted(pair.misfit)) < _REPLACED:
-        return pair, False
+    solution, images = _refitted(white, best.parameters, variance, limits)
+    if _replaced(white.weighted(solution.misfit)) < _REPLACED:
+        return solution, False
     observed = condensed(white.at_least(float(images.scatter.mean())).differences())
     starts = starting_points(observed, STARTS, make.profile)
     others = _best(images, starts, limits, variance)
     # both are fits to the same images, so that costs compare
-    return (others if others and others.cost < pair.cost else pair), True
+    return (others if others and others.cost < solution.cost else solution), True
 
 
 def _best(images: Images, starts: torch.Tensor, limits: Limits, variance: float) -> Solution | None:
