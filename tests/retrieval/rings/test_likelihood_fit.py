@@ -116,6 +116,23 @@ def test_images_are_independent_of_each_other():
     np.testing.assert_allclose(together.of("x"), [c[0] for c in centres], atol=1e-3)
 
 
+@pytest.mark.parametrize("method", ["annular", "pixels"])
+def test_calibration_error_is_in_the_speed(method):
+    """As a fit with that error in its model tells; the zero shifts all speeds."""
+    image = torch.as_tensor(reference.ring_image(40.0, **COARSE))
+    zero, relative = 0.2, 2e-5
+    covariance = np.zeros((8, 8))
+    covariance[0, 0], covariance[1, 1] = zero**2, relative**2
+    known = {"centre": (119.5, 97.0), "free": ("v_los", "level", "temperature"), "method": method}
+    fit = fit_rings(image, ring_model(**COARSE, systematic=covariance), **known)
+    longer = ring_model(**COARSE, focal_length=(1 + relative) * reference.FOCAL_LENGTH)
+    shift = float(fit_rings(image, longer, **known).v_los - fit.v_los)
+    assert abs(shift) > 0.05
+    assert float(fit.sensitivity[0, 0]) == -1
+    assert float(fit.sensitivity[0, 1]) * relative == pytest.approx(shift, rel=0.05)
+    assert float(fit.v_los_systematic) == pytest.approx(np.hypot(zero, shift), rel=0.05)
+
+
 def test_known_centre_stays():
     image = torch.as_tensor(reference.ring_image(5.0, centre=(118.0, 95.0), **COARSE))
     free = ("v_los", "level", "background")
