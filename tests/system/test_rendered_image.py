@@ -124,7 +124,8 @@ def test_volume_image_is_the_mean_over_the_gate(tmp_path, quick):
     of 20 %), gates of 2.5 m across planes of 1 m. Equal weights for the two planes inside the
     gates give a ratio of 22."""
     name = write_wake(tmp_path / "v.nc", lambda x, y, z: y * 0 + 1, x=np.arange(0.5, 8))
-    data = small() | {"render": {"samples_per_beam": 256, "max_order": 1}}
+    render = {"samples_per_beam": 256, "max_order": 1, "random_numbers": "independent"}
+    data = small() | {"render": render}
     data["wake"] = {"file": name, "depth": "volume", "texture": {"rms": 0.2, "outer_scale": "4 m"}}
     data["scattering"] = {"phase": "rayleigh"}
     run(check(data), tmp_path / "run", beside=tmp_path)
