@@ -74,13 +74,7 @@ class CampaignFolder:
 
     @cached_property
     def index(self) -> list[Row]:
-        """A row for each point, by its number.
-
-        Raises
-        ------
-        InputError
-            The file is damaged.
-        """
+        """A row for each point, by its number."""
         path = self.path / INDEX
         rows = []
         for line in read_text(path, "the index of a campaign").splitlines():
@@ -120,13 +114,7 @@ class CampaignFolder:
             (self.path / IMAGES).rmdir()
 
     def claimed(self) -> AbstractContextManager[None]:
-        """Lock the folder for the one process that hands out its points.
-
-        Raises
-        ------
-        InputError
-            Another process does.
-        """
+        """Lock the folder for the one process that hands out its points."""
         return locked(self.path)
 
 
@@ -210,13 +198,7 @@ def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder
 
 
 def open_folder(folder: str | Path) -> CampaignFolder:
-    """The folder of an existing campaign.
-
-    Raises
-    ------
-    InputError
-        There is no campaign in it.
-    """
+    """The folder of an existing campaign."""
     folder = Path(folder)
     path = folder / RECORD
     if not path.is_file():

@@ -83,13 +83,7 @@ class Status(Tabular):
 
 
 def campaign_status(folder: str | Path) -> Status:
-    """How far the campaign in a folder is; also while it runs.
-
-    Raises
-    ------
-    InputError
-        No campaign in the folder.
-    """
+    """How far the campaign in a folder is; also while it runs."""
     opened = open_folder(folder)
     status = Status(opened.campaign.name, len(opened.points))
     for number in range(status.total):

@@ -35,13 +35,7 @@ class Log:
         self.warnings: list[str] = []
 
     def __call__(self, text: str) -> None:
-        """Show a line, and write it into the file.
-
-        Raises
-        ------
-        InputError
-            It cannot be written.
-        """
+        """Show a line, and write it into the file."""
         self._write(text)
         self.notice(text, None)
 

@@ -106,11 +106,6 @@ def prepare(
     Run
         On the device that the experiment asks for, with the truth and the other results of the
         preflight; `complete` runs the rest.
-
-    Raises
-    ------
-    InputError
-        Bad input.
     """
     if experiment.encounter is not None:
         raise InputError(

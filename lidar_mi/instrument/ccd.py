@@ -201,10 +201,6 @@ def expose(
     -------
     torch.Tensor
         float32, (number of images, height, width).
-
-    Raises
-    ------
-    InputError
     """
     import torch
 

@@ -138,11 +138,6 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
     At the angles of a ring image (10 mrad) coatings of quarter waves reflect the same to 2e-5 and
     shift the orders by 2e-5 more, equivalent to 0.03 m/s there (others up to 0.1 m/s), the same in
     every image; `coated_transmission` has it all.
-
-    Raises
-    ------
-    InputError
-        A coating that does not transmit.
     """
     if etalon.coatings is None:
         reflectivity = etalon.reflectivity

@@ -110,11 +110,6 @@ def permissible_exposure(wavelength: float, duration: float) -> float:
     duration : float
         s, 1e-13 to 3e4. For a steady beam: the duration of exposure.
 
-    Raises
-    ------
-    InputError
-        Outside these limits.
-
     Notes
     -----
     Table A.1. From 400 to 600 nm the lesser of the thermal and the photochemical limit, from 1250

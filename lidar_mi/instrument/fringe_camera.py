@@ -210,10 +210,6 @@ def fringe_values(
     -------
     np.ndarray
         float64, (height, width), or (N, height, width) for an array of speeds.
-
-    Raises
-    ------
-    InputError
     """
     speeds = np.asarray(v_los, float)
     _check("v_los", speeds, abs(speeds) < 1e5, "finite speeds below 1e5 m/s")

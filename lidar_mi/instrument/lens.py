@@ -22,10 +22,6 @@ def fused_silica_index(wavelength: float) -> float:
     """Refractive index of fused silica at 20 C (Malitson 1965, J. Opt. Soc. Am. 55, 1205).
 
     The wavelength (m) is 0.21 to 3.71 um.
-
-    Raises
-    ------
-    InputError
     """
     if not 0.21e-6 <= wavelength <= 3.71e-6:
         raise InputError(f"wavelength: {wavelength:g} m is not allowed; expected 0.21 to 3.71 um")
@@ -60,11 +56,6 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
     For 300 mm, 5 mm and the corners of the default camera (15 mrad) the middle of the light stays
     within 0.002 pixels of f tan(theta); its rms width grows with the square of the angle to 0.16
     pixels (0.14 radially, 0.07 across) in the corners. The width is proportional to the stop.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
     """
     for name, value, most in (
         ("focal_length", focal_length, np.inf),

@@ -220,13 +220,7 @@ def random_process(
 def true_pose(
     motion: Motion, time: np.ndarray, speed: float, seed: int, path: Trajectory | None = None
 ) -> Pose:
-    """The true pose at times (s) since the first scan, at a speed (m/s) or along a path.
-
-    Raises
-    ------
-    InputError
-        See `Trajectory.at`.
-    """
+    """The true pose at times (s) since the first scan, at a speed (m/s) or along a path."""
     time = np.asarray(time, float)
     recorded = path.at(time, speed) if path else None
     offset = {axis: np.zeros(len(time)) for axis in (*PLACES, *ANGLES)}

@@ -62,11 +62,6 @@ def pulse_budget(
     sending : float
         Time in which the pulses of a slab are sent, without turns of the scanner, s. Default: all
         the time until the next slab.
-
-    Raises
-    ------
-    InputError
-        A number that is not positive.
     """
     for name, value in (
         ("directions", directions),
@@ -96,11 +91,6 @@ def pulses_for_error(error_of_one: float, required: float) -> int:
     """Pulses to average for a standard error, if those of single pulses are independent.
 
     (error of one / required)^2, rounded up: a bias does not average out.
-
-    Raises
-    ------
-    InputError
-        A standard error that is not positive.
     """
     for name, value in (("error_of_one", error_of_one), ("required", required)):
         if not (value > 0 and math.isfinite(value)):

@@ -23,13 +23,7 @@ def is_free(folder: str | Path) -> bool:
 
 
 def make_folder(folder: str | Path) -> None:
-    """Create a folder and its parents, where they are missing.
-
-    Raises
-    ------
-    InputError
-        It cannot be created.
-    """
+    """Create a folder and its parents, where they are missing."""
     folder = Path(folder)
     try:
         if not folder.is_dir():

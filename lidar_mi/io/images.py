@@ -86,13 +86,7 @@ def read_frames(
 
 
 def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
-    """How many images a file has, and whether they are channels of one moment.
-
-    Raises
-    ------
-    InputError
-        As `read_pixels`.
-    """
+    """How many images a file has, and whether they are channels of one moment."""
     if kind_of(Path(path)) in _SINGLE_IMAGE:
         return 1, False
     frames = _frames(Path(path), layer)
@@ -323,11 +317,6 @@ def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | N
         `beam_time` (s) and, where the pixels are beams that miss the nodes, `y_reported` and
         `z_reported` (m). The attribute `frozen_air` is 1 if all beams saw the air of the scan's
         reference time, as simulated ones may. None if the file does not state times.
-
-    Raises
-    ------
-    InputError
-        As `read_image`.
     """
     if not _is_exr(path):
         return None
@@ -340,13 +329,7 @@ def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | N
 
 
 def as_webp(path: str | Path) -> bytes:
-    """An image file in colours as lossless WebP, two thirds of its PNG.
-
-    Raises
-    ------
-    InputError
-        No readable image.
-    """
+    """An image file in colours as lossless WebP, two thirds of its PNG."""
     from PIL import Image
 
     content = BytesIO()
@@ -372,11 +355,6 @@ def panel_cuts(path: str | Path) -> list[float]:
 
     A figure of n equal columns has white gaps of its full height near k / n; the smallest n up to 4
     is taken. Empty: one column, or an element that spans several.
-
-    Raises
-    ------
-    InputError
-        No readable image.
     """
     from PIL import Image
 

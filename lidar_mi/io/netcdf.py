@@ -296,11 +296,6 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     """Write a data set as compressed NetCDF-4, whole or not at all.
 
     The file is composed in memory, as HDF5 crashes if the disk is full.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     import dask
 

@@ -72,13 +72,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def append_line(path: str | Path, line: str) -> None:
-    """Append a line to a text file, which is created if it is missing.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
+    """Append a line to a text file, which is created if it is missing."""
     try:
         with open(path, "ab") as file:
             file.write(encoded(f"{line}\n"))

@@ -130,13 +130,7 @@ def _times(data: xr.Dataset, name: str, path: Path) -> tuple[np.ndarray, np.ndar
 
 
 def wake_times(path: str | Path, names: Mapping[str, str] | None = None) -> np.ndarray:
-    """Times (s) of the states of a file that `read_wake` reads; none: it has no time.
-
-    Raises
-    ------
-    InputError
-        As of `read_wake`.
-    """
+    """Times (s) of the states of a file that `read_wake` reads; none: it has no time."""
     path = Path(path)
     name = _file_names(names, path)[0]["time"]
     with open_netcdf(path) as data:

@@ -33,11 +33,6 @@ def write_wind(path: str | Path, wind: xr.Dataset, pixel: tuple[float, float]) -
     -------
     str
         What the format loses; empty: nothing.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".nc":

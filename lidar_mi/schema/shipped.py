@@ -129,13 +129,7 @@ def experiment_file(name: str | Path) -> Path:
 
 @checked_arguments
 def campaign_file(name: str | Path) -> Path:
-    """As `experiment_file`, for a campaign, or for an experiment with variants.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
+    """As `experiment_file`, for a campaign, or for an experiment with variants."""
     return _file_of(name, [_CAMPAIGN, _EXPERIMENT])
 
 

@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.alt_text import TRUE_CORE
-from lidar_mi.assessment.figures.panels import Drawn, Progress, save_all
+from lidar_mi.assessment.figures.panels import Drawn, Progress, coloured, save_all
 from lidar_mi.assessment.labels import BACKSCATTER
 
 _SPEED = "m s$^{-1}$"
@@ -61,9 +61,7 @@ def draw_comparison(
                 panel.remove()
                 continue
             y, z = field["y"].values, field["z"].values
-            mesh = panel.pcolormesh(
-                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
-            )
+            mesh = coloured(panel, field, **style)
             panel.set(title=title, aspect="equal", xlim=(y.max(), y.min()), ylim=(z.min(), z.max()))
             for core in cores:
                 panel.plot(*core, "k+", ms=8, label=f"_{TRUE_CORE}")

@@ -75,13 +75,7 @@ def metrics_of(dataset: xr.Dataset) -> dict[str, xr.DataArray]:
 
 
 def chosen(metrics: Mapping[str, xr.DataArray], names: Sequence[str] | None) -> list[str]:
-    """The metrics to show: those asked for, or errors, stated errors, vortices and pulses.
-
-    Raises
-    ------
-    InputError
-        A metric that the campaign does not have.
-    """
+    """The metrics to show: those asked for, or errors, stated errors, vortices and pulses."""
     for key in names or ():
         if key not in metrics:
             near = ", ".join(difflib.get_close_matches(key, metrics, 3, 0.5))

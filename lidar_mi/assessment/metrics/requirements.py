@@ -126,11 +126,6 @@ def judge(
         without a row in the table are ignored.
     not_judged : mapping
         Reasons why rows are not judged, by names of `QUANTITIES`, whatever was measured.
-
-    Raises
-    ------
-    InputError
-        An unknown name, or an impossible value.
     """
     for name, value in measured.items():
         _check_name(name, "measured")
@@ -157,13 +152,7 @@ def fulfilled(findings: Sequence[Finding]) -> bool | None:
 
 
 def look_ahead(distance: float, speed: float) -> float:
-    """Time until the aircraft reaches the measured air, s: range over air speed; inf at rest.
-
-    Raises
-    ------
-    InputError
-        A negative distance or speed.
-    """
+    """Time until the aircraft reaches the measured air, s: range over air speed; inf at rest."""
     for name, value, unit in (("range", distance, "m"), ("speed", speed, "m/s")):
         if not value >= 0:
             raise InputError(f"{name}: {value} {unit} is not allowed; expected >= 0 {unit}")

@@ -44,11 +44,6 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
         The campaign with all defaults, as YAML.
     metrics : sequence of str, optional
         Names of metrics to show. Default: errors, coverage, vortices, pulses needed.
-
-    Raises
-    ------
-    InputError
-        A metric that the campaign does not have.
     """
     flown = list(encounter_blocks(numbers.metrics_of(dataset)))
     dataset = _in_usual_units(dataset)

@@ -41,11 +41,6 @@ class Microburst:
         Height of the largest outflow, m: 0.22 z*. e = z*/12.5.
     x, y : float
         Of its axis, m.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
     """
 
     outflow: float

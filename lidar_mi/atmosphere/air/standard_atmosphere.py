@@ -23,11 +23,6 @@ def standard_atmosphere(altitude: float) -> StandardAir:
     ----------
     altitude : float
         Geometric height above sea level in m, -5000 to 80 000.
-
-    Raises
-    ------
-    InputError
-        Out of range.
     """
     from fluids.atmosphere import ATMOSPHERE_1976
 

@@ -52,11 +52,6 @@ def mil_f_8785c(height: float, level: Level) -> tuple[float, float]:
     height : float
         Above the ground, m; below 10 ft the values are those of 10 ft.
     level : {"light", "moderate", "severe"}
-
-    Raises
-    ------
-    InputError
-        Another level.
     """
     if level not in LEVELS:
         raise InputError(f"turbulence.level: {level!r} is not known; expected {', '.join(LEVELS)}")

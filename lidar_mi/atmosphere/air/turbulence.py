@@ -128,11 +128,6 @@ def turbulence(
         waves lose their correlation as exp(-(sigma k t)^2/2).
     modes : int
         60 or more.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
     """
     for name, value, allowed, words in (
         ("sigma", sigma, sigma >= 0, "0 m/s or more"),

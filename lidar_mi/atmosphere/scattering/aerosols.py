@@ -76,10 +76,6 @@ class Aerosol:
         Length over width of a prolate spheroid; 1 is a sphere.
     number_density : float
         Typical particles per m^3.
-
-    Raises
-    ------
-    InputError
     """
 
     name: str
@@ -237,13 +233,7 @@ AEROSOLS: dict[str, Aerosol] = {
 
 
 def aerosol(name: str) -> Aerosol:
-    """The aerosol of this name.
-
-    Raises
-    ------
-    InputError
-        No such name.
-    """
+    """The aerosol of this name."""
     if name not in AEROSOLS:
         raise InputError(
             f"aerosol: {name!r} is not known; expected one of {', '.join(sorted(AEROSOLS))}"

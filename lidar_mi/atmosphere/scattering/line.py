@@ -35,11 +35,6 @@ class Line:
         Fraction of the photons in each Gaussian, 0 or more, with a sum of one.
     offsets, sigmas : array (K,)
         Centres and standard deviations, Hz; sigma 0 is a monochromatic line.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
     """
 
     wavelength: float
@@ -220,10 +215,6 @@ def backscatter_line(
         heavy to broaden the line.
     shape : {"rayleigh", "rayleigh_brillouin"}
         Of the molecular line.
-
-    Raises
-    ------
-    InputError
     """
     if shape not in SHAPES:
         raise InputError(f"shape: {shape!r} is not allowed; expected one of {', '.join(SHAPES)}")

@@ -150,10 +150,6 @@ def molecular_scattering(
         What the receiver lets through: the Cabannes line (narrow filter) or all of it.
     co2 : float
         Volume fraction.
-
-    Raises
-    ------
-    InputError
     """
     king = king_factor(wavelength, co2)
     # extinction is by the whole band, the received light that of one

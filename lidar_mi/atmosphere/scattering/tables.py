@@ -132,10 +132,6 @@ def check(table: ScatteringTable) -> None:
     Mee 1986, Astron. Astrophys. 157, 301); the symmetry relations forward (a2 = a3, b1 = b2 = 0)
     and backward (a2 = -a3, a4 = a1 - 2 a2, b1 = b2 = 0; van de Hulst 1957, sec. 5.2;
     Mishchenko & Hovenier 1995).
-
-    Raises
-    ------
-    InputError
     """
     label = f"scattering table {table.name!r}"
     numbers = {
@@ -278,10 +274,6 @@ def mix(
     -------
     ScatteringTable
         On the union of all angles. `extinction_cross_section` is the mean over all particles.
-
-    Raises
-    ------
-    InputError
     """
     tables, extinctions = list(tables), [float(value) for value in extinctions]
     if not tables or len(tables) != len(extinctions):

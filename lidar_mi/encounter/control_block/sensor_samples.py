@@ -61,13 +61,7 @@ class SensorSamples:
 
 
 def flights_in(folder: str | Path) -> list[Path]:
-    """Folders of finished flights with a lidar: this one, or those below it.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
+    """Folders of finished flights with a lidar: this one, or those below it."""
     folder = Path(folder)
     needed = (RECORD, FLIGHT_FILES["series"], FLIGHT_FILES["slabs"])
     files = sorted(

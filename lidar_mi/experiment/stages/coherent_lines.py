@@ -84,13 +84,7 @@ def passing_air(
 
 
 def check_scan(doppler: CoherentDoppler, wake: Wake | None) -> None:
-    """Refuse a scan that takes too much memory, or that is along the wake.
-
-    Raises
-    ------
-    InputError
-        With what is allowed.
-    """
+    """Refuse a scan that takes too much memory, or that is along the wake."""
     scan = doppler.scan
     cells = line_scan(scan).time.size * doppler.laser.gates
     if cells > _MOST_CELLS:

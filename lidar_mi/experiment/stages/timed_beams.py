@@ -90,11 +90,6 @@ def line_beams(
     """Beams of the Doppler lidar's lines of sight, about the first scan's reference time.
 
     None where nothing takes time or moves.
-
-    Raises
-    ------
-    InputError
-        As `timed_plans`.
     """
     if (sensor.timing is None or sensor.timing.is_instant) and is_steady(platform):
         return None

@@ -79,11 +79,6 @@ def in_air_of_its_site(experiment: Experiment, search_path: Path) -> Experiment:
     ``doppler.lidar`` does not state its own. Backscatter is that of molecules plus the
     ``aerosol_fraction``, extinction that of molecules; neither changes if all light is of aerosol.
     Without a site nothing changes.
-
-    Raises
-    ------
-    InputError
-        As of `clear_air`.
     """
     doppler, site = experiment.fringes, experiment.site
     if doppler is None or site == Site():

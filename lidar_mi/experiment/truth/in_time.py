@@ -51,13 +51,7 @@ def state_times(observation: Observation, flows: Flows, times: np.ndarray) -> np
 
 
 def values_of_states(observation: Observation, flows: Flows, plans: Sequence[ScanPlan]) -> int:
-    """Values of all states of the scan that has most; 0 where air is frozen or beams have one time.
-
-    Raises
-    ------
-    InputError
-        As of `state_times`.
-    """
+    """Values of all states of the scan that has most; 0: air is frozen or beams have one time."""
     if observation.scan.air != "moving":
         return 0
     timed = [plan.beams.time for plan in plans if plan.beams is not None]
@@ -82,11 +76,6 @@ def air_in_time(
     -------
     xarray.DataArray
         float32, at `state_times`, for linear interpolation. Without ``time`` where air is uniform.
-
-    Raises
-    ------
-    InputError
-        As of `state_times`.
     """
     if all(float(field.min()) == float(field.max()) for field in truth.extinction):
         return truth.extinction[which]
