@@ -29,6 +29,7 @@ from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
 from lidar_mi.schema.doppler import Doppler
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.reading import load_experiment
+from lidar_mi.variables import variable
 
 
 def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") -> Doppler:
@@ -293,8 +294,8 @@ def retrieve_v_los(
             columns[3:, k] = float(fit.chi_square), float(fit.rings)
     return xr.Dataset(
         {
-            name: ("frame", values, {"units": units, "long_name": text})
-            for (name, units, text), values in zip(_VARIABLES, columns, strict=True)
+            name: variable("frame", values, *about)
+            for (name, *about), values in zip(_VARIABLES, columns, strict=True)
         }
         | {"status": ("frame", status, {"long_name": "why a frame has no speed"})},
         attrs={

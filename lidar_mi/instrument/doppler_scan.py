@@ -18,6 +18,7 @@ from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.motion import attitude, tilted
 from lidar_mi.instrument.scan import HalfAngle
 from lidar_mi.units import Angle, Speed, Within, quantity
+from lidar_mi.variables import variable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -296,12 +297,12 @@ def scan_wind(
     noise = np.random.default_rng(int(noise_seed)).standard_normal(len(true))
     measurement = xr.Dataset(
         {
-            "v_los": _variable("line", true + std * noise, "m s-1", _LOS),
-            "v_los_std": _variable("line", std, "m s-1", "standard error of v_los"),
-            "v_los_true": _variable("line", true, "m s-1", _LOS + ", without noise"),
-            "range": _variable("line", ranges, "m", "distance of the middle of the range bin"),
-            "range_bin": ((), lidar.range_bin, {"units": "m", "long_name": "length of range bin"}),
-            "platform_velocity": _variable(
+            "v_los": variable("line", true + std * noise, "m s-1", _LOS),
+            "v_los_std": variable("line", std, "m s-1", "standard error of v_los"),
+            "v_los_true": variable("line", true, "m s-1", _LOS + ", without noise"),
+            "range": variable("line", ranges, "m", "distance of the middle of the range bin"),
+            "range_bin": variable((), lidar.range_bin, "m", "length of range bin"),
+            "platform_velocity": variable(
                 "axis" if beams is None else ("line", "axis"),
                 reported,
                 "m s-1",
@@ -309,7 +310,7 @@ def scan_wind(
             ),
         },
         coords={
-            "direction": _variable(("line", "axis"), directions, "1", "unit vector"),
+            "direction": variable(("line", "axis"), directions, "1", "unit vector"),
             "axis": ("axis", ["x", "y", "z"]),
         },
         attrs={"Conventions": "CF-1.11", "title": "Line-of-sight velocities", "seed": seed},
@@ -317,20 +318,14 @@ def scan_wind(
     if beams is None:
         return measurement
     return measurement.assign(
-        time=_variable("line", beams.time, "s", "time from the reference time of the scan"),
-        origin=_variable(
+        time=variable("line", beams.time, "s", "time from the reference time of the scan"),
+        origin=variable(
             ("line", "axis"), beams.reported_origin, "m", "place of the telescope, as reported"
         ),
     )
 
 
 _LOS = "velocity toward the instrument along the line of sight"
-
-
-def _variable(
-    dims: str | tuple[str, ...], values: np.ndarray, units: str, long_name: str
-) -> tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]:
-    return dims, values, {"units": units, "long_name": long_name}
 
 
 def _spread(half: float, count: int) -> np.ndarray:

@@ -36,6 +36,7 @@ from lidar_mi.schema.input_files import find_file
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.sensor import Sensor
 from lidar_mi.schema.wake import Wake
+from lidar_mi.variables import variable
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.rings.model import PixelNoise
@@ -212,15 +213,15 @@ def with_speeds(
         "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),
         # independent errors: variances add
         "v_los_std": ("line", np.hypot(std, drift_std), lines.variables["v_los_std"].attrs),
-        "v_los_systematic": (
+        "v_los_systematic": variable(
             "line",
             np.hypot(systematic, plate_uncertainty(doppler)),
-            {"units": "m s-1", "long_name": "systematic standard error common to all lines"},
+            "m s-1",
+            "systematic standard error common to all lines",
         ),
     }
     shared = shared_covariance(doppler, pulses, laser_std, PULSES)
     if shared is not None:
         text = "covariance of the random errors of v_los by the laser's frames, beside v_los_std"
-        about = {"units": "m2 s-2", "long_name": text}
-        variables["v_los_covariance"] = ("line", "other_line"), shared, about
+        variables["v_los_covariance"] = variable(("line", "other_line"), shared, "m2 s-2", text)
     return lines.assign(variables)

@@ -11,6 +11,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.scans import LineScan
 from lidar_mi.instrument.coherent.velocity_noise import cramer_rao, random_velocity
 from lidar_mi.instrument.coherent.weighting import CoherentLidar, Signal, WindField, gate_moments
+from lidar_mi.variables import variable
 
 START = np.datetime64("2000-01-01T00:00:00", "ns")
 """Time 0 of simulated lines."""
@@ -93,18 +94,17 @@ def measured_lines(
     uniform = receiver.bandwidth * (scipy.special.ndtr(noise) - 0.5)
     measured = np.where(lost, uniform, true + stderr * noise)
 
-    def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
-        return dims, values, {"units": units, "long_name": long_name}
-
     time = START + np.round(scan.time * 1e9).astype("timedelta64[ns]")
     degree = {"units": "degree"}
     return xr.Dataset(
         {
-            "radial_velocity": field(measured, "radial velocity, positive away"),
-            "radial_velocity_stderr": field(stderr, "standard error of the radial velocity"),
-            "radial_velocity_true": field(true, "radial velocity without noise"),
-            "spectral_width": field(width, "width of the Doppler spectrum"),
-            "snr": field(ratio, "signal-to-noise ratio of the powers", "1"),
+            "radial_velocity": variable(dims, measured, "m s-1", "radial velocity, positive away"),
+            "radial_velocity_stderr": variable(
+                dims, stderr, "m s-1", "standard error of the radial velocity"
+            ),
+            "radial_velocity_true": variable(dims, true, "m s-1", "radial velocity without noise"),
+            "spectral_width": variable(dims, width, "m s-1", "width of the Doppler spectrum"),
+            "snr": variable(dims, ratio, "1", "signal-to-noise ratio of the powers"),
             "flag": (
                 dims,
                 lost.astype(np.uint16),

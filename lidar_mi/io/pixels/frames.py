@@ -1,6 +1,7 @@
 """The result of every reader of pixels: the images of a file, one number a pixel."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,6 +93,17 @@ def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> n
         return first
     with np.errstate(over="ignore", invalid="ignore"):
         return np.where(equal, first, pixels.mean(-1, dtype=float))
+
+
+@contextmanager
+def reading(path: str | Path, kind: str) -> Iterator[None]:
+    """Turn any exception of a library in a damaged file into `damaged`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise damaged(path, kind, error) from None
 
 
 def damaged(path: str | Path, kind: str, error: object) -> InputError:

@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.pixels.frames import Frames, damaged, frames_of
+from lidar_mi.io.pixels.frames import Frames, frames_of, reading
 from lidar_mi.io.size import check_size
 
 if TYPE_CHECKING:
@@ -29,19 +29,15 @@ def read_npy(path: Path) -> Frames:
     InputError
         A damaged file, Python objects, another number of dimensions.
     """
-    try:
+    with reading(path, "npy"):
         with path.open("rb") as file:
             image = _numpy_array(path, file, path.stat().st_size)
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "npy", error) from None
     return _stack(path, image)
 
 
 def read_npz(path: Path, layer: str | None) -> Frames:
     """One array of a NumPy zip file, as `read_npy`; ``layer`` names it where there are several."""
-    try:
+    with reading(path, "npz"):
         with zipfile.ZipFile(path) as packed:
             names = {n.removesuffix(".npy"): n for n in packed.namelist() if n.endswith(".npy")}
             # two dimensions at least: parameters are stored beside images
@@ -54,10 +50,6 @@ def read_npz(path: Path, layer: str | None) -> Frames:
             check_size(path, size)
             with packed.open(names[chosen]) as file:
                 image = _numpy_array(path, file, size)
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the libraries in a damaged file
-        raise damaged(path, "npz", error) from None
     return _stack(path, image)
 
 
@@ -78,15 +70,11 @@ def read_mat(path: Path, layer: str | None) -> Frames:
         "logical",
         *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
     }
-    try:
+    with reading(path, "MATLAB file"):
         shapes = {name: shape for name, shape, kind in whosmat(path) if kind in numbers}
         chosen = _chosen(path, shapes, layer)
         check_size(path, 8 * math.prod(shapes[chosen]))
         image = loadmat(path, variable_names=[chosen])[chosen]
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "MATLAB file", error) from None
     return _matrix(path, np.asarray(image))
 
 
@@ -100,7 +88,7 @@ def read_hdf5(path: Path, layer: str | None) -> Frames:
     """
     import h5py
 
-    try:
+    with reading(path, "HDF5"):
         with h5py.File(path, "r") as file:
             arrays: dict[str, Any] = {}
 
@@ -115,10 +103,6 @@ def read_hdf5(path: Path, layer: str | None) -> Frames:
             _refuse_unreadable(path, part)
             matlab = "MATLAB_class" in part.attrs
             image = part[()]
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "HDF5", error) from None
     return _matrix(path, image.T) if matlab else _stack(path, image)
 
 
