@@ -43,10 +43,7 @@ KUESSNER = Indicial((0.236, 0.513, 0.171), (0.058, 0.364, 2.42))
 class Memory:
     """Unsteady response of strips to their inputs, exact for inputs linear between samples.
 
-    Parameters
-    ----------
-    rate : ndarray, shape (n,)
-        Half chords flown in a second, by strip.
+    ``rate``, shape (n,): half chords flown in a second, by strip.
     """
 
     def __init__(self, indicial: Indicial, rate: np.ndarray) -> None:

@@ -102,6 +102,8 @@ def wing_strips(
     second kind, whose weight is the elliptic chord: lift and moments are exact for winds that are
     polynomials in y up to the degree 2 n - 1.
 
+    Raises InputError: span, area, slope or number not positive.
+
     Parameters
     ----------
     span, area : float
@@ -112,11 +114,6 @@ def wing_strips(
         Number of strips.
     place : array_like, shape (3,)
         Middle of the surface in the body frame, m.
-
-    Raises
-    ------
-    InputError
-        Span, area, slope or number not positive.
     """
     angle = _angles(n)
     places = np.tile(np.asarray(place, dtype=float), (n, 1))

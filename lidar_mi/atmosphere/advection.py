@@ -93,6 +93,8 @@ def advect(
     is not meaningful. A field without negative values remains so: the undershoots of the spline at
     sharp edges are set to zero.
 
+    Raises InputError: other dims, unequal grids, uneven axes, values or dt not finite.
+
     Parameters
     ----------
     field : xarray.DataArray
@@ -110,11 +112,6 @@ def advect(
     -------
     xarray.DataArray
         float64, dims, coordinates and attributes of `field`.
-
-    Raises
-    ------
-    InputError
-        Other dims, unequal grids, uneven axes, values or dt not finite.
     """
     _check_step(dt, steps)
     _check_grid(field, v, w, u)  # a fault of the field, or of the velocities
@@ -161,10 +158,7 @@ def advect_to(
     r (omega t)^3/(6 n^2) after n steps. Times (s) ascend, 0 is that of ``field``; the result has
     dims (time, ...) and is float64.
 
-    Raises
-    ------
-    InputError
-        Times not finite or not ascending; else as `advect`.
+    Raises InputError: times not finite or not ascending; else as `advect`.
     """
     times = np.asarray(times, float)
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():

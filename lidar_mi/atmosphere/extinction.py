@@ -94,6 +94,9 @@ def extinction_from_tracer(
     stretching factor of 2.0" and that relative structure is maintained, but no formula: this
     reading of it is ours. Where aerosol > 1, E may pass `maximum` by background*(aerosol - 1).
 
+    Raises InputError: numbers out of range, missing or negative variables, a reference below the
+    data.
+
     Parameters
     ----------
     wake : xarray.Dataset
@@ -112,11 +115,6 @@ def extinction_from_tracer(
     -------
     xarray.DataArray
         m^-1, dims of the wake's variables.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range, missing or negative variables, a reference below the data.
     """
     _check(background, maximum, stretch)
 

@@ -72,6 +72,8 @@ def corrsin_obukhov(
     0 and s. The factor's own mean and rms therefore scatter only by what the tails do: some
     per cent of the rms in an image of ten outer scales.
 
+    Raises InputError: values out of range, uneven axes, a field too large for memory.
+
     Parameters
     ----------
     y, z : array_like
@@ -90,11 +92,6 @@ def corrsin_obukhov(
     -------
     xarray.DataArray
         Factor, dimensionless, dims (y, z) or (x, y, z).
-
-    Raises
-    ------
-    InputError
-        Values out of range, uneven axes, a field too large for memory.
     """
     if not (np.isfinite(rms) and rms >= 0):
         raise InputError(f"texture.rms: {rms} is not allowed; it must be >= 0")
@@ -196,10 +193,7 @@ def periodic_texture(
 
     Mean and standard deviation of the Gaussian field are set over the period.
 
-    Raises
-    ------
-    InputError
-        An outer scale of less than two cells, a period too large for memory.
+    Raises InputError: an outer scale of less than two cells, a period too large for memory.
     """
     if not outer_scale >= 2 * max(spacing):
         raise InputError(

@@ -21,6 +21,9 @@ from lidar_mi.errors import InputError
 class TurbineWake:
     """The mean wake at one place downstream of an actuator disc.
 
+    Raises InputError: numbers out of range, or a place so near that the far wake's formula has no
+    value there.
+
     Parameters
     ----------
     diameter : float
@@ -38,11 +41,6 @@ class TurbineWake:
         Distance from the rotor, m.
     hub_core : float
         Radius of the swirl's core, m.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range, or a place so near that the far wake's formula has no value there.
 
     Notes
     -----

@@ -57,10 +57,7 @@ class Span(Description):
     def ends(self) -> tuple[float, float]:
         """Both ends in `unit`.
 
-        Raises
-        ------
-        ValueError
-            No quantities, or of two units.
+        Raises ValueError: no quantities, or of two units.
         """
         (first, unit), (last, other) = map(split_quantity, self._ends())
         if unit != other:
@@ -247,6 +244,9 @@ def read_campaign(
 ) -> Campaign:
     """Read a campaign file.
 
+    Raises InputError: unreadable file, unknown key, a dimension that is none: the first fault is
+    named.
+
     Parameters
     ----------
     path : path
@@ -255,11 +255,6 @@ def read_campaign(
         Texts such as ``"members=4"`` or ``"set.scan.range=200 m"``.
     quick : bool
         The coarse version that the file describes.
-
-    Raises
-    ------
-    InputError
-        Unreadable file, unknown key, a dimension that is none: the first fault is named.
     """
     data = read_yaml(path, "a campaign file")
     if not isinstance(data, dict):

@@ -147,10 +147,7 @@ def write_outcome(place: Path, outcome: Outcome) -> None:
 def read_base(campaign: Campaign, origin: str | Path) -> tuple[dict[str, Any], Path]:
     """Keys of the base experiment and the folder of its file.
 
-    Raises
-    ------
-    InputError
-        No such experiment; one with variants.
+    Raises InputError: no such experiment; one with variants.
     """
     neighbour = Path(origin).parent / campaign.base
     path = neighbour if neighbour.is_file() else experiment_file(campaign.base)
@@ -170,10 +167,8 @@ def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder
 
     Every point's settings are checked before anything is written.
 
-    Raises
-    ------
-    InputError
-        A point that is no experiment, two that are equal, the folder of another campaign.
+    Raises InputError: a point that is no experiment, two that are equal, the folder of another
+    campaign.
     """
     folder = Path(folder)
     record = _record(points)
@@ -215,10 +210,7 @@ def open_folder(folder: str | Path) -> CampaignFolder:
 def check_version(folder: CampaignFolder) -> None:
     """Refuse to compute points of another version's campaign.
 
-    Raises
-    ------
-    InputError
-        Results of two versions must not be mixed.
+    Raises InputError: results of two versions must not be mixed.
     """
     version = read_yaml(folder.path / RECORD, "the record of a campaign")["version"]
     if version != __version__:

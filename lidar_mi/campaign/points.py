@@ -49,17 +49,14 @@ class Dimension:
 class Points:
     """All points of a campaign, in the order of the file, members last and fastest.
 
+    Raises InputError: two dimensions that change one key.
+
     Parameters
     ----------
     base : dict
         Keys of the base experiment.
     search_path : path
         Folder in which files named by the experiments are searched first.
-
-    Raises
-    ------
-    InputError
-        Two dimensions that change one key.
     """
 
     def __init__(self, campaign: Campaign, base: dict[str, Any], search_path: str | Path) -> None:
@@ -94,10 +91,7 @@ class Points:
     def experiment(self, number: int) -> Experiment:
         """The experiment of a point.
 
-        Raises
-        ------
-        InputError
-            An unknown key, a wrong unit, a value out of range.
+        Raises InputError: an unknown key, a wrong unit, a value out of range.
         """
         *index, member = self.index(number)
         data = self.base

@@ -16,6 +16,8 @@ def slurm_cluster(
 
     Workers end two minutes before their walltime, and their points go to others.
 
+    Raises InputError: dask-jobqueue is missing; a walltime that is none.
+
     Parameters
     ----------
     memory : str
@@ -29,11 +31,6 @@ def slurm_cluster(
     -------
     dask_jobqueue.SLURMCluster
         ``scale(jobs=40)`` submits 40 of them, ``job_script()`` is one as text.
-
-    Raises
-    ------
-    InputError
-        dask-jobqueue is missing; a walltime that is none.
     """
     try:
         from dask_jobqueue.slurm import SLURMCluster

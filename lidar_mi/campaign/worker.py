@@ -69,10 +69,7 @@ class Prepare(WorkerPlugin):
     def setup(self, worker: Worker) -> None:
         """Called by the worker when it starts, or when it receives this plugin.
 
-        Raises
-        ------
-        InputError
-            The worker has another version of the package.
+        Raises InputError: the worker has another version of the package.
         """
         # a campaign of two versions would compare what is not comparable
         if self.version != __version__:

@@ -104,18 +104,15 @@ def _pair(one: xr.Dataset) -> VortexPairFit | None:
 def recorded_flight(folder: str | Path, experiment: Experiment) -> FlightData:
     """The data sets of a flight whose estimates an experiment may fly by.
 
+    Raises InputError: no flight with a lidar, or one from a version that did not record its
+    estimates; another experiment; a mode of control without the lidar.
+
     Parameters
     ----------
     folder : path
         Of the recorded flight.
     experiment : Experiment
         Differs from the recorded one in `encounter.aircraft` and `encounter.control` alone.
-
-    Raises
-    ------
-    InputError
-        No flight with a lidar, or one from a version that did not record its estimates; another
-        experiment; a mode of control without the lidar.
     """
     folder = Path(folder)
     if encounter_of(experiment).control.mode != FEEDFORWARD:

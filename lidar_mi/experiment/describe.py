@@ -30,6 +30,8 @@ def sections(
 ) -> Iterator[Section]:
     """Describe a file, a folder of a run or a study, a named aerosol or the molecules of air.
 
+    Raises InputError: nothing of this name, not readable, or an option that does not apply to it.
+
     Parameters
     ----------
     what : str
@@ -38,11 +40,6 @@ def sections(
         m, of a named scatterer; default 532 nm.
     altitude : float, optional
         m in the standard atmosphere, of molecules; default 0.
-
-    Raises
-    ------
-    InputError
-        Nothing of this name, not readable, or an option that does not apply to it.
     """
     path = Path(what)
     # a file with the name of a scatterer comes first

@@ -242,11 +242,8 @@ def _given(experiment: Experiment, parameter: Parameter) -> Any:
 def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
     """A stage's function with its sections from an experiment.
 
-    Parameters
-    ----------
-    **given
-        Its other parameters: results, and what a run provides; by default a silent log, and the
-        experiment's folder.
+    ``**given``: its other parameters: results, and what a run provides; by default a silent log,
+    and the experiment's folder.
     """
     provided = {"log": Log(), "search_path": experiment.folder} | given
     for parameter in parameters(function):
@@ -269,11 +266,8 @@ def _bundled(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[st
 class Graph:
     """The stages, out of those of all experiments, that an experiment has, in their order.
 
-    Raises
-    ------
-    ValueError
-        Two stages of one name, a parameter that is nothing, stages that need each other, a stage
-        of the preflight that needs one that is not.
+    Raises ValueError: two stages of one name, a parameter that is nothing, stages that need each
+    other, a stage of the preflight that needs one that is not.
     """
 
     def __init__(self, stages: Sequence[Stage], experiment: Experiment):

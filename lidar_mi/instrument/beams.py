@@ -83,6 +83,8 @@ def steered_beams(
 ) -> Beams:
     """The beams of a scanner that is steered by the reported pose, or fixed to the body.
 
+    Raises InputError: a pose that takes the telescope beyond the plane or turns beams away from it.
+
     Parameters
     ----------
     speed : float
@@ -91,11 +93,6 @@ def steered_beams(
         Of the telescope at the times.
     jitter : float
         Rms of true directions on both axes, rad, by the generator ``random``.
-
-    Raises
-    ------
-    InputError
-        A pose that takes the telescope beyond the plane or turns beams away from it.
     """
     time, position = targets.time, targets.position
     slab = position + targets.distance

@@ -100,6 +100,9 @@ def detect(
     mean N and variance N (F - 1), and read-out noise is Gaussian. Known means of background and
     dark counts are subtracted, so the estimate is unbiased and may be negative.
 
+    Raises InputError: S0 negative or not finite, light beyond 10^15 photoelectrons, duration,
+    distance, polarisation or seed out of range.
+
     Parameters
     ----------
     s0 : array
@@ -120,12 +123,6 @@ def detect(
     Detection
         All of one shape. ``s0_std`` is the exact standard deviation of ``s0`` for this mean; from
         measured counts alone, `noise_variance` of the estimated signal is its estimate.
-
-    Raises
-    ------
-    InputError
-        S0 negative or not finite, light beyond 10^15 photoelectrons, duration, distance,
-        polarisation or seed out of range.
     """
     s0 = np.asarray(s0, float)
     _check("S0", s0, s0 >= 0, "finite values, 0 or more")
@@ -179,6 +176,8 @@ def noisy_scan(
     of gates, pixels and scans is independent (the air moves by more than a wavelength from scan
     to scan; between gates that holds for lines wider than 1 / gate duration).
 
+    Raises InputError: the scan does not state its gates; see `detect` for the rest.
+
     Parameters
     ----------
     scan : xr.Dataset
@@ -190,11 +189,6 @@ def noisy_scan(
         from a file.
     pulses : int
         Averaged in every beam.
-
-    Raises
-    ------
-    InputError
-        The scan does not state its gates; see `detect` for the rest.
     """
     plan = plan or _plan(scan)
     scan = scan.transpose("gate", "z", "y", ...)
@@ -246,10 +240,7 @@ def noise_budget(
     ``speckle_modes`` (not without speckle), and the relative standard deviation of S0 by cause,
     ``noise.shot``, ``.speckle``, ``.background``, ``.dark``, ``.readout``, and ``noise.all``.
 
-    Raises
-    ------
-    InputError
-        The scan does not state its gates, or is dark.
+    Raises InputError: the scan does not state its gates, or is dark.
     """
     plan = _plan(scan)
     scan = scan.transpose("gate", "z", "y", ...)

@@ -168,6 +168,8 @@ def solar_background(lidar: DopplerLidar, etalon: Etalon) -> float:
 def coherence_time(etalon: Etalon, line: Line, order: float = 0.0) -> float:
     """Coherence time of the light of a line in one place behind the etalon, s.
 
+    Raises InputError: a line with a monochromatic part.
+
     Parameters
     ----------
     line : lidar_mi.atmosphere.scattering.line.Line
@@ -175,11 +177,6 @@ def coherence_time(etalon: Etalon, line: Line, order: float = 0.0) -> float:
     order : float
         Fractional order of the laser's light; 0 is the peak of a fringe, where the spectrum is
         narrowest and the coherence time longest: light of other places has more modes.
-
-    Raises
-    ------
-    InputError
-        A line with a monochromatic part.
     """
     return filtered_coherence_time(line, _behind_etalon(etalon, line, order))
 
@@ -190,17 +187,14 @@ def filtered_coherence_time(line: Line, transmission: Callable[[np.ndarray], np.
     int |g|^2 dt over all times, which by Parseval's theorem is int p^2 dnu, with p the spectrum
     behind the filter, of integral 1 (Goodman 1985, Statistical Optics, section 5.1).
 
+    Raises InputError: a line with a monochromatic part.
+
     Parameters
     ----------
     line : lidar_mi.atmosphere.scattering.line.Line
         Of air at rest, every Gaussian with a width.
     transmission : function
         Of the frequency less that of the laser (array, Hz).
-
-    Raises
-    ------
-    InputError
-        A line with a monochromatic part.
     """
     if not line.sigmas.all():
         raise InputError("line.sigmas: 0 Hz is not allowed; expected a line with a width")

@@ -124,10 +124,7 @@ def sight_volumes(
     exp(-2 alpha r) / r^2: the centroid of 10 m at 56 m is 0.3 m nearer than the middle. Points
     (lines, points, 3) are in m; weights (lines, points) have the sum 1 for every line.
 
-    Raises
-    ------
-    InputError
-        A bin that reaches the telescope.
+    Raises InputError: a bin that reaches the telescope.
     """
     directions, ranges = np.asarray(directions, float), np.asarray(ranges, float)
     bin_nodes, bin_weights = np.polynomial.legendre.leggauss(_BIN)
@@ -167,15 +164,10 @@ def sight_volumes(
 def wind_at(wind: "xr.Dataset", points: np.ndarray) -> np.ndarray:
     """Wind (..., 3) at points (..., 3), by linear interpolation.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        u, v, w (m s^-1) on (z, y), the same for all x, or on (x, y, z); coordinates ascending, m.
+    ``wind``: u, v, w (m s^-1) on (z, y), the same for all x, or on (x, y, z); coordinates
+    ascending, m.
 
-    Raises
-    ------
-    InputError
-        A component or a coordinate is missing, or the points leave the field.
+    Raises InputError: a component or a coordinate is missing, or the points leave the field.
     """
     for name in ("u", "v", "w"):
         if name not in wind:
@@ -240,6 +232,8 @@ def scan_wind(
     platform's own, plus normal noise. Photons arrive evenly from all of the volume: extinction and
     backscatter coefficient are homogeneous in it.
 
+    Raises InputError: a field that does not contain the scan; a negative standard error.
+
     Parameters
     ----------
     wind : xr.Dataset or callable
@@ -264,11 +258,6 @@ def scan_wind(
         `direction` and `range` (m; where the lines are taken to go), `range_bin` (m),
         `v_los`, `v_los_std` and `v_los_true` (m s-1; without noise), `platform_velocity` (m s-1).
         With beams these are as reported, line by line, with `time` (s) and `origin` (m).
-
-    Raises
-    ------
-    InputError
-        A field that does not contain the scan; a negative standard error.
     """
     import xarray as xr
 

@@ -262,10 +262,7 @@ def transmission(
 def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> float:
     """Free spectral range over the full width of a fringe at half its height above zero.
 
-    Raises
-    ------
-    InputError
-        Fringes so broad that they nowhere fall to half their height.
+    Raises InputError: fringes so broad that they nowhere fall to half their height.
     """
     amplitudes = harmonics(etalon, wavelength, line)
 

@@ -139,6 +139,9 @@ def permissible_pulse(
     is 1 for pulses longer than T_i (5 us; 13 us from 1050 nm) and in exposures up to 0.25 s. Pulses
     within T_i of each other count as one.
 
+    Raises InputError: a wavelength or time out of the standard's limits, a negative rate, pulses
+    that overlap.
+
     Parameters
     ----------
     wavelength, pulse_duration : float
@@ -150,11 +153,6 @@ def permissible_pulse(
         s, see `time_base`.
     burst : (pulses, rate)
         Pulses that follow each other at a rate (Hz) above the mean, as those of one beam do.
-
-    Raises
-    ------
-    InputError
-        A wavelength or time out of the standard's limits, a negative rate, pulses that overlap.
     """
     single = permissible_exposure(wavelength, pulse_duration)
     total = _duration("exposure_duration", exposure_duration)
@@ -297,6 +295,8 @@ def scan_hazard_distance(
     distance r receives the light of n pulses in every scan, n = (pi w^2 / 2) / (spacing r)^2 for
     the 1/e^2 radius w, between 1 and ``beams``, each taken as strong as the one that points at it.
 
+    Raises InputError: as `permissible_pulse`; a spacing or number of beams that is not positive.
+
     Parameters
     ----------
     scan_rate : float
@@ -305,11 +305,6 @@ def scan_hazard_distance(
         s.
     burst : (pulses, rate)
         Pulses of each beam in a scan, and their rate while they are sent, Hz.
-
-    Raises
-    ------
-    InputError
-        As `permissible_pulse`; a spacing or number of beams that is not positive.
 
     Notes
     -----

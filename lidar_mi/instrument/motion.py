@@ -127,10 +127,7 @@ class Trajectory:
     def at(self, time: np.ndarray, speed: float) -> Pose:
         """Departure from straight flight at a speed (m/s) along x.
 
-        Raises
-        ------
-        InputError
-            Times outside of the trajectory.
+        Raises InputError: times outside of the trajectory.
         """
         first, last = self.time[0], self.time[-1]
         # rounding of times in a file

@@ -64,10 +64,7 @@ def depolarization_stderr_bound(
     depolarisation. In single scattering, where all samples of a beam are nearly equal, the error is
     orders of magnitude smaller.
 
-    Parameters
-    ----------
-    samples : int
-        Number n of independent samples of a pixel and gate.
+    ``samples``: number n of independent samples of a pixel and gate.
     """
     s0 = np.asarray(s0, float)
     ratio = linear_depolarization(s0, s1)
@@ -82,10 +79,8 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
     scan has them; from ``S0_stderr`` alone it is `depolarization_stderr_bound`, an upper bound.
     See the attribute ``stderr_is_bound`` of ``depolarization_stderr``.
 
-    Raises
-    ------
-    InputError
-        The scan was rendered without polarisation, or its light was not emitted along e_h.
+    Raises InputError: the scan was rendered without polarisation, or its light was not emitted
+    along e_h.
     """
     if not _emitted_along_e_h(scan):
         raise InputError(
@@ -173,10 +168,7 @@ def multiple_scattering_image(scan: xr.Dataset) -> xr.Dataset:
     not contribute less to another (attribute ``stderr_is_bound``). Where few samples contribute all
     of the multiple scattering, S0_stderr itself is too small for most pixels, and so is the bound.
 
-    Raises
-    ------
-    InputError
-        The scan has no orders above one.
+    Raises InputError: the scan has no orders above one.
     """
     orders = sorted(str(name) for name in scan.data_vars if _ORDER.fullmatch(str(name)))
     if len(orders) < 2 or "order1.S0" not in orders:

@@ -179,6 +179,8 @@ def plan_scans(
 ) -> list[ScanPlan]:
     """The scans of one slab of air from a moving telescope.
 
+    Raises InputError: the telescope would reach the slab, or a distance is not finite.
+
     Parameters
     ----------
     y, z : arrays
@@ -186,11 +188,6 @@ def plan_scans(
     travelled : sequence of float
         Distance of the telescope along x at each scan, m, in the frame of the air. The gates are
         fixed in that frame, so they are nearer by as much. Negative: the air moves away.
-
-    Raises
-    ------
-    InputError
-        The telescope would reach the slab, or a distance is not finite.
     """
     plans = []
     for index, position in enumerate(travelled):

@@ -181,6 +181,9 @@ class ScanTiming(Description):
     ) -> Schedule:
         """Times and places of all beams of one scan.
 
+        Raises InputError: turns longer than the duration, a table of another number of beams, a
+        scanner beyond its limits: then with the smallest duration that is within them.
+
         Parameters
         ----------
         y, z : (columns,), (rows,) arrays
@@ -191,12 +194,6 @@ class ScanTiming(Description):
             Whether a curve is even in angles rather than in places.
         table : Directions
             With pattern ``table``.
-
-        Raises
-        ------
-        InputError
-            Turns longer than the duration, a table of another number of beams, a scanner beyond
-            its limits: then with the smallest duration that is within them.
         """
         if self.pattern in _ROWS:
             schedule = self._rows(y, z, distance)

@@ -73,6 +73,8 @@ def speckle_modes(
     times comes from a wider spot, so M is a lower bound there. ``detector.speckle_modes`` replaces
     all of it; without ``detector.speckle`` M is infinite.
 
+    Raises InputError: the line is narrower than a pulse of ``lidar.pulse_duration`` can have.
+
     Parameters
     ----------
     duration : array
@@ -81,11 +83,6 @@ def speckle_modes(
         Range of the gate, m.
     polarization : array
         Degree of polarisation of the received light, 0 to 1.
-
-    Raises
-    ------
-    InputError
-        The line is narrower than a pulse of ``lidar.pulse_duration`` can have.
     """
     if not detector.speckle:
         return np.inf

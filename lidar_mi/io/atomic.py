@@ -25,6 +25,9 @@ def write_atomically(
     function returns, the file survives a loss of power. Temporary files of killed processes in the
     same folder are removed.
 
+    Raises InputError: the file cannot be written there, or the path is not that of an ordinary
+    file.
+
     Parameters
     ----------
     path : str or Path
@@ -32,11 +35,6 @@ def write_atomically(
         Of the whole file.
     first : callable, optional
         Called when the content is on the disk, before the file is renamed.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written there, or the path is not that of an ordinary file.
     """
     path = Path(path)
     try:

@@ -44,10 +44,8 @@ def locked(folder: str | Path) -> Iterator[None]:
     process ends in any way. The file is removed at the end; one left by a killed process has no
     effect.
 
-    Raises
-    ------
-    InputError
-        Another process or thread has locked the folder; or no file can be locked in it.
+    Raises InputError: another process or thread has locked the folder; or no file can be locked in
+    it.
     """
     path = Path(folder) / _LOCK
     try:

@@ -28,6 +28,9 @@ def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = 
     averaged in float64, unweighted: where red, green and blue are equal, the value is theirs.
     Transparency is ignored. A FITS image is read as stored, first row first.
 
+    Raises InputError: no such file, one that cannot be read, or no such layer or frame; several
+    frames, and none named; values that float64 does not hold exactly.
+
     Parameters
     ----------
     layer : str, optional
@@ -36,12 +39,6 @@ def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = 
         any file the only one.
     frame : int, optional
         Number of the image, from 0; needed where the file has several.
-
-    Raises
-    ------
-    InputError
-        No such file, one that cannot be read, or no such layer or frame; several frames, and none
-        named; values that float64 does not hold exactly.
     """
     path = Path(path)
     frames = _frames(path, layer)
@@ -61,17 +58,14 @@ def read_frames(
     The pages of a TIFF file, the planes of a FITS cube or of an array; one for other files. Colours
     as of `read_pixels`.
 
+    Raises InputError: as `read_pixels`; pages of different size, channels.
+
     Parameters
     ----------
     layer : str, optional
         As of `read_pixels`.
     numbers : sequence of int, optional
         Which images, from 0. Default: all, which must not be channels of one moment.
-
-    Raises
-    ------
-    InputError
-        As `read_pixels`; pages of different size, channels.
     """
     path = Path(path)
     frames = _frames(path, layer)
@@ -149,10 +143,7 @@ def default_layer(path: str | Path) -> str | None:
     What a detector delivered, ``Y_noisy``, comes before ``Y``, which is free of its noise; of any
     other file it is the only layer.
 
-    Raises
-    ------
-    InputError
-        One that cannot be read, or several layers of which one has to be named.
+    Raises InputError: one that cannot be read, or several layers of which one has to be named.
     """
     if not _is_exr(path):
         return None

@@ -18,6 +18,8 @@ LONGEST = 64 << 20
 def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
     """Text of a file, UTF-8, without the mark that some editors set before it.
 
+    Raises InputError: a file that cannot be read, is too long or is not text.
+
     Parameters
     ----------
     path : str or Path
@@ -25,11 +27,6 @@ def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
         Kind of file expected, for the message: "an experiment file".
     longest : int
         Bytes; longer files are not read, nor devices and pipes, which have no end.
-
-    Raises
-    ------
-    InputError
-        A file that cannot be read, is too long or is not text.
     """
     path = Path(path)
     try:

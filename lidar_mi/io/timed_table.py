@@ -31,6 +31,10 @@ def read_timed_table(
     are comments; a NetCDF file has variables of one dimension with the attribute ``units``. Without
     a unit, times and lengths are SI; angles and pressures must have one.
 
+    Raises InputError: a file that cannot be read, no axis, none of the columns, fewer than two
+    rows, a unit that does not convert, a value that is no finite number, an axis that does not
+    increase.
+
     Parameters
     ----------
     path : path
@@ -44,12 +48,6 @@ def read_timed_table(
     -------
     dict of str to (n,) array
         The axis and what of the columns there is.
-
-    Raises
-    ------
-    InputError
-        A file that cannot be read, no axis, none of the columns, fewer than two rows, a unit that
-        does not convert, a value that is no finite number, an axis that does not increase.
     """
     path = Path(path)
     expected = {TIME: "s", **units} if axis == TIME else dict(units)

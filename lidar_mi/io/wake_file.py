@@ -255,6 +255,10 @@ def read_wake(
     nodes (the ground). Stretched axes and staggered variables are interpolated to even nodes, see
     `lidar_mi.atmosphere.regrid`; the attribute ``interpolated`` then states with which error.
 
+    Raises InputError: naming file and variable: unreadable, missing, wrong dims or units, values
+    that are not finite, a tracer or aerosol that is asked for and negative somewhere, axes that are
+    not monotonic, a time or plane that is not there.
+
     Parameters
     ----------
     path : str or Path
@@ -278,13 +282,6 @@ def read_wake(
         float64 on dims (x, y, z), ascending, metres: u, v, w in m s^-1, the tracer in the file's
         unit, aerosol dimensionless, as far as the file has them. Scalar coordinate `time` in s if
         known.
-
-    Raises
-    ------
-    InputError
-        Naming file and variable: unreadable, missing, wrong dims or units, values that are not
-        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not
-        monotonic, a time or plane that is not there.
     """
     path = Path(path)
     table, opposite = _file_names(names, path)

@@ -25,15 +25,12 @@ def read_bts(path: str | Path) -> xr.Dataset:
     A grid of the field at the time t is the plane x = -U t, with U the mean wind at the hub
     (Jonkman, TurbSim user's guide v2.00, annex D). Points of the tower below the grid are omitted.
 
+    Raises InputError: not in this format, cut short, or without mean wind.
+
     Returns
     -------
     xarray.Dataset
         u, v, w (m/s) on (x, y, z), m, ascending; z above the ground. The mean wind is in u.
-
-    Raises
-    ------
-    InputError
-        Not in this format, cut short, or without mean wind.
     """
     path = Path(path)
     data = _content(path)
@@ -71,6 +68,8 @@ def read_mann(
     The axes are those of the generator (Mann, Prob. Eng. Mech. 13, 1998): right-handed, x along the
     wind and ascending, z up. HAWC2 itself turns y and z to the right and down.
 
+    Raises InputError: a file is missing, or its size is not that of the shape.
+
     Parameters
     ----------
     path : str or Path
@@ -86,11 +85,6 @@ def read_mann(
     -------
     xarray.Dataset
         u, v, w (m/s) on (x, y, z), m; without mean wind.
-
-    Raises
-    ------
-    InputError
-        A file is missing, or its size is not that of the shape.
     """
     components = []
     for component in mann_files(path):
@@ -108,10 +102,7 @@ def read_mann(
 def mann_files(path: str | Path) -> list[Path]:
     """The files of u, v and w of a Mann box, by that of u.
 
-    Raises
-    ------
-    InputError
-        Its name does not end with u.
+    Raises InputError: its name does not end with u.
     """
     path = Path(path)
     if not path.stem.endswith("u"):

@@ -33,6 +33,8 @@ def extrude(
     the gate's planes and the outermost nodes. The plane is extended by that much (the outermost
     values repeated), so that the whole gate is filled with it.
 
+    Raises InputError: beams so wide that the extended plane would not fit into the memory.
+
     Parameters
     ----------
     plane : (z, y) or (time, z, y) array
@@ -40,11 +42,6 @@ def extrude(
         The scan from farthest away.
     scans : sequence of ScanPlan
         All scans that have beams of their own: these may be more oblique, or miss the plane.
-
-    Raises
-    ------
-    InputError
-        Beams so wide that the extended plane would not fit into the memory.
     """
     radius = beam_reach(lidar, plan.gate_stop)
     slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre

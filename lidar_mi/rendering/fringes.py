@@ -40,6 +40,9 @@ def render_fringes(
 
     In Mitsuba's variant in force.
 
+    Raises InputError: a velocity that is not finite, or a lens that is too fast or has too wide a
+    field.
+
     Parameters
     ----------
     line : lidar_mi.atmosphere.scattering.line.Line
@@ -56,11 +59,6 @@ def render_fringes(
     xr.Dataset
         S0 ... S3 and S0_stderr, dims (y, x) from the top left, received energy over the energy the
         source sends through the stop; one image at a time, as soon as it is rendered.
-
-    Raises
-    ------
-    InputError
-        A velocity that is not finite, or a lens that is too fast or has too wide a field.
     """
     import mitsuba as mi
 
@@ -172,10 +170,7 @@ def lens_surfaces(
 ) -> np.ndarray | None:
     """Surfaces of a real lens as the plugin `ccd` takes them; None: it is ideal.
 
-    Raises
-    ------
-    InputError
-        A lens that is too fast or has too wide a field.
+    Raises InputError: a lens that is too fast or has too wide a field.
     """
     if settings.lens == "ideal":
         return None
@@ -194,10 +189,7 @@ def _field(camera: FringeCamera) -> float:
 def render_image(scene: Any, samples: int = 0, seed: int = 0) -> xr.Dataset:
     """Render a loaded scene of a `ccd` with the `fringes` integrator and describe the image.
 
-    Parameters
-    ----------
-    samples : int
-        Light paths per pixel; 0: as in the scene.
+    ``samples``: light paths per pixel; 0: as in the scene.
     """
     import mitsuba as mi
 

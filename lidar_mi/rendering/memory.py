@@ -60,10 +60,7 @@ def backend_of(variant: str) -> str:
 def image_bytes(beams: int, gates: int, quantities: int) -> float:
     """Bytes of an image while it is rendered, copied once, and written.
 
-    Parameters
-    ----------
-    quantities : int
-        Of every beam and gate: Stokes components, errors, orders.
+    ``quantities``: of every beam and gate: Stokes components, errors, orders.
     """
     return 4.0 * beams * gates * quantities * 4
 
@@ -73,10 +70,7 @@ def check_memory(
 ) -> None:
     """Refuse to exceed the limit of the memory.
 
-    Raises
-    ------
-    InputError
-        The memory needed is above the limit.
+    Raises InputError: the memory needed is above the limit.
     """
     allowed = ceiling(memory)
     if needed > allowed:

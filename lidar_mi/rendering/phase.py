@@ -73,6 +73,9 @@ def scatterer(
 ) -> Scatterer:
     """Phase function and albedo of an experiment's air.
 
+    Raises InputError: a table that does not exist, that cannot be read or is for another
+    wavelength; an aerosol without a table at this one.
+
     Parameters
     ----------
     scattering : lidar_mi.schema.scattering.Scattering
@@ -83,12 +86,6 @@ def scatterer(
         Of the laser, m; aerosols and molecules scatter accordingly.
     notice : callable, optional
         Called with the progress of a table that must be computed first.
-
-    Raises
-    ------
-    InputError
-        A table that does not exist, that cannot be read or is for another wavelength; an aerosol
-        without a table at this one.
     """
     albedo = 1.0
     match scattering.phase:
@@ -151,10 +148,7 @@ def table_files(scattering: Keys, folder: str | Path = ".") -> dict[str, Path]:
 
     They are searched in the folder, then among those of the package.
 
-    Raises
-    ------
-    InputError
-        One of them does not exist.
+    Raises InputError: one of them does not exist.
     """
     named = {f"scattering.parts.{k}.table": part for k, part in enumerate(scattering.parts or ())}
     files = {}

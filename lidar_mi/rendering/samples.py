@@ -52,11 +52,8 @@ class Samples(NamedTuple):
 def noise_ratio(scan: xr.Dataset) -> np.ndarray:
     """Variance of the simulation's noise over that of the detector's, (gate, z, y).
 
-    Parameters
-    ----------
-    scan : xr.Dataset
-        With ``S0_stderr``, of common random numbers ``S0_pair_stderr``, which counts then, and
-        ``S0_noise_std``. NaN where the detector has no noise.
+    ``scan``: with ``S0_stderr``, of common random numbers ``S0_pair_stderr``, which counts then,
+    and ``S0_noise_std``. NaN where the detector has no noise.
     """
     simulated, detected = (
         error.transpose("gate", "z", "y").values.astype(float) ** 2

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,11 +22,8 @@ def draw_comparison(
 ) -> list[Drawn]:
     """One row per variant: its first image, the w retrieved from the pair, and its error.
 
-    Parameters
-    ----------
-    rows : mapping of variant to (image, winds, cores)
-        Attenuated backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag;
-        positions (y, z) of the true cores, m.
+    ``rows`` are (image, winds, cores) by variant: attenuated backscatter (m^-1 sr^-1) and winds on
+    (z, y), these with w_true and flag; positions (y, z) of the true cores, m.
     """
     figure = Figure(figsize=(19, 4.0 * len(rows)), layout="compressed")
     axes = figure.subplots(len(rows), 3, squeeze=False)
@@ -46,7 +44,7 @@ def draw_comparison(
             wind["flag"] == 0,
             {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"},
         )
-        columns = (
+        columns: tuple[tuple[xr.DataArray, dict[str, Any], str, str], ...] = (
             (
                 1e6 * image.sel(place),
                 {"cmap": "cividis", "vmin": low, "vmax": high},

@@ -210,10 +210,7 @@ class Boundary:
 def boundaries(margin: Interval, logarithmic: bool) -> list[Boundary]:
     """Where a margin along one knob changes its sign, between points linear in the knob's scale.
 
-    Parameters
-    ----------
-    margin : Interval
-        On one dimension with a coordinate in ascending or descending order.
+    ``margin``: on one dimension with a coordinate in ascending or descending order.
     """
     (knob,) = margin.mean.dims
     order = np.argsort(margin.mean[knob].values)

@@ -95,10 +95,8 @@ def read_requirements(
 ) -> dict[tuple[str, str], RequirementTable]:
     """Requirement tables by (application, phase of flight), from a YAML file like the shipped one.
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read, a row or a limit that is not known, a value with a wrong unit.
+    Raises InputError: a file that cannot be read, a row or a limit that is not known, a value with
+    a wrong unit.
     """
     data = read_yaml(str(path), "a requirement table")
     tables = {}

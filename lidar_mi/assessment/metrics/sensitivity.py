@@ -71,11 +71,8 @@ class SobolIndices:
 def unit_cube(knobs: Mapping[str, ArrayLike], logarithmic: Sequence[str] = ()) -> Array:
     """Knobs mapped to 0 ... 1 by their range in the sample, (point, knob).
 
-    Raises
-    ------
-    InputError
-        Knobs of different lengths, a value that is not finite, a logarithmic knob with a value
-        that is not positive, a knob that does not vary.
+    Raises InputError: knobs of different lengths, a value that is not finite, a logarithmic knob
+    with a value that is not positive, a knob that does not vary.
     """
     columns = []
     for name, samples in knobs.items():
@@ -103,6 +100,8 @@ def sobol_indices(
     The knobs are independent and uniform (or uniform in their logarithm) between the smallest and
     the largest of the sample.
 
+    Raises InputError: see `unit_cube`; also values of another number of points.
+
     Parameters
     ----------
     knobs : mapping of str to array (point,)
@@ -110,11 +109,6 @@ def sobol_indices(
         The metric. NaN: no value. The mean over the members of a point is analysed.
     logarithmic : sequence of str
         Knobs that were sampled in their logarithm.
-
-    Raises
-    ------
-    InputError
-        See `unit_cube`; also values of another number of points.
 
     Notes
     -----

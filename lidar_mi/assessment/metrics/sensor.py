@@ -103,10 +103,8 @@ def without_skill(metrics: Mapping[str, float]) -> list[str]:
 def line_metrics(lines: xr.Dataset) -> dict[str, float]:
     """Number of lines of sight with a velocity, and their errors; m/s.
 
-    Parameters
-    ----------
-    lines : xr.Dataset, dim (line)
-        ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN without a velocity.
+    ``lines``, dim (line): ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN without a
+    velocity.
     """
     error = (lines["v_los"] - lines["v_los_true"]).values
     metrics: dict[str, float] = {
@@ -144,11 +142,8 @@ def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) ->
 def limit_metrics(mean_squares: Mapping[str, float]) -> dict[str, float]:
     """Error budget of u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.fraction_u``.
 
-    Parameters
-    ----------
-    mean_squares : mapping of str to float
-        Mean square error of u (m^2 s^-2): with all causes as "", without each of them, and
-        "sampling", the remainder without all. Empty: not known.
+    ``mean_squares``: mean square error of u (m^2 s^-2): with all causes as "", without each of
+    them, and "sampling", the remainder without all. Empty: not known.
     """
     if not mean_squares:
         return {}

@@ -116,10 +116,7 @@ def largest_parts(metrics: Mapping[str, xr.DataArray]) -> xr.DataArray | None:
 def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> list[SimulationPart]:
     """The parts in winds from the most complete images, by every method with known errors.
 
-    Parameters
-    ----------
-    metrics : mapping of str to float
-        Of a run, with those of `simulation_metrics`; empty without them.
+    ``metrics``: of a run, with those of `simulation_metrics`; empty without them.
     """
     place = far_from_cores(metrics, "true_wind.", "rms_")
     parts = []

@@ -96,10 +96,7 @@ class AirAlongPath:
     def vortices(self, x: float, time: float) -> tuple[Vortex, Vortex]:
         """Port and starboard vortex in the plane x at a time.
 
-        Raises
-        ------
-        InputError
-            There is no wake, or it lies in the plane.
+        Raises InputError: there is no wake, or it lies in the plane.
         """
         if self.wake is None:
             raise InputError("encounter.air.wake: false leaves no vortices; expected true")

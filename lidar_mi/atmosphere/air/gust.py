@@ -18,6 +18,8 @@ _TOWARDS = {"up": (2, 1), "down": (2, -1), "left": (1, 1), "right": (1, -1)}
 class Gust:
     """U/2 (1 - cos(pi s / H)) for 0 <= s <= 2 H, across the path; the same at every y and z.
 
+    Raises InputError: numbers out of range, another direction.
+
     Parameters
     ----------
     direction : {"up", "down", "left", "right"}
@@ -28,11 +30,6 @@ class Gust:
         Where it begins, along x, m.
     speed : float
         U, the largest, m/s true airspeed.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range, another direction.
     """
 
     direction: Direction

@@ -83,17 +83,14 @@ def flight_profile_alleviation(
     F_g = (F_gz + F_gm)/2 with F_gz = 1 - Z_mo / 250000 ft and F_gm = sqrt(R2 tan(pi R1/4)); it
     grows linearly with the altitude to 1 at Z_mo.
 
+    Raises InputError: weights or a maximum altitude out of range.
+
     Parameters
     ----------
     altitude, maximum_altitude : float
         Of the flight, and Z_mo at which the aeroplane operates; m.
     landing_weight, zero_fuel_weight : float
         R1 and R2: the maximum weights over that of take-off, above 0, at most 1.
-
-    Raises
-    ------
-    InputError
-        Weights or a maximum altitude out of range.
     """
     for name, value in (("landing_weight", landing_weight), ("zero_fuel_weight", zero_fuel_weight)):
         if not 0 < value <= 1:
@@ -118,10 +115,7 @@ def design_gust_speed(altitude: float, gradient: float, alleviation: float = 1.0
 
     The altitude (m) is in the standard atmosphere; the gradient H is in m, F_g is the alleviation.
 
-    Raises
-    ------
-    InputError
-        A gradient or an alleviation factor out of range.
+    Raises InputError: a gradient or an alleviation factor out of range.
     """
     low, high = GRADIENTS
     # a gradient in rounded metres is within the range in feet

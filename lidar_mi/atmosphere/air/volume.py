@@ -24,10 +24,7 @@ def divergence_fraction(flow: xr.Dataset) -> float:
 
     0 for a field without divergence, 0.577 for independent isotropic noise in each component.
 
-    Parameters
-    ----------
-    flow : xarray.Dataset
-        u, v and w on (x, y, z), even.
+    ``flow``: u, v and w on (x, y, z), even.
     """
     axes = [flow[name].values for name in "xyz"]
     gradients = np.array(
@@ -46,6 +43,8 @@ class AirVolume:
     that the mean wind carries to the same instant. Beyond its edges the wind is that at the edge:
     `missing` says where places are outside.
 
+    Raises InputError: fewer nodes, or a field with divergence.
+
     Parameters
     ----------
     flow : xarray.Dataset
@@ -59,11 +58,6 @@ class AirVolume:
         At which the mean wind is that of the frame, m.
     largest_divergence : float
         Rms of the divergence over that of the velocity gradient, at most.
-
-    Raises
-    ------
-    InputError
-        Fewer nodes, or a field with divergence.
     """
 
     flow: xr.Dataset

@@ -116,10 +116,7 @@ class Aerosol:
     def refractive_index(self, wavelength: float) -> complex:
         """Refractive index at a wavelength in m.
 
-        Raises
-        ------
-        InputError
-            Outside the wavelengths that `index` gives.
+        Raises InputError: outside the wavelengths that `index` gives.
         """
         nodes = [node for node, _ in self.index]
         # a relative 1e-9 forgives the rounding of "532 nm"
@@ -253,6 +250,8 @@ def changed(
 ) -> Aerosol:
     """A named aerosol with some of its numbers changed; what is None stays.
 
+    Raises InputError: unknown name, a number out of range, or a change without a new name.
+
     Parameters
     ----------
     name : str
@@ -266,11 +265,6 @@ def changed(
     **sizes
         ``radius`` (median of a log-normal, mode of a modified gamma distribution), ``smallest``,
         ``largest`` in m; ``sigma`` of a log-normal one.
-
-    Raises
-    ------
-    InputError
-        Unknown name, a number out of range, or a change without a new name.
     """
     particles = aerosol(name)
     numbers = {"elongation": elongation, "number_density": number_density}

@@ -90,10 +90,7 @@ class Line:
         place better than to 1 / (N information)^(1/2) (Cramer-Rao), which an ideal spectral
         analyser does.
 
-        Raises
-        ------
-        InputError
-            A line with a monochromatic part, whose place has no error.
+        Raises InputError: a line with a monochromatic part, whose place has no error.
         """
         if not self.sigmas.all():
             raise InputError("line.sigmas: 0 Hz is not allowed; expected a line with a width")
@@ -170,10 +167,7 @@ def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -
     to 0.85 % of the peak; the missing wings leave an rms 0.4 % (y = 0.17) to 1.5 % (y = 1) below
     that of molecules without collisions, which it should equal.
 
-    Raises
-    ------
-    InputError
-        y beyond 1.027, where the fit ends.
+    Raises InputError: y beyond 1.027, where the fit ends.
     """
     _check("pressure", pressure, pressure >= 0, "0 Pa or more")
     unit = math.sqrt(2) * rayleigh_width(wavelength, temperature) / _FWHM

@@ -52,6 +52,8 @@ def make_table(
 ) -> ScatteringTable:
     """The scattering table of an aerosol: averages over sizes and, for spheroids, orientations.
 
+    Raises InputError: unknown name, no refractive index at this wavelength, ``scatrs`` missing.
+
     Parameters
     ----------
     particles : Aerosol or str
@@ -63,11 +65,6 @@ def make_table(
         ratio has converged to 0.5 %.
     notice : callable, optional
         Called with a text that names the work and the fraction of it that is done.
-
-    Raises
-    ------
-    InputError
-        Unknown name, no refractive index at this wavelength, ``scatrs`` missing.
 
     Notes
     -----

@@ -31,6 +31,9 @@ _TOLERANCE = 1e-5
 class ScatteringTable:
     """What one kind of particle, or a mixture, does to light of one wavelength.
 
+    Raises InputError: a number out of range, or a matrix that no collection of particles can have
+    (`check`).
+
     Parameters
     ----------
     wavelength : float
@@ -47,11 +50,6 @@ class ScatteringTable:
         Particles per m^3 that go with this table.
     provenance : str
         One line: the source of the numbers.
-
-    Raises
-    ------
-    InputError
-        A number out of range, or a matrix that no collection of particles can have (`check`).
     """
 
     name: str
@@ -214,10 +212,7 @@ def rayleigh_table(
 ) -> ScatteringTable:
     """The scattering matrix of molecules (Hansen & Travis 1974, eqs. 2.15-2.17).
 
-    Parameters
-    ----------
-    depolarization : float
-        Depolarisation factor of natural light at 90 degrees, 0 <= d < 0.5.
+    ``depolarization``: depolarisation factor of natural light at 90 degrees, 0 <= d < 0.5.
 
     Notes
     -----

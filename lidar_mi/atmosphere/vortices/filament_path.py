@@ -115,11 +115,8 @@ class FilamentsAlongPath:
         Their places are where the lines cross the plane; cores are given by the circle of their
         area.
 
-        Raises
-        ------
-        InputError
-            A plane that does not cut both vortices once: between rings, along their ends, or along
-            the wake.
+        Raises InputError: a plane that does not cut both vortices once: between rings, along their
+        ends, or along the wake.
         """
         pair = self.pair
         check_cut(pair.axes[0], pair.crossing_angle)

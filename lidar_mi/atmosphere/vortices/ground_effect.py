@@ -33,6 +33,8 @@ class PairAboveGround:
     section 155): it sinks to half of its separation and spreads. The boundary layer at the
     ground, whose vorticity makes real vortices rise again, is not there.
 
+    Raises InputError: a pair that is no pair, or below the ground.
+
     Parameters
     ----------
     circulation, separation, core_radius : float
@@ -49,11 +51,6 @@ class PairAboveGround:
         `Crosswind`.
     ground : bool
         With images.
-
-    Raises
-    ------
-    InputError
-        A pair that is no pair, or below the ground.
     """
 
     circulation: float

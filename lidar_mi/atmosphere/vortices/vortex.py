@@ -25,6 +25,9 @@ LAMB_OSEEN_CONSTANT = 1.2564
 class Vortex:
     """A straight vortex along x.
 
+    Raises InputError: for a core radius that is not positive, values that are not finite, an
+    unknown model.
+
     Parameters
     ----------
     circulation : float
@@ -35,11 +38,6 @@ class Vortex:
         Position of the axis, m.
     model : {"lamb_oseen", "burnham_hallock"}
         Swirl profile, see `tangential_speed`.
-
-    Raises
-    ------
-    InputError
-        For a core radius that is not positive, values that are not finite, an unknown model.
     """
 
     circulation: float
@@ -128,10 +126,7 @@ def vortex_pair(
     down. Separation and core radius default to the paper's 47.1 m and 3 m. Both are about (y, z);
     lengths are in m, Gamma_0 > 0 in m^2 s^-1.
 
-    Raises
-    ------
-    InputError
-        For a separation or circulation that is not positive.
+    Raises InputError: for a separation or circulation that is not positive.
     """
     _check_pair(circulation, separation)
     half = separation / 2

@@ -72,10 +72,7 @@ def cut_radius(core_radius: float, tangent: np.ndarray) -> float:
 def check_cut(along: np.ndarray, crossing_angle: float) -> None:
     """Whether planes across the path cut a wake with this axis.
 
-    Raises
-    ------
-    InputError
-        A wake that lies in the plane.
+    Raises InputError: a wake that lies in the plane.
     """
     if along[0] < _LEAST_ALONG:
         raise InputError(
@@ -236,10 +233,7 @@ class PairAlongPath:
         Their places are where the axes cross the plane. The circulation through the plane is that
         across the axis (Stokes); the core, an ellipse there, is given by the circle of its area.
 
-        Raises
-        ------
-        InputError
-            A wake that lies in the plane.
+        Raises InputError: a wake that lies in the plane.
         """
         along, left, _ = self.axes
         check_cut(along, self.crossing_angle)

@@ -56,6 +56,9 @@ def one_period(
         Its last ``length`` is blended into the first one by a raised cosine, and the period is
         shorter by that. Differences of the cores are blurred, and differences of u make divergence.
 
+    Raises InputError: a volume of fewer than 4 planes; one that is not periodic, where that is
+    refused; one that is shorter than twice ``length``.
+
     Parameters
     ----------
     flow : xarray.Dataset
@@ -63,12 +66,6 @@ def one_period(
     ends : {"mirror", "blend", "refuse"}
     length : float
         m.
-
-    Raises
-    ------
-    InputError
-        A volume of fewer than 4 planes; one that is not periodic, where that is refused; one that
-        is shorter than twice ``length``.
     """
     count = flow.sizes["x"]
     if count == 1:

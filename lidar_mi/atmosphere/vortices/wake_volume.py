@@ -185,10 +185,7 @@ class VolumeAlongPath:
         Their places are where the lines of the cores cross the plane; cores are given by the circle
         of their area.
 
-        Raises
-        ------
-        InputError
-            A wake that lies in the plane.
+        Raises InputError: a wake that lies in the plane.
         """
         check_cut(self.axes[0], self.crossing_angle)
         centre, rotation = self.centre_at(time), np.stack(self.axes)

@@ -45,6 +45,8 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
     second state. The wing is in the plane `arrival` seconds after the first scan, `lead` seconds
     after the delivery.
 
+    Raises InputError: too few slabs; an input that is zero, as in air at rest.
+
     Parameters
     ----------
     flights : sequence of SensorSamples
@@ -56,11 +58,6 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
         ``A``, ``B``, ``C``, ``D``, ``dt``, ``noise_covariance``, ``loss_transition``; filters,
         noise and spectra of every axis with their standard errors. Each variable has units and a
         meaning.
-
-    Raises
-    ------
-    InputError
-        Too few slabs; an input that is zero, as in air at rest.
     """
     one = flights[0]
     # margins without an estimate part the flights, and a row without a gust

@@ -112,6 +112,9 @@ class FilterFit:
 def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
     """The filter and its noise, with the number of lags that the data support.
 
+    Raises InputError: fewer than `LEAST_SAMPLES` samples that have all inputs and outputs before
+    them.
+
     Parameters
     ----------
     output, value : ndarray, shape (n,)
@@ -119,11 +122,6 @@ def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
         `BEFORE` samples or more without output.
     after : int
         Samples after a sample that may have a weight.
-
-    Raises
-    ------
-    InputError
-        Fewer than `LEAST_SAMPLES` samples that have all inputs and outputs before them.
     """
     # all models are compared on the samples that the longest one has
     usable = np.isfinite([_delayed(output, k) for k in range(MOST_LAGS + 1)]).all(axis=0)
@@ -146,10 +144,8 @@ def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
 def fit_process(values: np.ndarray) -> tuple[np.ndarray, float]:
     """An autoregressive model of a process: its lags, and the variance of its innovations.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Without a mean; NaN between two records. There are many more than `MOST_PROCESS_LAGS`.
+    ``values``, shape (n,): without a mean; NaN between two records. There are many more than
+    `MOST_PROCESS_LAGS`.
     """
     before = [_delayed(values, k) for k in range(MOST_PROCESS_LAGS + 1)]
     usable = np.isfinite(before).all(axis=0)

@@ -58,10 +58,7 @@ class LossChain:
 def loss_chain(records: Sequence[np.ndarray]) -> LossChain:
     """The chain of several records.
 
-    Parameters
-    ----------
-    records : sequence of ndarray of bool, shape (n,)
-        True where an estimate is lost, slab by slab.
+    ``records``, each (n,): true where an estimate is lost, slab by slab.
     """
     pairs = np.zeros((2, 2), int)
     triples = np.zeros((2, 2, 2), int)

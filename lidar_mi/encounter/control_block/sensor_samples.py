@@ -81,10 +81,7 @@ def flights_in(folder: str | Path) -> list[Path]:
 def samples_of(folder: Path) -> SensorSamples:
     """The slabs of a flight.
 
-    Raises
-    ------
-    InputError
-        A folder without a flight, or one whose slabs have no wind vectors.
+    Raises InputError: a folder without a flight, or one whose slabs have no wind vectors.
     """
     marker = folder / RECORD
     experiment = check(read_record(folder)["experiment"], str(marker)).read_from(folder)

@@ -65,6 +65,8 @@ def combined_in_flight(
 ) -> xr.Dataset:
     """u, v, w of a slab from its images' wind and its lines of sight.
 
+    Raises InputError: no valid vector or no line of sight on the grid.
+
     Parameters
     ----------
     wind : Dataset, dims (z, y)
@@ -83,11 +85,6 @@ def combined_in_flight(
     Dataset, dims (z, y)
         From `combine`, path frame. Gates are fixed in the air, but air that moves along x within
         its slab moves in the images, since beams are oblique: `combine` subtracts this motion.
-
-    Raises
-    ------
-    InputError
-        No valid vector or no line of sight on the grid.
     """
     axes = {axis: wind.variables[axis] for axis in ("z", "y")}
     # the lines start at their telescope: so does the frame in which both are combined

@@ -153,10 +153,8 @@ class DopplerScans:
 def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
     """The Doppler lidar of an encounter, checked; None where its experiment has no `sensor`.
 
-    Raises
-    ------
-    InputError
-        Times of lines, a range that is not that of the slabs, an aircraft too fast for the etalon.
+    Raises InputError: times of lines, a range that is not that of the slabs, an aircraft too fast
+    for the etalon.
     """
     sensor = experiment.sensor
     if sensor is None:
@@ -185,10 +183,7 @@ def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
 def at_the_slabs(experiment: Experiment, gates: Gates) -> Experiment:
     """An encounter whose Doppler lidar, if there is one, has the slabs' range.
 
-    Raises
-    ------
-    InputError
-        Its own range is another one.
+    Raises InputError: its own range is another one.
     """
     doppler = experiment.fringes
     if experiment.sensor is None or doppler is None:

@@ -78,10 +78,7 @@ class Gates:
 
         The middle of the last gate's image is at ``window``: y and z about the aircraft, m.
 
-        Raises
-        ------
-        InputError
-            An aircraft in or behind the nearer slab.
+        Raises InputError: an aircraft in or behind the nearer slab.
         """
         start = self.look_ahead - self.stride - ahead
         if not start > 0:
@@ -109,11 +106,8 @@ class Gates:
 def gates_of(experiment: Experiment) -> Gates:
     """The gates of an encounter.
 
-    Raises
-    ------
-    InputError
-        No encounter, a look-ahead within the distance flown in a period, beams that are not aimed
-        at nodes at once, through planar gates.
+    Raises InputError: no encounter, a look-ahead within the distance flown in a period, beams that
+    are not aimed at nodes at once, through planar gates.
     """
     encounter, scan = encounter_of(experiment), experiment.scan
     for key, given, expected in (
@@ -284,10 +278,7 @@ class Air:
 def air_of(experiment: Experiment, gates: Gates) -> Air:
     """The air of an encounter: its texture has the longest period along the path that memory holds.
 
-    Raises
-    ------
-    InputError
-        A texture finer than its nodes.
+    Raises InputError: a texture finer than its nodes.
     """
     along_path, wake = air_along_path(experiment), experiment.wake
     assert wake is not None  # `air_along_path` refuses its absence

@@ -43,10 +43,7 @@ class ImageStore:
     def stored(self, part: str) -> xr.Dataset | None:
         """A rendered image, without a detector's noise; None: it is not there.
 
-        Raises
-        ------
-        InputError
-            It was made by another experiment or version.
+        Raises InputError: it was made by another experiment or version.
         """
         path = self.path(part)
         if not path.is_file():

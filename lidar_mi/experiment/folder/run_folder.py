@@ -109,11 +109,8 @@ class RunFolder:
     def claimed(self, overwrite: bool) -> Iterator[None]:
         """Lock the folder for this run, keeping images of the same experiment.
 
-        Raises
-        ------
-        InputError
-            Another run is using the folder; it holds images of another experiment or version, and
-            ``overwrite`` is not set; or it is no run folder.
+        Raises InputError: another run is using the folder; it holds images of another experiment or
+        version, and ``overwrite`` is not set; or it is no run folder.
         """
         with held(self.path, "run folder"):
             self._begin(overwrite)
@@ -292,10 +289,7 @@ def write_result(folder: Path, name: str, value: Any, experiment: str, signature
 def held(folder: Path, kind: str) -> Iterator[None]:
     """Create and lock a folder with a record; one with other contents is refused.
 
-    Raises
-    ------
-    InputError
-        Another process uses the folder, or it holds files but no record.
+    Raises InputError: another process uses the folder, or it holds files but no record.
     """
     refuse_strangers(folder, RECORD, kind)
     make_folder(folder)
@@ -308,10 +302,7 @@ def held(folder: Path, kind: str) -> Iterator[None]:
 def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
     """Refuse a folder that is not empty and lacks a marker file.
 
-    Raises
-    ------
-    InputError
-        The folder is not empty, and the marker is not in it.
+    Raises InputError: the folder is not empty, and the marker is not in it.
     """
     if not (folder / marker).is_file() and not is_free(folder):
         raise InputError(f"{folder}: is no {kind}; expected an empty or a new one (-o DIR)")

@@ -60,6 +60,8 @@ def sections(
 ) -> Iterator[Section]:
     """Titled tables of an experiment's instruments and the observed air; nothing is written.
 
+    Raises InputError: anything that a run would refuse before it starts.
+
     Parameters
     ----------
     search_path : path
@@ -71,11 +73,6 @@ def sections(
     sampled : bool
         Say of Monte Carlo samples, where there is a detector, how many are chosen and what their
         noise is relative to its own, which takes an image of few samples.
-
-    Raises
-    ------
-    InputError
-        Anything that a run would refuse before it starts.
     """
     # processor time, which other programs do not affect
     start = time.process_time()

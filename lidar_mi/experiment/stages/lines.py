@@ -76,10 +76,7 @@ def requirement_tables(
 ) -> Mapping[tuple[str, str], RequirementTable]:
     """The tables that the lidars are compared with, as `read_requirements` gives them.
 
-    Raises
-    ------
-    InputError
-        A requirement table that is missing or not one.
+    Raises InputError: a requirement table that is missing or not one.
     """
     path = sensor.requirements if sensor else None
     if path:
@@ -114,11 +111,8 @@ def states_of_wind(platform: Platform, slab_wind: xr.Dataset, flows: Flows) -> x
 def check_lines(line_scan: LineScan, scan: Scan, rings: Rings) -> None:
     """Check that both lidars observe the same air, in the Doppler lidar's velocity range.
 
-    Raises
-    ------
-    InputError
-        Lidars that do not observe the same slab, lines that leave the wake, speeds beyond the
-        unambiguous range.
+    Raises InputError: lidars that do not observe the same slab, lines that leave the wake, speeds
+    beyond the unambiguous range.
     """
     sensor, states, speed = line_scan.sensor, line_scan.states, line_scan.platform.speed
     reference_frames(sensor.pulses, line_scan.doppler.reference.every, PULSES)

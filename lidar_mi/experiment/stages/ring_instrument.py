@@ -34,17 +34,14 @@ def ring_model(
 ) -> "RingModel":
     """The model of a line's rings for the retrieval.
 
+    Raises InputError: a mirror that does not transmit, lines of different wavelengths.
+
     Parameters
     ----------
     line : Line, or function of the temperature (K) that returns one
         Of air at rest, or of the laser.
     temperatures : sequence of float
         K, ascending; with them ``line`` is a function and the temperature a parameter of the fit.
-
-    Raises
-    ------
-    InputError
-        A mirror that does not transmit, lines of different wavelengths.
     """
     from lidar_mi.retrieval.rings.model import RingModel
 

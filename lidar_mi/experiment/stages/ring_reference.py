@@ -28,10 +28,8 @@ WANTED = 0.5  # m/s, error for which the required scrambling is stated
 def reference_frames(averaged: int, every: int, key: str) -> tuple[int, int]:
     """Frames of the laser in an average of pulses, and averages that share one frame.
 
-    Raises
-    ------
-    InputError
-        An average that is neither a multiple nor a divisor of ``every``; ``key`` is its name.
+    Raises InputError: an average that is neither a multiple nor a divisor of ``every``; ``key`` is
+    its name.
     """
     if averaged % every and every % averaged:
         raise InputError(

@@ -52,11 +52,8 @@ def check_volume(
 ) -> None:
     """Check that a wind in three dimensions can be retrieved.
 
-    Raises
-    ------
-    InputError
-        A wake without wind along x, gates that reach beyond it, fewer gates or beams than a window
-        has voxels.
+    Raises InputError: a wake without wind along x, gates that reach beyond it, fewer gates or beams
+    than a window has voxels.
     """
     if "u" not in flows[0]:
         raise InputError("wake.file: no wind along x (u) in it; expected u, v and w for volume")

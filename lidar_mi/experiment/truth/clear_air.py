@@ -42,12 +42,9 @@ def clear_air(
 ) -> ClearAir:
     """Molecules of the air, as stated or from the site's pressure and temperature.
 
-    Raises
-    ------
-    InputError
-        A sounding that cannot be used, that does not reach the site's altitude, or whose pressure
-        there is below half or above twice that of the standard atmosphere; a wavelength at
-        which the refractive index of air is not known.
+    Raises InputError: a sounding that cannot be used, that does not reach the site's altitude, or
+    whose pressure there is below half or above twice that of the standard atmosphere; a wavelength
+    at which the refractive index of air is not known.
     """
     molecules = wake_extinction.molecules
     if molecules == 0:

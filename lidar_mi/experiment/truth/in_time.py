@@ -28,10 +28,7 @@ def state_times(observation: Observation, flows: Flows, times: np.ndarray) -> np
 
     The middle one is that of the middle of the scan.
 
-    Raises
-    ------
-    InputError
-        More states than the memory holds.
+    Raises InputError: more states than the memory holds.
     """
     flow = mean_flow(flows)
     first, last = float(np.min(times)), float(np.max(times))

@@ -118,11 +118,8 @@ def passing_wake(
 ) -> PassingWake:
     """The air of an experiment until a time (s).
 
-    Raises
-    ------
-    InputError
-        A file without two vortices in its plane; keys that it does not allow; turbulence out of
-        range.
+    Raises InputError: a file without two vortices in its plane; keys that it does not allow;
+    turbulence out of range.
     """
     passage, air = doppler.passage, doppler.air
     mean = _mean(air)

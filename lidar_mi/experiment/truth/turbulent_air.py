@@ -9,6 +9,8 @@ from lidar_mi.schema import air as schema
 def turbulent_air(keys: schema.Turbulence, height: float, seed: int, section: str) -> Turbulence:
     """Turbulence at a height above the ground, m.
 
+    Raises InputError: a shortest wavelength above a tenth of the length.
+
     Parameters
     ----------
     height : float
@@ -17,11 +19,6 @@ def turbulent_air(keys: schema.Turbulence, height: float, seed: int, section: st
         Of the experiment, where the section has none.
     section : str
         That has the key ``turbulence``, for messages.
-
-    Raises
-    ------
-    InputError
-        A shortest wavelength above a tenth of the length.
     """
     sigma, length = turbulence_scales(keys, height)
     if keys.shortest > length / 10:

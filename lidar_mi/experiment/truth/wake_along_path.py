@@ -38,10 +38,7 @@ def encounter_of(experiment: Experiment) -> Encounter:
 def wake_along_path(experiment: Experiment) -> WakeAlongPath:
     """Wind and vortices along the flight path.
 
-    Raises
-    ------
-    InputError
-        No encounter, or a wake that is not known along its axis.
+    Raises InputError: no encounter, or a wake that is not known along its axis.
     """
     encounter, wake = encounter_of(experiment), experiment.wake
     if wake is not None and wake.file:

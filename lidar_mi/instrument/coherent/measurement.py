@@ -51,6 +51,8 @@ def measured_lines(
     velocities uniform over the bandwidth, velocities are uniform, and flagged. Gates that overlap
     share their samples: noise at the distance x correlates by 1 - x / gate length.
 
+    Raises InputError: a signal that is not above 0, or of another number of gates.
+
     Parameters
     ----------
     wind, scan, lidar, resolution, signal
@@ -67,11 +69,6 @@ def measured_lines(
         `spectral_width` (of the pulse and of the wind within the gate), `snr`, `flag` (1: no
         signal);
         `azimuth` and `elevation` in degrees.
-
-    Raises
-    ------
-    InputError
-        A signal that is not above 0, or of another number of gates.
     """
     ranges = lidar.ranges
     ratio = np.asarray(snr(ranges) if callable(snr) else snr, float)

@@ -34,10 +34,7 @@ def assembled(
 
     Each scan has its file's name and its flags (lines, gates); thresholds become attributes.
 
-    Raises
-    ------
-    InputError
-        Lidars at different places; gates that differ from line to line without end.
+    Raises InputError: lidars at different places; gates that differ from line to line without end.
     """
     ranges = _common_ranges([scan for _, scan, _ in scans])
     gates = [_gates(scan.range, ranges) for _, scan, _ in scans]

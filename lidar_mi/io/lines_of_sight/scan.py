@@ -70,11 +70,8 @@ class Scan:
 def check(scan: Scan, path: Path) -> Scan:
     """A scan with angles in range and ranges in metres; changes become remarks.
 
-    Raises
-    ------
-    InputError
-        No line with a time and a direction, ranges that are no numbers, do not increase or can only
-        be kilometres.
+    Raises InputError: no line with a time and a direction, ranges that are no numbers, do not
+    increase or can only be kilometres.
     """
     lines = len(scan.time)
     complete = ~np.isnat(scan.time)
@@ -224,10 +221,7 @@ def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[s
     They count from 1970, unless they then lie in the future or closer together than lines can: then
     the only other common encoding with dates from 1980 to today is used.
 
-    Raises
-    ------
-    InputError
-        No encoding, or more than one, is possible.
+    Raises InputError: no encoding, or more than one, is possible.
     """
     epoch = np.datetime64("1970-01-01", "s")
     finite = values[np.isfinite(values)]

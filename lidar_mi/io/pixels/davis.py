@@ -14,10 +14,8 @@ from lidar_mi.io.size import check_size
 def read_davis(path: Path) -> Frames:
     """The frames of a DaVis image, raw counts; masked pixels are NaN.
 
-    Raises
-    ------
-    InputError
-        lvpyio is not installed; a damaged file; frames of several planes or different sizes.
+    Raises InputError: lvpyio is not installed; a damaged file; frames of several planes or
+    different sizes.
     """
     try:
         import lvpyio

@@ -40,10 +40,8 @@ def frames_of(path: str | Path, images: np.ndarray) -> Frames:
 def checked(path: str | Path, pixels: np.ndarray) -> np.ndarray:
     """Pixels, if float64 holds every one of them exactly.
 
-    Raises
-    ------
-    InputError
-        No real numbers, no pixels, whole numbers beyond 2^53 or floats of more than 64 bits.
+    Raises InputError: no real numbers, no pixels, whole numbers beyond 2^53 or floats of more than
+    64 bits.
     """
     if pixels.dtype.kind not in "biuf" or pixels.dtype.itemsize > 8:
         raise InputError(f"{path}: pixels of type {pixels.dtype}; expected real numbers of 64 bits")
@@ -65,6 +63,8 @@ def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> n
 
     Nothing is weighted and no gamma is undone. Where the three are equal, the number is theirs.
 
+    Raises InputError: another number of channels: which of them is light is not known.
+
     Parameters
     ----------
     pixels : (..., height, width, channels) array
@@ -72,11 +72,6 @@ def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> n
         1 or 3, the first of the channels.
     more : int
         Channels of transparency that follow: 0 or 1.
-
-    Raises
-    ------
-    InputError
-        Another number of channels: which of them is light is not known.
     """
     channels = pixels.shape[-1]
     if colours not in (1, 3) or channels != colours + more or more > _ALPHA:

@@ -24,10 +24,7 @@ _PACKED = ("scale_factor", "add_offset")
 def read_npy(path: Path) -> Frames:
     """An image (height, width) or images (frames, height, width).
 
-    Raises
-    ------
-    InputError
-        A damaged file, Python objects, another number of dimensions.
+    Raises InputError: a damaged file, Python objects, another number of dimensions.
     """
     with reading(path, "npy"):
         with path.open("rb") as file:
@@ -56,11 +53,8 @@ def read_npz(path: Path, layer: str | None) -> Frames:
 def read_mat(path: Path, layer: str | None) -> Frames:
     """A matrix of a MATLAB file of version 4 to 7; ``layer`` names it where there are several.
 
-    Raises
-    ------
-    InputError
-        A damaged file; no or several matrices; an array of more than two dimensions, in which
-        images may be first or last.
+    Raises InputError: a damaged file; no or several matrices; an array of more than two dimensions,
+    in which images may be first or last.
     """
     from scipy.io import loadmat, whosmat
 
@@ -81,10 +75,8 @@ def read_mat(path: Path, layer: str | None) -> Frames:
 def read_hdf5(path: Path, layer: str | None) -> Frames:
     """An image or images of an HDF5 file, of MATLAB 7.3 too; ``layer`` is the path of the data set.
 
-    Raises
-    ------
-    InputError
-        A damaged file; no or several images; a filter that is not installed; packed numbers.
+    Raises InputError: a damaged file; no or several images; a filter that is not installed; packed
+    numbers.
     """
     import h5py
 

@@ -23,10 +23,8 @@ _KIND = "PGM, PPM, PAM or PFM"
 def read_netpbm(path: Path) -> Frames:
     """All images of a file; float images, stored from the bottom row, are turned.
 
-    Raises
-    ------
-    InputError
-        A bitmap (P1, P4), a damaged file, images of different sizes, channels of unknown meaning.
+    Raises InputError: a bitmap (P1, P4), a damaged file, images of different sizes, channels of
+    unknown meaning.
     """
     content, place = path.read_bytes(), 0
     images: list[np.ndarray] = []

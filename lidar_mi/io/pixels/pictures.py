@@ -22,10 +22,8 @@ _GREY = {"1": 0, "L": 0, "LA": 1}
 def read_picture(path: Path) -> Frames:
     """All images of a JPEG, BMP, GIF or WebP file, turned as its EXIF orientation says.
 
-    Raises
-    ------
-    InputError
-        A damaged file, one that declares too much, inks (CMYK), or images of different sizes.
+    Raises InputError: a damaged file, one that declares too much, inks (CMYK), or images of
+    different sizes.
     """
     from PIL import ImageOps
 
@@ -46,10 +44,7 @@ def read_picture(path: Path) -> Frames:
 def read_jpeg2000(path: Path) -> Frames:
     """The image of a JPEG 2000 file, of whatever depth and sign.
 
-    Raises
-    ------
-    InputError
-        A damaged file, one that declares too much, or channels of unknown meaning.
+    Raises InputError: a damaged file, one that declares too much, or channels of unknown meaning.
     """
     import imagecodecs
 

@@ -39,11 +39,9 @@ def read_tiff(path: Path) -> Frames:
     Reduced copies of a page (pyramids, thumbnails) and masks are omitted. A page is turned as its
     orientation says; GDAL's value for missing data becomes NaN.
 
-    Raises
-    ------
-    InputError
-        A damaged file, or one that declares too much; several axes in addition to height and width;
-        pages of different size; inks, mosaics, palettes of colours, white as 0, complex numbers.
+    Raises InputError: a damaged file, or one that declares too much; several axes in addition to
+    height and width; pages of different size; inks, mosaics, palettes of colours, white as 0,
+    complex numbers.
     """
     with _opened(path) as file:
         numbers, count, channels = _planes(path, file)
