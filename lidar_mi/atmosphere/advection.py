@@ -93,20 +93,13 @@ def advect(
     is not meaningful. A field without negative values remains so: the undershoots of the spline at
     sharp edges are set to zero.
 
-    Raises InputError: other dims, unequal grids, uneven axes, values or dt not finite.
+    field: any scalar, dims (y, z) or (x, y, z) in any order, y and z equally spaced, metres.
+    v, w: velocity along y and z, m s^-1, same dims and coordinates as `field`.
+    dt: s; negative goes back in time.
+    steps: trajectory steps in dt, >= 1.
+    u: velocity along x, m s^-1, for a field on (x, y, z) with x equally spaced as well.
 
-    Parameters
-    ----------
-    field : xarray.DataArray
-        Any scalar, dims (y, z) or (x, y, z) in any order, y and z equally spaced, metres.
-    v, w : xarray.DataArray
-        Velocity along y and z, m s^-1, same dims and coordinates as `field`.
-    dt : float
-        s; negative goes back in time.
-    steps : int
-        Trajectory steps in dt, >= 1.
-    u : xarray.DataArray, optional
-        Velocity along x, m s^-1, for a field on (x, y, z) with x equally spaced as well.
+    Raises InputError: other dims, unequal grids, uneven axes, values or dt not finite.
 
     Returns
     -------

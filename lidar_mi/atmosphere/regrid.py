@@ -45,11 +45,9 @@ def interpolated(
 ) -> tuple[np.ndarray, float]:
     """Values at other nodes by cubic splines, axis by axis, and how well they are determined.
 
-    Parameters
-    ----------
-    values : (n0, n1, ...) array
-    nodes, targets : sequences of arrays
-        For every axis, ascending. An axis with equal nodes and targets is left as it is.
+    values (n0, n1, ...)
+    nodes, targets (sequences of arrays): for every axis, ascending. An axis with equal nodes and
+        targets is left as it is.
 
     Returns
     -------

@@ -72,21 +72,14 @@ def corrsin_obukhov(
     0 and s. The factor's own mean and rms therefore scatter only by what the tails do: some
     per cent of the rms in an image of ten outer scales.
 
-    Raises InputError: values out of range, uneven axes, a field too large for memory.
-
-    Parameters
-    ----------
-    y, z : array_like
-        Node positions, m, equally spaced, ascending.
-    rms : float
-        Relative, >= 0; 0 gives ones.
-    outer_scale : float
-        m, at least two cells.
-    seed : int
-        >= 0.
-    x : array_like, optional
-        Gives dims (x, y, z); one node is a slice of the two-dimensional field, more a
+    y, z: node positions, m, equally spaced, ascending.
+    rms: relative, >= 0; 0 gives ones.
+    outer_scale: m, at least two cells.
+    seed: >= 0.
+    x: gives dims (x, y, z); one node is a slice of the two-dimensional field, more a
         three-dimensional field.
+
+    Raises InputError: values out of range, uneven axes, a field too large for memory.
 
     Returns
     -------
@@ -152,12 +145,8 @@ _ORDER = 5  # of the spline through the nodes, as in advection
 class PeriodicTexture:
     """The factor of `corrsin_obukhov` anywhere in space, periodic in all directions, without seams.
 
-    Attributes
-    ----------
-    coefficients : (nx, ny, nz) array
-        Of the periodic quintic B-spline of the logarithm.
-    spacing : (float, float, float)
-        Of its nodes, m.
+    coefficients (nx, ny, nz): of the periodic quintic B-spline of the logarithm.
+    spacing: of its nodes, m.
     """
 
     coefficients: np.ndarray

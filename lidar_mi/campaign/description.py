@@ -244,17 +244,12 @@ def read_campaign(
 ) -> Campaign:
     """Read a campaign file.
 
+    path: a campaign file, or an experiment with ``variants``, which are its one dimension.
+    overrides: texts such as ``"members=4"`` or ``"set.scan.range=200 m"``.
+    quick: the coarse version that the file describes.
+
     Raises InputError: unreadable file, unknown key, a dimension that is none: the first fault is
     named.
-
-    Parameters
-    ----------
-    path : path
-        A campaign file, or an experiment with ``variants``, which are its one dimension.
-    overrides : list of str, optional
-        Texts such as ``"members=4"`` or ``"set.scan.range=200 m"``.
-    quick : bool
-        The coarse version that the file describes.
     """
     data = read_yaml(path, "a campaign file")
     if not isinstance(data, dict):

@@ -176,12 +176,9 @@ def connected(
 ) -> Iterator[Client]:
     """A client whose workers are ready.
 
-    Raises InputError: a scheduler that does not answer, workers of another version.
+    client: of a scheduler, its address, or the file that it wrote. Default: processes here.
 
-    Parameters
-    ----------
-    client : Client or str, optional
-        Of a scheduler, its address, or the file that it wrote. Default: processes here.
+    Raises InputError: a scheduler that does not answer, workers of another version.
     """
     if isinstance(client, Client):
         _make_ready(client, threads, own_cache=True)

@@ -17,7 +17,7 @@ def campaign_answer(folder: str | Path) -> str:
 def write_report(folder: str | Path, metrics: Sequence[str] | None = None) -> Path:
     """Write ``report.html`` of a campaign; returns its path.
 
-    ``metrics``: names of those to show. Default: errors, requirements and vortices.
+    metrics: names of those to show. Default: errors, requirements and vortices.
 
     Raises InputError: no campaign in the folder, or no such metric.
     """

@@ -16,16 +16,11 @@ def slurm_cluster(
 
     Workers end two minutes before their walltime, and their points go to others.
 
-    Raises InputError: dask-jobqueue is missing; a walltime that is none.
+    memory: of each.
+    walltime: of each job, HH:MM:SS.
+    queue, account: partition and account.
 
-    Parameters
-    ----------
-    memory : str
-        Of each.
-    walltime : str
-        Of each job, HH:MM:SS.
-    queue, account : str, optional
-        Partition and account.
+    Raises InputError: dask-jobqueue is missing; a walltime that is none.
 
     Returns
     -------

@@ -80,14 +80,10 @@ def sections(
 ) -> Iterator[Section]:
     """Titled tables of the flight and of the lidar's first slab; nothing is written.
 
-    Raises InputError: anything that a flight would refuse before it starts.
+    notice: called with the name of the running step.
+    timed: with the time of the flight, which takes a probe of about two seconds.
 
-    Parameters
-    ----------
-    notice : callable
-        Called with the name of the running step.
-    timed : bool
-        With the time of the flight, which takes a probe of about two seconds.
+    Raises InputError: anything that a flight would refuse before it starts.
     """
     warnings = geometry(experiment)
     encounter, gates = encounter_of(experiment), gates_of(experiment)

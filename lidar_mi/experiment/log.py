@@ -22,12 +22,8 @@ def silent(text: str, fraction: float | None) -> None:
 class Log:
     """Lines, progress and warnings of a run.
 
-    Attributes
-    ----------
-    path : Path or None
-        File to which lines are appended, if there is one.
-    warnings : list of str
-        Those that matter for the results.
+    path: file to which lines are appended, if there is one.
+    warnings: those that matter for the results.
     """
 
     def __init__(self, notice: Notice = silent, path: Path | None = None):

@@ -60,12 +60,8 @@ class Footprint:
     def bytes(self, beams: int, in_states: int = 0) -> float:
         """Memory of the run.
 
-        Parameters
-        ----------
-        beams : int
-            Of the backscatter lidar in an image; 0: there is none.
-        in_states : int
-            Values of all states of moving air in a scan, see `values_of_states`.
+        beams: of the backscatter lidar in an image; 0: there is none.
+        in_states: values of all states of moving air in a scan, see `values_of_states`.
         """
         if not beams:
             return PROGRAM + self._rings()

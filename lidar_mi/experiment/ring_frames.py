@@ -57,7 +57,7 @@ def read_electrons(
 ) -> np.ndarray:
     """All frames of some files as photoelectrons, (frames, height, width).
 
-    ``counts``: whether the files hold a digitiser's counts; electrons otherwise.
+    counts: whether the files hold a digitiser's counts; electrons otherwise.
 
     Raises InputError: a file that is no image, frames of different sizes, a rendered image: its
     values are relative energies, from which neither a pulse nor its noise follows.

@@ -164,8 +164,7 @@ def sight_volumes(
 def wind_at(wind: "xr.Dataset", points: np.ndarray) -> np.ndarray:
     """Wind (..., 3) at points (..., 3), by linear interpolation.
 
-    ``wind``: u, v, w (m s^-1) on (z, y), the same for all x, or on (x, y, z); coordinates
-    ascending, m.
+    wind: u, v, w (m s^-1) on (z, y), the same for all x, or on (x, y, z); coordinates ascending, m.
 
     Raises InputError: a component or a coordinate is missing, or the points leave the field.
     """
@@ -199,13 +198,9 @@ def wind_of_lines(
 ) -> np.ndarray:
     """Wind (lines, points, 3) at points (lines, points, 3), each line at its own time.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        As for `wind_at`; or two states of it, dims (time, ...), linear in time between and beyond
+    wind: as for `wind_at`; or two states of it, dims (time, ...), linear in time between and beyond
         them.
-    times : (lines,) array, optional
-        s; 0 for all by default.
+    times (lines,): s; 0 for all by default.
     """
     if "time" not in wind.dims:
         return wind_at(wind, points)
@@ -232,25 +227,17 @@ def scan_wind(
     platform's own, plus normal noise. Photons arrive evenly from all of the volume: extinction and
     backscatter coefficient are homogeneous in it.
 
-    Raises InputError: a field that does not contain the scan; a negative standard error.
+    wind: as for `wind_of_lines`, in the lidar's frame; or u, v, w (..., 3) in m/s of points (...,
+        3) in m.
+    v_los_std (float or (lines,) array): standard error of a measured velocity, m/s: what the fringe
+        chain gives for as many pulses as a line has.
+    seed: of noise and jitter.
+    speed: of the platform along x, as measured on board, m/s.
+    errors: errors of the assumed attitude, pointing and speed; by default none.
+    beams: time and pose of every line, true and reported, from the telescope's place at the
+        reference time; `errors` come on top of them. None: all at once and from there.
 
-    Parameters
-    ----------
-    wind : xr.Dataset or callable
-        As for `wind_of_lines`, in the lidar's frame; or u, v, w (..., 3) in m/s of points (..., 3)
-        in m.
-    v_los_std : float or (lines,) array
-        Standard error of a measured velocity, m/s: what the fringe chain gives for as many pulses
-        as a line has.
-    seed : int
-        Of noise and jitter.
-    speed : float
-        Of the platform along x, as measured on board, m/s.
-    errors : PlatformErrors
-        Errors of the assumed attitude, pointing and speed; by default none.
-    beams : Beams
-        Time and pose of every line, true and reported, from the telescope's place at the reference
-        time; `errors` come on top of them. None: all at once and from there.
+    Raises InputError: a field that does not contain the scan; a negative standard error.
 
     Returns
     -------

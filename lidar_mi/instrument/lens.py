@@ -34,16 +34,10 @@ def fused_silica_index(wavelength: float) -> float:
 def singlet(focal_length: float, wavelength: float, stop_radius: float, field: float) -> np.ndarray:
     """An aspheric singlet without spherical aberration, coma and distortion.
 
-    Parameters
-    ----------
-    focal_length : float
-        m.
-    wavelength : float
-        m.
-    stop_radius : float
-        Of the light, m; at most 0.1 focal lengths.
-    field : float
-        Half angle of the corrected image, rad; at most 0.05.
+    focal_length: m.
+    wavelength: m.
+    stop_radius: of the light, m; at most 0.1 focal lengths.
+    field: half angle of the corrected image, rad; at most 0.05.
 
     Returns
     -------
@@ -106,12 +100,9 @@ def trace(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions on the CCD of light through points of the stop, by Snell's law at every surface.
 
-    Parameters
-    ----------
-    lens : array (N, 4)
-        As `singlet` returns it.
-    across, along : array
-        Positions on the stop; the light arrives at ``angle`` (rad) in the plane of the first.
+    lens (N, 4): as `singlet` returns it.
+    across, along: positions on the stop; the light arrives at ``angle`` (rad) in the plane of the
+        first.
 
     Returns
     -------

@@ -107,16 +107,10 @@ class Pose:
 class Trajectory:
     """A flight, as a file has it: linear between its times, attitudes along great circles.
 
-    Attributes
-    ----------
-    time : (n,) array
-        s since the first scan, ascending.
-    place : (n, 3) array
-        m in the lidar's frame; the first scan is made near 0.
-    attitude : Rotation
-        Of n.
-    source : str
-        Its file, for messages.
+    time (n,): s since the first scan, ascending.
+    place (n, 3): m in the lidar's frame; the first scan is made near 0.
+    attitude: of n.
+    source: its file, for messages.
     """
 
     time: np.ndarray

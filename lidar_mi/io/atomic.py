@@ -25,16 +25,11 @@ def write_atomically(
     function returns, the file survives a loss of power. Temporary files of killed processes in the
     same folder are removed.
 
+    content: of the whole file.
+    first: called when the content is on the disk, before the file is renamed.
+
     Raises InputError: the file cannot be written there, or the path is not that of an ordinary
     file.
-
-    Parameters
-    ----------
-    path : str or Path
-    content : bytes
-        Of the whole file.
-    first : callable, optional
-        Called when the content is on the disk, before the file is renamed.
     """
     path = Path(path)
     try:

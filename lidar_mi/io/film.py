@@ -66,14 +66,10 @@ def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) ->
 def as_mp4(frames: Sequence[np.ndarray], seconds: float) -> bytes | None:
     """Frames as an MP4 file (H.264), which browsers and presentations play; None without PyAV.
 
-    Raises InputError: no frames, frames of several sizes or of odd ones.
+    frames (height, width, 3): 8 bit, of one size, with even numbers of rows and columns.
+    seconds: for which each is shown.
 
-    Parameters
-    ----------
-    frames : sequence of ndarray, shape (height, width, 3)
-        8 bit, of one size, with even numbers of rows and columns.
-    seconds : float
-        For which each is shown.
+    Raises InputError: no frames, frames of several sizes or of odd ones.
     """
     shapes = {frame.shape for frame in frames}
     if len(shapes) != 1 or any(n % 2 for shape in shapes for n in shape[:2]):

@@ -28,17 +28,13 @@ def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = 
     averaged in float64, unweighted: where red, green and blue are equal, the value is theirs.
     Transparency is ignored. A FITS image is read as stored, first row first.
 
+    layer: of an EXR file; the name of an array in an npz, mat or HDF5 file, of a part of a FITS
+        file. Default: of EXR Y_noisy (what a detector delivered), else Y, or the mean of R, G and
+        B; of any file the only one.
+    frame: number of the image, from 0; needed where the file has several.
+
     Raises InputError: no such file, one that cannot be read, or no such layer or frame; several
     frames, and none named; values that float64 does not hold exactly.
-
-    Parameters
-    ----------
-    layer : str, optional
-        Of an EXR file; the name of an array in an npz, mat or HDF5 file, of a part of a FITS file.
-        Default: of EXR Y_noisy (what a detector delivered), else Y, or the mean of R, G and B; of
-        any file the only one.
-    frame : int, optional
-        Number of the image, from 0; needed where the file has several.
     """
     path = Path(path)
     frames = _frames(path, layer)
@@ -58,14 +54,10 @@ def read_frames(
     The pages of a TIFF file, the planes of a FITS cube or of an array; one for other files. Colours
     as of `read_pixels`.
 
-    Raises InputError: as `read_pixels`; pages of different size, channels.
+    layer: as of `read_pixels`.
+    numbers: which images, from 0. Default: all, which must not be channels of one moment.
 
-    Parameters
-    ----------
-    layer : str, optional
-        As of `read_pixels`.
-    numbers : sequence of int, optional
-        Which images, from 0. Default: all, which must not be channels of one moment.
+    Raises InputError: as `read_pixels`; pages of different size, channels.
     """
     path = Path(path)
     frames = _frames(path, layer)

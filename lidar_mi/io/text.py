@@ -18,15 +18,10 @@ LONGEST = 64 << 20
 def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
     """Text of a file, UTF-8, without the mark that some editors set before it.
 
-    Raises InputError: a file that cannot be read, is too long or is not text.
+    expected: kind of file expected, for the message: "an experiment file".
+    longest: bytes; longer files are not read, nor devices and pipes, which have no end.
 
-    Parameters
-    ----------
-    path : str or Path
-    expected : str
-        Kind of file expected, for the message: "an experiment file".
-    longest : int
-        Bytes; longer files are not read, nor devices and pipes, which have no end.
+    Raises InputError: a file that cannot be read, is too long or is not text.
     """
     path = Path(path)
     try:

@@ -68,16 +68,11 @@ def _shortest(time: float, tolerance: float) -> str:
 def state_at(time: float, times: np.ndarray, rounding: np.ndarray, where: str) -> int:
     """Index of the state of a time.
 
-    Raises InputError: no state, or more than one, has this time.
+    time: s.
+    times, rounding (n,): of the states, and to which they are rounded in the file, s.
+    where: file, for the message.
 
-    Parameters
-    ----------
-    time : float
-        s.
-    times, rounding : (n,) arrays
-        Of the states, and to which they are rounded in the file, s.
-    where : str
-        File, for the message.
+    Raises InputError: no state, or more than one, has this time.
     """
     tolerance = tolerances(times, rounding)
     fits = np.flatnonzero(np.abs(times - time) <= tolerance)

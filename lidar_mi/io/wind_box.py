@@ -68,18 +68,12 @@ def read_mann(
     The axes are those of the generator (Mann, Prob. Eng. Mech. 13, 1998): right-handed, x along the
     wind and ascending, z up. HAWC2 itself turns y and z to the right and down.
 
-    Raises InputError: a file is missing, or its size is not that of the shape.
+    path: file of u; its name ends with u before the suffix, those of v and w with v and w.
+    shape: nodes along x, y and z.
+    spacing: m.
+    base: height of the lowest nodes above the ground, m.
 
-    Parameters
-    ----------
-    path : str or Path
-        File of u; its name ends with u before the suffix, those of v and w with v and w.
-    shape : (int, int, int)
-        Nodes along x, y and z.
-    spacing : (float, float, float)
-        m.
-    base : float
-        Height of the lowest nodes above the ground, m.
+    Raises InputError: a file is missing, or its size is not that of the shape.
 
     Returns
     -------

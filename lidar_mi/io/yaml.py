@@ -85,7 +85,7 @@ def _fault(problem: str, mark: yaml.Mark) -> yaml.constructor.ConstructorError:
 def parse_yaml(text: str, origin: str) -> Any:
     """Content of YAML text: dict, list, str, number, bool, date or None.
 
-    ``origin``: where it comes from, for the message: a path.
+    origin: where it comes from, for the message: a path.
 
     Raises InputError: not YAML, larger or deeper than allowed, a value that is not of its type, or
     a key that is there twice; with the line.

@@ -40,19 +40,13 @@ def render_fringes(
 
     In Mitsuba's variant in force.
 
+    line: of air at rest.
+    v_los: m/s; positive when the air approaches.
+    seed: image k uses seed + k * 2^16.
+    series: which of the velocities to render; its samples are paths.
+
     Raises InputError: a velocity that is not finite, or a lens that is too fast or has too wide a
     field.
-
-    Parameters
-    ----------
-    line : lidar_mi.atmosphere.scattering.line.Line
-        Of air at rest.
-    v_los : sequence of float
-        m/s; positive when the air approaches.
-    seed : int
-        Image k uses seed + k * 2^16.
-    series : Series
-        Which of the velocities to render; its samples are paths.
 
     Yields
     ------
@@ -189,7 +183,7 @@ def _field(camera: FringeCamera) -> float:
 def render_image(scene: Any, samples: int = 0, seed: int = 0) -> xr.Dataset:
     """Render a loaded scene of a `ccd` with the `fringes` integrator and describe the image.
 
-    ``samples``: light paths per pixel; 0: as in the scene.
+    samples: light paths per pixel; 0: as in the scene.
     """
     import mitsuba as mi
 

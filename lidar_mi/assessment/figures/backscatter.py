@@ -50,14 +50,9 @@ class ObservedAir(Protocol):
 class Scale:
     """Common settings of all wind maps of a run.
 
-    Attributes
-    ----------
-    limit : float
-        Speed at the end of the colours, m/s.
-    length : float
-        Of its arrow, in distances between arrows.
-    y, z : array
-        Axes of the plane, m.
+    limit: speed at the end of the colours, m/s.
+    length: of its arrow, in distances between arrows.
+    y, z: axes of the plane, m.
     """
 
     limit: float

@@ -64,21 +64,14 @@ class RequirementTable:
 class Finding:
     """One row, judged.
 
-    Attributes
-    ----------
-    quantity : str
-        A key of `QUANTITIES`.
-    minimum, maximum : float
-        Required limits at the measured range; NaN if they depend on a range and there is none.
-    measured : float
-        NaN: not known.
-    passed : bool or None
-        None: not judged.
-    margin : float
-        Distance from the nearer limit as a fraction of it: 0.2 is 20 % better than required, -0.2
-        20 % worse; NaN where not judged.
-    reason : str
-        Why it is not judged; empty where it is.
+    quantity: a key of `QUANTITIES`.
+    minimum, maximum: required limits at the measured range; NaN if they depend on a range and there
+        is none.
+    measured: NaN: not known.
+    passed: none: not judged.
+    margin: distance from the nearer limit as a fraction of it: 0.2 is 20 % better than required,
+        -0.2 20 % worse; NaN where not judged.
+    reason: why it is not judged; empty where it is.
     """
 
     quantity: str
@@ -117,13 +110,9 @@ def judge(
 ) -> list[Finding]:
     """A sensor against a table, row by row.
 
-    Parameters
-    ----------
-    measured : mapping
-        The sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known. Names
-        without a row in the table are ignored.
-    not_judged : mapping
-        Reasons why rows are not judged, by names of `QUANTITIES`, whatever was measured.
+    measured: the sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known.
+        Names without a row in the table are ignored.
+    not_judged: reasons why rows are not judged, by names of `QUANTITIES`, whatever was measured.
     """
     for name, value in measured.items():
         _check_name(name, "measured")

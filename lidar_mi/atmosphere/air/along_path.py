@@ -56,12 +56,8 @@ class AirAlongPath:
 
     The wake drifts as a whole. That other air bends, stretches or weakens it is neglected.
 
-    Parameters
-    ----------
-    drift : (float, float, float)
-        Of the wake, m/s, path frame.
-    t_c : float
-        When the wake is at its own place, s.
+    drift: of the wake, m/s, path frame.
+    t_c: when the wake is at its own place, s.
     """
 
     wake: WakeAlongPath | None

@@ -27,14 +27,9 @@ _FWHM = 2 * math.sqrt(2 * math.log(2))
 class Line:
     """A spectral line as a sum of Gaussians about the laser's frequency.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser; the zero of the offsets.
-    weights : array (K,)
-        Fraction of the photons in each Gaussian, 0 or more, with a sum of one.
-    offsets, sigmas : array (K,)
-        Centres and standard deviations, Hz; sigma 0 is a monochromatic line.
+    wavelength: m, in vacuum, of the laser; the zero of the offsets.
+    weights (K,): fraction of the photons in each Gaussian, 0 or more, with a sum of one.
+    offsets, sigmas (K,): centres and standard deviations, Hz; sigma 0 is a monochromatic line.
     """
 
     wavelength: float
@@ -198,17 +193,11 @@ def backscatter_line(
 ) -> Line:
     """Line of the backscatter of air at rest, molecules and aerosol, with the laser's own width.
 
-    Parameters
-    ----------
-    wavelength, temperature, pressure : float
-        m, K, Pa; see `lidar_mi.atmosphere.air.standard_atmosphere`.
-    laser_width : float
-        Full width at half maximum of the emitted line, Hz.
-    aerosol_fraction : float
-        Fraction of the backscattered photons from aerosol, 0 to 1; aerosol is too
+    wavelength, temperature, pressure: m, K, Pa; see `lidar_mi.atmosphere.air.standard_atmosphere`.
+    laser_width: full width at half maximum of the emitted line, Hz.
+    aerosol_fraction: fraction of the backscattered photons from aerosol, 0 to 1; aerosol is too
         heavy to broaden the line.
-    shape : {"rayleigh", "rayleigh_brillouin"}
-        Of the molecular line.
+    shape {"rayleigh", "rayleigh_brillouin"}: of the molecular line.
     """
     if shape not in SHAPES:
         raise InputError(f"shape: {shape!r} is not allowed; expected one of {', '.join(SHAPES)}")

@@ -31,25 +31,17 @@ _TOLERANCE = 1e-5
 class ScatteringTable:
     """What one kind of particle, or a mixture, does to light of one wavelength.
 
+    wavelength: m, in vacuum.
+    angle (N,): scattering angle in degrees, rising from 0 to 180; values between are linear in
+        angle.
+    elements (N, 6): a1, a2, a3, a4, b1, b2; a1 averages to one over the sphere.
+    extinction_cross_section: m^2 per particle (the mean over the size distribution).
+    albedo: single-scattering albedo.
+    number_density: particles per m^3 that go with this table.
+    provenance: one line: the source of the numbers.
+
     Raises InputError: a number out of range, or a matrix that no collection of particles can have
     (`check`).
-
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum.
-    angle : array (N,)
-        Scattering angle in degrees, rising from 0 to 180; values between are linear in angle.
-    elements : array (N, 6)
-        a1, a2, a3, a4, b1, b2; a1 averages to one over the sphere.
-    extinction_cross_section : float
-        m^2 per particle (the mean over the size distribution).
-    albedo : float
-        Single-scattering albedo.
-    number_density : float
-        Particles per m^3 that go with this table.
-    provenance : str
-        One line: the source of the numbers.
     """
 
     name: str
@@ -212,7 +204,7 @@ def rayleigh_table(
 ) -> ScatteringTable:
     """The scattering matrix of molecules (Hansen & Travis 1974, eqs. 2.15-2.17).
 
-    ``depolarization``: depolarisation factor of natural light at 90 degrees, 0 <= d < 0.5.
+    depolarization: depolarisation factor of natural light at 90 degrees, 0 <= d < 0.5.
 
     Notes
     -----
@@ -258,12 +250,9 @@ def mix(
 
     Matrices add weighted by scattering coefficient, albedos by extinction coefficient.
 
-    Parameters
-    ----------
-    tables : sequence of ScatteringTable
-        All of one wavelength.
-    extinctions : sequence of float
-        Extinction coefficient of each in m^-1, >= 0, not all zero. Their sum is the mixture's.
+    tables: all of one wavelength.
+    extinctions: extinction coefficient of each in m^-1, >= 0, not all zero. Their sum is the
+        mixture's.
 
     Returns
     -------

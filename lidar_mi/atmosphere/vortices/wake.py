@@ -104,14 +104,10 @@ def centre(
 ) -> xr.Dataset:
     """Translate the wake: its point (y, z) to `about` in the lidar frame, by default the beam axis.
 
-    Raises InputError: a centre outside the wake.
+    y, z: m, in the wake's own frame and inside it; default: the middle of the domain.
+    about: y and z in the lidar frame, m.
 
-    Parameters
-    ----------
-    y, z : float, optional
-        m, in the wake's own frame and inside it; default: the middle of the domain.
-    about : (float, float)
-        y and z in the lidar frame, m.
+    Raises InputError: a centre outside the wake.
 
     Returns
     -------

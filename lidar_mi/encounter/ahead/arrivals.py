@@ -17,16 +17,10 @@ _PLACES = np.linspace(-0.9, 0.9, 7)
 class Arrival:
     """The wind expected on the wing in the plane of a slab.
 
-    Attributes
-    ----------
-    x, time : float
-        m and s.
-    y : ndarray, shape (places,)
-        On the wing, m, path frame.
-    z : float
-        m.
-    wind, stderr : ndarray, shape (2, places)
-        v and w as expected then, and their standard errors, m/s.
+    x, time: m and s.
+    y (places,): on the wing, m, path frame.
+    z: m.
+    wind, stderr (2, places): v and w as expected then, and their standard errors, m/s.
     """
 
     x: float

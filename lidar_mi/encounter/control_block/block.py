@@ -45,12 +45,9 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
     second state. The wing is in the plane `arrival` seconds after the first scan, `lead` seconds
     after the delivery.
 
-    Raises InputError: too few slabs; an input that is zero, as in air at rest.
+    flights: of one timing, range and span, as of `pooled`.
 
-    Parameters
-    ----------
-    flights : sequence of SensorSamples
-        Of one timing, range and span, as of `pooled`.
+    Raises InputError: too few slabs; an input that is zero, as in air at rest.
 
     Returns
     -------

@@ -22,7 +22,7 @@ _ROUNDS, _SHRINKS = 200, 0.9  # in so many samples the changes shrink by this fa
 def stationary_distribution(transition: ArrayLike) -> np.ndarray:
     """Probabilities of the modes of a chain with one recurrent class; (modes,).
 
-    ``transition``, shape (modes, modes): p_ij, from mode i to mode j; rows sum to 1.
+    transition (modes, modes): p_ij, from mode i to mode j; rows sum to 1.
 
     Raises InputError: not a matrix of probabilities.
     """
@@ -44,16 +44,11 @@ def jump_covariance(
 
     With one mode this is the discrete Lyapunov equation.
 
-    Raises InputError: the system has no finite variance, or the transition is none.
+    a, b, c, d (modes, rows, columns): matrices of the modes.
+    transition (modes, modes): p_ij, from mode i to mode j.
+    noise (inputs, inputs): covariance W of the white input, which is independent of the mode.
 
-    Parameters
-    ----------
-    a, b, c, d : array_like, shape (modes, rows, columns)
-        Matrices of the modes.
-    transition : array_like, shape (modes, modes)
-        p_ij, from mode i to mode j.
-    noise : array_like, shape (inputs, inputs)
-        Covariance W of the white input, which is independent of the mode.
+    Raises InputError: the system has no finite variance, or the transition is none.
     """
     a, b, c, d = (np.asarray(one, float) for one in (a, b, c, d))
     p, w = np.asarray(transition, float), np.asarray(noise, float)

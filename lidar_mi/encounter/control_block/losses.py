@@ -20,14 +20,10 @@ RECEIVED, LOST = 0, 1
 class LossChain:
     """Probabilities of lost estimates, with standard errors.
 
-    Attributes
-    ----------
-    begin, end : float
-        a and b, by maximum likelihood. b is 1 where nothing was lost.
-    begin_stderr, end_stderr : float
-        Of the posterior with Jeffreys' prior, which is not 0 where nothing was lost.
-    memory_p : float
-        P value of the chain against one of second order; 1: no run was long enough to tell.
+    begin, end: a and b, by maximum likelihood. b is 1 where nothing was lost.
+    begin_stderr, end_stderr: of the posterior with Jeffreys' prior, which is not 0 where nothing
+        was lost.
+    memory_p: P value of the chain against one of second order; 1: no run was long enough to tell.
     """
 
     begin: float

@@ -26,25 +26,15 @@ MARGIN = 8
 class SensorSamples:
     """Gusts of consecutive slabs of one flight: true, and as estimated.
 
-    Attributes
-    ----------
-    period : float
-        From slab to slab, s.
-    speed, span : float
-        Of the aircraft, m/s and m.
-    distance : float
-        Of a slab when it is scanned for the first time, m.
-    delay : float
-        From this scan to the delivery, s.
-    truth, estimate : ndarray, shape (slabs, 4)
-        Along `GUSTS` of `gust_axes`. The truth is that of the plane when the wing arrives on the
-        nominal path; NaN where nothing was estimated.
-    truth_before, truth_after : ndarray, shape (`MARGIN`, 4)
-        In the planes before and after.
-    roll_moment_per_gust : float
-        Rolling moment per roll gust, N m s/rad.
-    lift_per_gust : float
-        Force upwards per w, N s/m.
+    period: from slab to slab, s.
+    speed, span: of the aircraft, m/s and m.
+    distance: of a slab when it is scanned for the first time, m.
+    delay: from this scan to the delivery, s.
+    truth, estimate (slabs, 4): along `GUSTS` of `gust_axes`. The truth is that of the plane when
+        the wing arrives on the nominal path; NaN where nothing was estimated.
+    truth_before, truth_after (`MARGIN`, 4): in the planes before and after.
+    roll_moment_per_gust: rolling moment per roll gust, N m s/rad.
+    lift_per_gust: force upwards per w, N s/m.
     """
 
     period: float

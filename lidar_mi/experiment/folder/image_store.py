@@ -25,12 +25,8 @@ class ImageStore:
 
     Rendered images are read back, so that new and stored ones have the same float32 values.
 
-    Attributes
-    ----------
-    folder_of : callable
-        ``folder_of(part)``: the folder of an image.
-    signature_of : callable
-        ``signature_of(part)``: what an image there is signed with.
+    folder_of: ``folder_of(part)``: the folder of an image.
+    signature_of: ``signature_of(part)``: what an image there is signed with.
     """
 
     folder_of: Callable[[str], Path]

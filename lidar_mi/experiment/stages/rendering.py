@@ -290,8 +290,8 @@ def batches_of(
 ) -> Callable[[int], Batches] | None:
     """Storage of an image's samples while it is rendered, by its index among the names.
 
-    ``samples``: per beam, where that was chosen: stored ones of an image with another number are
-    not used.
+    samples: per beam, where that was chosen: stored ones of an image with another number are not
+        used.
     """
     if store is None:
         return None

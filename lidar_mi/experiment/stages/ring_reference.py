@@ -56,14 +56,9 @@ def drifts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drift in the speed of averages of pulses, and its standard deviation, m/s.
 
-    Parameters
-    ----------
-    averaged : int
-        Pulses of an average.
-    numbers : sequence of int
-        Of the averages, counted from the first pulse of a series.
-    key : str
-        As of `reference_frames`.
+    averaged: pulses of an average.
+    numbers: of the averages, counted from the first pulse of a series.
+    key: as of `reference_frames`.
     """
     every = doppler.reference.every
     frames, sharing = reference_frames(averaged, every, key)

@@ -62,12 +62,8 @@ def air_along_path(experiment: Experiment) -> WakeAlongPath:
 def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir, ...]:
     """The parts of the air that are neither the wake nor read from a file.
 
-    Parameters
-    ----------
-    path : lidar_mi.schema.encounter.Path
-        Heights are above its ground; turbulence and gusts are those at its start.
-    seed : int
-        Of the experiment.
+    path: heights are above its ground; turbulence and gusts are those at its start.
+    seed: of the experiment.
     """
     parts: list[MovingAir] = []
     if air.turbulence is not None:

@@ -64,10 +64,7 @@ def air_in_time(
     The truth of the scan's reference time, advected by the same flow as the air from t1 to t2. With
     a stored state at t2, the mean of both states advected to the time, weighted linearly in time.
 
-    Parameters
-    ----------
-    times : array
-        Of the beams, s, from the scan's reference time.
+    times: of the beams, s, from the scan's reference time.
 
     Returns
     -------

@@ -21,12 +21,8 @@ START = np.datetime64("2000-01-01T00:00:00", "ns")
 class Receiver:
     """What a receiver makes of a line.
 
-    Attributes
-    ----------
-    samples : float
-        Independent ones, of a gate times pulses of a line.
-    bandwidth : float
-        As a range of velocities, m/s.
+    samples: independent ones, of a gate times pulses of a line.
+    bandwidth: as a range of velocities, m/s.
     """
 
     samples: float = 1e5
@@ -51,16 +47,12 @@ def measured_lines(
     velocities uniform over the bandwidth, velocities are uniform, and flagged. Gates that overlap
     share their samples: noise at the distance x correlates by 1 - x / gate length.
 
-    Raises InputError: a signal that is not above 0, or of another number of gates.
+    wind, scan, lidar, resolution, signal: as of `gate_moments`.
+    snr (float, (gates,) array or callable of the range (m)): signal-to-noise ratio of the powers
+        where the signal is 1, above 0.
+    receiver: default: as `Receiver` has it.
 
-    Parameters
-    ----------
-    wind, scan, lidar, resolution, signal
-        As of `gate_moments`.
-    snr : float, (gates,) array or callable of the range (m)
-        Signal-to-noise ratio of the powers where the signal is 1, above 0.
-    receiver : Receiver, optional
-        Default: as `Receiver` has it.
+    Raises InputError: a signal that is not above 0, or of another number of gates.
 
     Returns
     -------

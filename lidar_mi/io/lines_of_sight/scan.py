@@ -37,24 +37,15 @@ PLACE = {
 class Scan:
     """Lines of one file or of one of its sweeps.
 
-    Attributes
-    ----------
-    time : (lines,) array of datetime64[ns]
-        UTC.
-    angles : dict of str to (lines,) array
-        `ANGLES`, degrees: azimuth and elevation, the others where there are any.
-    range : (gates,) or (lines, gates) array
-        Of the gates' centres, m.
-    fields : dict of str to (lines, gates) array
-        `FIELDS`; NaN: missing.
-    place : dict of str to float
-        `PLACE`.
-    rejected : (lines, gates) array of bool, optional
-        By the lidar's own software.
-    about : dict
-        Attributes: kind, instrument, scan_type, gate_length (m), ...
-    remarks : list of str
-        What is unusual, a sentence each.
+    time (lines,): UTC.
+    angles (dict of str to (lines,) array): `ANGLES`, degrees: azimuth and elevation, the others
+        where there are any.
+    range (gates,) or (lines, gates) array: of the gates' centres, m.
+    fields (dict of str to (lines, gates) array): `FIELDS`; NaN: missing.
+    place: `PLACE`.
+    rejected (lines, gates): by the lidar's own software.
+    about: attributes: kind, instrument, scan_type, gate_length (m), ...
+    remarks: what is unusual, a sentence each.
     """
 
     time: np.ndarray

@@ -17,7 +17,7 @@ _KIND = "FITS"
 def read_fits(path: Path, layer: str | None) -> Frames:
     """The image or the planes of a cube, first row first, BSCALE, BZERO and BLANK applied.
 
-    ``layer``: name (EXTNAME) or number of the part that has the image. Default: the only one.
+    layer: name (EXTNAME) or number of the part that has the image. Default: the only one.
 
     Raises InputError: astropy is not installed; a damaged file; no or several images; more than
     three dimensions.

@@ -18,12 +18,8 @@ _ALPHA = 1
 class Frames:
     """The images of a file, read when they are asked for.
 
-    Attributes
-    ----------
-    read : callable
-        Images of the given numbers, (n, height, width), top row first, in the file's type.
-    channels : bool
-        They are channels of one moment by what the file says, not images one after the other.
+    read: images of the given numbers, (n, height, width), top row first, in the file's type.
+    channels: they are channels of one moment by what the file says, not images one after the other.
     """
 
     count: int
@@ -63,15 +59,11 @@ def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> n
 
     Nothing is weighted and no gamma is undone. Where the three are equal, the number is theirs.
 
-    Raises InputError: another number of channels: which of them is light is not known.
+    pixels (..., height, width, channels)
+    colours: 1 or 3, the first of the channels.
+    more: channels of transparency that follow: 0 or 1.
 
-    Parameters
-    ----------
-    pixels : (..., height, width, channels) array
-    colours : int
-        1 or 3, the first of the channels.
-    more : int
-        Channels of transparency that follow: 0 or 1.
+    Raises InputError: another number of channels: which of them is light is not known.
     """
     channels = pixels.shape[-1]
     if colours not in (1, 3) or channels != colours + more or more > _ALPHA:
