@@ -112,7 +112,7 @@ def test_an_image_of_chosen_samples_is_that_of_the_number_alone(prepared, number
     render = rendering.render_scans
 
     def watched(*given, **how):
-        seeds.append((given[7], given[6].samples_per_beam))
+        seeds.append((given[5], given[4].samples_per_beam))
         return render(*given, **how)
 
     monkeypatch.setattr(rendering, "render_scans", watched)
