@@ -248,14 +248,6 @@ def test_a_set_option_is_completed(monkeypatch, capsys):
     assert "scan.gates=spherical" in capsys.readouterr().out
 
 
-def test_examples_of_help_are_one_a_line(lidar_mi):
-    _, out, _ = lidar_mi("run", "--help")
-    after = out[out.index("Examples:") :].splitlines()
-    lines = [line.strip(" •") for line in after if "lidar-mi" in line]
-    assert lines[0] == "lidar-mi run wake_backscatter"
-    assert lines[1].startswith("lidar-mi run my.yaml -o outputs/calm")
-
-
 def test_new_file_like_an_instrument(lidar_mi, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, _ = lidar_mi("new", "mine", "--like", "windcube_200s")
