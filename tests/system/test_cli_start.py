@@ -147,7 +147,8 @@ def _value_at(experiment, name):
 PLAIN = [
     name
     for name in keys.settable()
-    if re.match(r"(scan|render|retrieval)\.(?!timing)", name) and keys.explain(name).example
+    if re.match(r"(lidar|render|retrieval|scan|site)\.(?!timing)", name)
+    and keys.explain(name).example
 ]
 # what their examples need besides
 TOGETHER = {"retrieval.pointing.offset": ["retrieval.pointing.stderr=1 mrad"]}
