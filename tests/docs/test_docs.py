@@ -44,19 +44,9 @@ GUIDE = tuple(
 )
 # guides whose commands and programs compute for seconds
 COMPUTING = (
-    "start",
-    "python",
-    "images",
-    "methods",
-    "rings",
-    "flights",
-    "control_block",
-    "jsbsim",
-    "air",
-    "xml_scenes",
-    "doppler_lines",
-    "measured_wakes",
-)
+    "start python images methods rings flights control_block jsbsim air xml_scenes "
+    "doppler_lines measured_wakes"
+).split()
 QUICK = tuple(page for page in GUIDE if Path(page).stem not in COMPUTING)
 THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))
 PAGES = ("README.md", *sorted(str(page.relative_to(ROOT)) for page in DOCS.rglob("*.md")))
