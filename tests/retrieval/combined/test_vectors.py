@@ -154,19 +154,6 @@ def test_errors_that_lines_share_enter_the_covariance():
     assert float(found["uv_correlation"][0]) == pytest.approx(correlation, abs=1e-9)
 
 
-def test_data_set_repeats_the_covariance(tmp_path):
-    found = wind_from_triples(scanned())
-    _, covariance, _ = solve_lines(
-        scanned().direction.values[found.lines.values], np.zeros((96, 3)), np.full((96, 3), 0.5)
-    )
-    np.testing.assert_allclose(found.u_stderr**2, covariance[:, 0, 0])
-    product = found.uw_correlation * found.u_stderr * found.w_stderr
-    np.testing.assert_allclose(product, covariance[:, 0, 2], atol=1e-9)
-    found.to_netcdf(tmp_path / "vectors.nc", engine="h5netcdf")
-    with xr.open_dataset(tmp_path / "vectors.nc", engine="h5netcdf") as back:
-        xr.testing.assert_identical(back.load(), found)
-
-
 # pointing
 
 
