@@ -13,15 +13,19 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
+from lidar_mi.experiment.folder.run_folder import IMAGES
+from lidar_mi.experiment.run import run
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
+from lidar_mi.io.exr import read_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.schema import reading as config
+from tests.support.experiments import check, small, write_wake
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
