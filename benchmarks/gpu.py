@@ -19,6 +19,7 @@ import xarray as xr
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import ScanRenderer, extrude
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import has_cuda, use_variant
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
@@ -98,7 +99,7 @@ def renderer_of(
     air = extrude(1e-3 * pair.first.clip(min=0.1), plan, lidar)
     settings = RenderSettings(variant=variant, samples_per_beam=samples, max_order=order)
     phase = {"type": "rayleigh_polarized"}
-    scene = ScanRenderer(air, plan, lidar, 1e-4, phase, 1.0, settings)
+    scene = ScanRenderer(air, plan, lidar, ScatteringAir(1e-4, phase, 1.0), settings)
 
     def render(seed: int) -> xr.Dataset:
         use_variant(variant)

@@ -18,7 +18,7 @@ from lidar_mi.encounter.lidar.computer import Cores
 from lidar_mi.encounter.lidar.doppler import DopplerScans, LineFrames, Midway, doppler_scans
 from lidar_mi.encounter.lidar.estimator import Estimator
 from lidar_mi.encounter.lidar.line_speeds import LineSpeeds
-from lidar_mi.encounter.lidar.slab_winds import without_old_garbage
+from lidar_mi.encounter.lidar.slab_winds import FirstImage, without_old_garbage
 from lidar_mi.encounter.lidar.slabs import gates_of
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -156,7 +156,7 @@ def timed(
     first, second = slab.images.first, slab.images.second
     complete = Completion(0.0, 0.0, "known", MIDWAY.place, (0.0, 0.0), DISTANCE, None)
     found = estimator.pair_of(
-        first, second, DT, NOISE, start, frames=slab.frames, complete=complete
+        FirstImage(first, DT, NOISE, expected=start), second, frames=slab.frames, complete=complete
     )
     after = cores.after(0.0, DT, found.seconds)
     seconds = {**found.seconds, "total": max(after)}

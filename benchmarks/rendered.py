@@ -19,7 +19,7 @@ from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
-from lidar_mi.rendering.phase import scatterer
+from lidar_mi.rendering.phase import ScatteringAir, scatterer
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.wind.methods import METHODS
 from lidar_mi.schema.experiment import Experiment
@@ -161,6 +161,5 @@ def images(experiment: Experiment, truth: Truth, seed: int) -> list[xr.Dataset]:
         for field in truth.extinction
     ]
     background = experiment.wake.extinction.background
-    return list(
-        render_scans(solids, plans, experiment.lidar, background, *air, experiment.render, seed)
-    )
+    around = ScatteringAir(background, *air)
+    return list(render_scans(solids, plans, experiment.lidar, around, experiment.render, seed))

@@ -10,7 +10,7 @@ import xarray as xr
 from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict
-from lidar_mi.rendering.phase import scatterer
+from lidar_mi.rendering.phase import ScatteringAir, scatterer
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.reading import load
@@ -29,11 +29,12 @@ class PaperScan:
         """Depth of the gate, m."""
         return self.plans[0].gate_stop - self.plans[0].gate_start
 
-    def air(self) -> tuple:
-        """Environment extinction (m^-1), phase function and albedo."""
-        background = self.experiment.wake.extinction.background
-        return background, *scatterer(
-            self.experiment.scattering, wavelength=self.experiment.lidar.wavelength
+    def air(self) -> ScatteringAir:
+        """Around the slab."""
+        experiment = self.experiment
+        return ScatteringAir(
+            experiment.wake.extinction.background,
+            *scatterer(experiment.scattering, wavelength=experiment.lidar.wavelength),
         )
 
     def scene(self):
@@ -42,7 +43,7 @@ class PaperScan:
         experiment = self.experiment
         return mi.load_dict(
             scene_dict(
-                self.fields[0], self.plans[0], experiment.lidar, *self.air(), experiment.render
+                self.fields[0], self.plans[0], experiment.lidar, self.air(), experiment.render
             )
         )
 
@@ -51,7 +52,7 @@ class PaperScan:
         use_variant(self.experiment.render.variant)
         settings = self.experiment.render.model_copy(update={"samples_per_beam": samples})
         return render_scans(
-            self.fields, self.plans, self.experiment.lidar, *self.air(), settings, seed
+            self.fields, self.plans, self.experiment.lidar, self.air(), settings, seed
         )
 
 

@@ -202,7 +202,7 @@ MAGNIFIED = 2.0**50
 # Fraction of the variance of S0 that comes from one sample from which on the standard error is
 # unreliable. A little less than one half: of two samples each has exactly that.
 HALF = 0.4999
-# Samples that are added up one by one.
+# Samples of a row. Rows are summed first: one sum of millions of samples loses digits.
 ROW = 1024
 # Fraction of samples lost to rounding from which on it is said: about that of the light.
 REJECTED = 1e-3
@@ -279,17 +279,18 @@ def define() -> type:
             before, arrays = stored_passes(self.batches, self.samples_per_pass, size)
             image = mi.Float(arrays["image"]) if "image" in arrays else dr.zeros(mi.Float, size)
             done, total = 0, _moments(arrays)
-            # of the finished pixels that receive light: how many there are, and how many of them
-            # have an unreliable standard error
+            # of finished beams: pixels that receive light, those with an unreliable standard error;
+            # of all: samples lost to rounding
             counts = np.array(arrays.get("counts", (0, 0, 0)))
             with dr.suspend_grad(), _nothing_freed():
                 passes = enumerate(self._passes(sensor, samples), 1)
-                for number, (first, count, start, now, complete) in passes:
-                    done += count * now * self._unit(sensor)
-                    # random numbers depend on beam and number alone: stored passes are skipped
+                for number, (first, count, start, rounds, complete) in passes:
+                    done += count * rounds * self._unit(sensor)
+                    # random numbers of a sample do not depend on passes before: stored ones are
+                    # skipped
                     if number <= before:
                         continue
-                    part, rejected = trace(scene, sensor, seed, first, count, start, now)
+                    part, rejected = trace(scene, sensor, seed, first, count, start, rounds)
                     total = part if total is None else _merge(total, part)
                     if complete:
                         cells = self._places(first * gates, count * gates)
@@ -389,9 +390,9 @@ def define() -> type:
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
             with _nothing_freed():
-                for first, count, start, now, _ in self._passes(sensor, samples):
+                for first, count, start, rounds, _ in self._passes(sensor, samples):
                     lidar, sample, cell, low, high = self._samples(
-                        scene, sensor, seed, first, count, start, now, differentiable=True
+                        scene, sensor, seed, first, count, start, rounds, differentiable=True
                     )
                     place = (cell + dr.opaque(mi.UInt32, first * gates)) * len(self.quantities())
                     places = [place + index for index in range(len(STOKES))]
@@ -447,12 +448,12 @@ def define() -> type:
             for first in range(0, beams, beams_at_once):
                 start = 0
                 while start < rounds:
-                    now = min(rounds_at_once, rounds - start)
-                    if rounds - start - now == 1:
-                        now += 1  # a pass of one sample has no variance
-                    last = start + now == rounds
-                    yield first, min(beams_at_once, beams - first), start, now, last
-                    start += now
+                    next_rounds = min(rounds_at_once, rounds - start)
+                    if rounds - start - next_rounds == 1:
+                        next_rounds += 1  # a pass of one sample has no variance
+                    last = start + next_rounds == rounds
+                    yield first, min(beams_at_once, beams - first), start, next_rounds, last
+                    start += next_rounds
 
         def _places(self, first: int, cells: int) -> list[UInt]:
             """Image indices of each quantity for a range of cells (beam by beam, gate by gate)."""
@@ -548,11 +549,8 @@ def define() -> type:
             if by_order:
                 means += [total / _opaque(rounds) for total in by_order.totals(parts)]
             if self.common:
-                # without the sample's number of the pass: of every beam the same passes are traced
-                odd = (
-                    dr.arange(mi.UInt32, dr.width(cell)) - cell * dr.opaque(mi.UInt32, rounds)
-                ) & 1
-                halves = dr.block_sum(dr.select(odd == 0, off[0], -off[0]), rounds)
+                # by the sample's number in its pass: passes are the same for all beams
+                halves = dr.block_sum(dr.select(number & 1 == 0, off[0], -off[0]), rounds)
                 means.append(halves / (MAGNIFIED * _opaque(rounds)))
             return (rounds, means, deviations, largest), lidar.rejected
 
@@ -581,6 +579,7 @@ def define() -> type:
             by_order = Orders(rows, self.max_order) if self.orders else None
             sums = [dr.zeros(mi.Float, rows) for _ in STOKES]
             products = {pair: dr.zeros(mi.Float, rows) for pair in self._products()}
+            # bits of floats of 0 or more, which are in order as integers too
             largest = dr.zeros(mi.UInt32, rows)
             lidar.analog(
                 sample,
@@ -598,15 +597,15 @@ def define() -> type:
             sums = [dr.block_sum(total, parts) for total in sums]
             products = {pair: dr.block_sum(total, parts) for pair, total in products.items()}
             largest = dr.block_reduce(dr.ReduceOp.Max, largest, parts)
-            number = _opaque(rounds)
-            means = [s / number for s in sums]
+            samples = _opaque(rounds)
+            means = [s / samples for s in sums]
             large = [MAGNIFIED * mean for mean in means]
             # here contributions are scattered to their gates before a mean is known; most are 0,
             # so that squares exceed the mean's by far and hardly cancel
-            deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
+            deviations = [p - samples * large[i] * large[j] for (i, j), p in products.items()]
             largest = dr.reinterpret_array(mi.Float, largest)
             if by_order:
-                means += [total / number for total in by_order.totals(parts)]
+                means += [total / samples for total in by_order.totals(parts)]
             return (rounds, means, deviations, largest), lidar.rejected
 
         def _products(self) -> tuple[tuple[int, int], ...]:
@@ -676,8 +675,8 @@ def _results(
     The last one is the fraction of the variance of S0 that comes from one sample.
     """
     errors = _errors(_opaque(number), deviations)
-    whole = deviations[0]
-    fraction = dr.select(whole > 0, dr.minimum(largest / whole, 1), 0)
+    total = deviations[0]
+    fraction = dr.select(total > 0, dr.minimum(largest / total, 1), 0)
     return [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:], fraction]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.experiment.stages.ideal_images import ideal_scan
-from lidar_mi.instrument.beams import steered_beams
+from lidar_mi.instrument.beams import Targets, steered_beams
 from lidar_mi.instrument.motion import Pose, attitude
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.instrument.scan_timing import ScanTiming
@@ -73,7 +73,7 @@ def wind_of(told, wind=WIND, pattern="raster", duration=DURATION, missed=(0.0, 0
             Pose(still, still, attitude(*(np.full(count, a) for a in turned)))
             for turned in ((0.0, 0.0, 0.0), angles)
         )
-        beams = steered_beams(time, places, plan.centre, 0.0, 0.0, true, level, body_fixed=False)
+        beams = steered_beams(Targets(time, places, plan.centre), 0.0, true, level)
         seen = air(states + (number - 0.5) * DT, wind).assign_coords(time=states)
         scans.append(ideal_scan(seen, replace(plan, beams=beams), gridded=False))
     scans = synchronised(scans, [DT], "Y")

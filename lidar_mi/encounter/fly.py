@@ -139,15 +139,16 @@ def fly(
     processes: int = 1,
     notice: Notice | None = None,
 ) -> Flights:
-    """Fly into the wake: without control, with an autopilot, steered by the lidar, by the truth.
+    """Fly into the wake, with and without a preview of its wind.
 
     All flights meet the same wake. Only the flight that the lidar steers renders its scans.
 
     Parameters
     ----------
     experiment : Experiment, str or path
-        With a section ``encounter``. Its ``control.mode`` says which flights: off alone; off,
-        autopilot and perfect; all four with feedforward.
+        With a section ``encounter``. Its ``control.mode`` says which flights: "off" with the wings
+        levelled only; "perfect" also with an autopilot without preview and with the true wind as
+        preview; "feedforward" also with the preview of the lidar.
     folder : path, optional
         Created if missing. If it holds flights of this experiment, only missing results are
         computed. Figures and a report are only made with a folder.
@@ -217,8 +218,8 @@ def fly(
         recorded = recorded_flight(replay, experiment)
         lidar = recorded_lidar(recorded, experiment)
     log = Log(notice)
-    for text in geometry(experiment, aircraft() if aircraft else None):
-        log.remark(text)
+    for warning in geometry(experiment, aircraft() if aircraft else None):
+        log.remark(warning)
     simulate = partial(
         _simulated,
         recorded,
@@ -244,7 +245,7 @@ def fly(
         # recognised in a folder
         reusable = not (lidar or aircraft or controller)
         try:
-            return _into(results, experiment, simulate, reusable, log)
+            return _completed(results, experiment, simulate, reusable, log)
         except BaseException as error:
             if is_interrupt(error):
                 error.add_note("start it again to fly again with the scans that are there")
@@ -261,7 +262,7 @@ def _simulated(recorded: FlightData | None, experiment: Experiment, **how: Any) 
     return data if recorded is None else with_recorded(data, recorded)
 
 
-def _into(
+def _completed(
     folder: EncounterFolder,
     experiment: Experiment,
     simulate: Callable[..., FlightData],
@@ -278,6 +279,7 @@ def _into(
         folder.write(data)
         log(f"flights simulated: {', '.join(map(str, data.series['flight'].values))}")
     if metrics is None:
+        # they are written last: without them the report is missing too
         metrics = encounter_metrics(data.series, data.track)
         write_report(folder, experiment, data, metrics, log)
     log("done")

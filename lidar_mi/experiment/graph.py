@@ -386,13 +386,13 @@ class Graph:
         search_path: str | Path,
         store: Store | None = None,
     ) -> Any:
-        """The result of a stage, saved if there is a store; those that it lacks are computed too.
+        """The result of a stage, saved if there is a store. Results that it needs come first.
 
         Parts that the store has are not computed, nor what only they need.
         """
         provided: dict[str, Any] = {"log": log, "search_path": Path(search_path)}
         if stage.parts is None:
-            result = stage.compute(**self._complete(stage, results, provided, store))
+            result = stage.compute(**self._inputs(stage, results, provided, store))
             if store:
                 store.store_result(stage.name, result)
             return result
@@ -407,18 +407,19 @@ class Graph:
         # inputs of parts that are all stored are not computed
         if missing:
             provided |= {"missing": missing, "store": store}
-            for name, part in stage.compute(**self._complete(stage, results, provided, store)):
+            for name, part in stage.compute(**self._inputs(stage, results, provided, store)):
                 # one by one: a stopped run goes on behind the last of them
                 there[name] = store.store_part(name, part) if store else part
         return there
 
-    def _complete(
+    def _inputs(
         self,
         stage: Stage,
         results: MutableMapping[str, Any],
         provided: dict[str, Any],
         store: Store | None,
     ) -> dict[str, Any]:
+        """The arguments of a stage; results that are missing are computed."""
         for name in self.needs(stage):
             # others were computed before
             if name not in results:

@@ -190,7 +190,7 @@ STAGES = (
     Stage("coherent_lines", coherent_lines, timing="lines"),
     Stage("line_winds", line_winds, has_profiles, timing="retrieve"),
     Stage("line_vortices", line_vortices, has_slices, timing="retrieve"),
-    # both as one sensor
+    # the backscatter and the Doppler lidar as one sensor
     Stage("requirements", requirement_tables, has_images, preflight=True),
     Stage("slab_wind", slab_wind, has_sensor, preflight=True),
     Stage("states", states_of_wind, preflight=True),

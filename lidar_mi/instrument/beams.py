@@ -50,22 +50,11 @@ def _crossings(origin: np.ndarray, direction: np.ndarray, x: float) -> np.ndarra
     return origin[:, 1:] + distance[:, None] * direction[:, 1:]
 
 
-def steered_beams(
-    time: np.ndarray,
-    places: np.ndarray,
-    distance: float,
-    position: float,
-    speed: float,
-    true: Pose,
-    reported: Pose,
-    *,
-    body_fixed: bool,
-    jitter: float = 0.0,
-    random: np.random.Generator | None = None,
-) -> Beams:
-    """The beams of a scanner that is steered by the reported pose, or fixed to the body.
+@dataclass(frozen=True)
+class Targets:
+    """Where the beams of a scan are to go.
 
-    Parameters
+    Attributes
     ----------
     time : (n,) array
         s from the scan's reference time.
@@ -74,6 +63,28 @@ def steered_beams(
         beams, as reported, go to these; beams fixed to the body go as if from a telescope at rest.
     position : float
         x of the telescope at the reference time, m, in the frame of the air.
+    """
+
+    time: np.ndarray
+    places: np.ndarray
+    distance: float
+    position: float = 0.0
+    body_fixed: bool = False
+
+
+def steered_beams(
+    targets: Targets,
+    speed: float,
+    true: Pose,
+    reported: Pose,
+    *,
+    jitter: float = 0.0,
+    random: np.random.Generator | None = None,
+) -> Beams:
+    """The beams of a scanner that is steered by the reported pose, or fixed to the body.
+
+    Parameters
+    ----------
     speed : float
         Of straight flight in the frame of the air, m/s.
     true, reported : Pose
@@ -86,11 +97,13 @@ def steered_beams(
     InputError
         A pose that takes the telescope beyond the plane or turns beams away from it.
     """
+    time, position = targets.time, targets.position
+    slab = position + targets.distance
     straight = np.zeros((len(time), 3))
     straight[:, 0] = position + speed * time
     origin, reported_origin = straight + true.place, straight + reported.place
-    target = np.column_stack([np.full(len(time), distance), places])
-    if body_fixed:
+    target = np.column_stack([np.full(len(time), targets.distance), targets.places])
+    if targets.body_fixed:
         reported_direction = reported.attitude.apply(_unit(target))
     else:
         reported_direction = _unit(target + np.array([position, 0.0, 0.0]) - reported_origin)
@@ -112,12 +125,12 @@ def steered_beams(
         ("true", origin, direction),
         ("reported", reported_origin, reported_direction),
     ):
-        behind = np.flatnonzero(places_from[:, 0] >= position + distance)
+        behind = np.flatnonzero(places_from[:, 0] >= slab)
         if behind.size:
             first = behind[0]
             raise InputError(
                 f"the {kind} place at {time[first]:g} s, x = {places_from[first, 0]:.4g} m, is not "
-                f"allowed; expected before the slab, {position + distance:.4g} m"
+                f"allowed; expected before the slab, {slab:.4g} m"
             )
         away = np.flatnonzero(going[:, 0] < _LEAST_AHEAD)
         if away.size:

@@ -57,6 +57,29 @@ class ViewingAid:
 
 
 @dataclass(frozen=True)
+class PulsedBeam:
+    """A pulsed Gaussian beam where it leaves the instrument.
+
+    Attributes
+    ----------
+    wavelength : float
+        m.
+    pulse_energy : float
+        J.
+    pulse_duration : float
+        s.
+    beam_radius, divergence_full : float
+        As of `exposure_at`.
+    """
+
+    wavelength: float
+    pulse_energy: float
+    pulse_duration: float
+    beam_radius: float
+    divergence_full: float
+
+
+@dataclass(frozen=True)
 class EyeSafety:
     """A pulsed beam's verdict.
 
@@ -265,11 +288,7 @@ def hazard_distance(
 
 
 def scan_hazard_distance(
-    wavelength: float,
-    pulse_energy: float,
-    pulse_duration: float,
-    beam_radius: float,
-    divergence_full: float,
+    beam: PulsedBeam,
     spacing: float,
     beams: int,
     scan_rate: float,
@@ -306,15 +325,20 @@ def scan_hazard_distance(
     _positive("beams", beams, "")
 
     def excess(distance: float) -> float:
-        radius2 = beam_radius**2 + (divergence_full / 2 * distance) ** 2
+        radius2 = beam.beam_radius**2 + (beam.divergence_full / 2 * distance) ** 2
         overlap = min(max(1.0, math.pi / 2 * radius2 / (spacing * distance) ** 2), beams)
         # beams that overlap may follow each other
         pulses = burst[0] * overlap
         limit = permissible_pulse(
-            wavelength, pulse_duration, scan_rate * pulses, exposure_duration, (pulses, burst[1])
+            beam.wavelength,
+            beam.pulse_duration,
+            scan_rate * pulses,
+            exposure_duration,
+            (pulses, burst[1]),
         )
-        beam = (pulse_energy, beam_radius, divergence_full, limit.aperture)
-        return exposure_at(distance, *beam) / limit.exposure - 1
+        shape = (beam.beam_radius, beam.divergence_full)
+        arrived = exposure_at(distance, beam.pulse_energy, *shape, limit.aperture)
+        return arrived / limit.exposure - 1
 
     # limits have steps where rules change: search for the farthest unsafe distance
     places = [10 ** (k / 20) for k in range(-40, 140)]
@@ -332,27 +356,24 @@ def scan_hazard_distance(
 
 
 def assess_pulses(
-    wavelength: float,
-    pulse_energy: float,
-    pulse_duration: float,
-    beam_radius: float,
-    divergence_full: float,
+    beam: PulsedBeam,
     repetition_rate: float = 0.0,
     exposure_duration: float | None = None,
     extinction: float = 0.0,
     aid: ViewingAid | None = None,
     burst: tuple[float, float] = (1, 0),
 ) -> EyeSafety:
-    """Eye safety of a pulsed Gaussian beam; see `permissible_pulse` and `exposure_at`.
+    """Eye safety of a beam; see `permissible_pulse` and `exposure_at`.
 
     ``exposure_duration`` is by default the standard's `time_base`, ``aid`` binoculars 7 x 50.
     """
+    wavelength, energy = beam.wavelength, beam.pulse_energy
     total = time_base(wavelength) if exposure_duration is None else exposure_duration
-    limit = permissible_pulse(wavelength, pulse_duration, repetition_rate, total, burst)
-    beam = (beam_radius, divergence_full)
-    naked = hazard_distance(pulse_energy, limit, *beam, extinction)
-    aided = hazard_distance(pulse_energy, limit, *beam, extinction, aid or ViewingAid())
-    exit_exposure = exposure_at(0.0, pulse_energy, *beam, limit.aperture)
+    limit = permissible_pulse(wavelength, beam.pulse_duration, repetition_rate, total, burst)
+    shape = (beam.beam_radius, beam.divergence_full)
+    naked = hazard_distance(energy, limit, *shape, extinction)
+    aided = hazard_distance(energy, limit, *shape, extinction, aid or ViewingAid())
+    exit_exposure = exposure_at(0.0, energy, *shape, limit.aperture)
     return EyeSafety(limit, exit_exposure, naked, aided)
 
 

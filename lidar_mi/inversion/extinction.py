@@ -14,6 +14,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.inversion.layers import Layers
 from lidar_mi.inversion.scoring import Fit, Known, fit
 from lidar_mi.rendering.backscatter import ScanRenderer
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.extinction.profile import numbers
@@ -39,7 +40,7 @@ class LayeredAir:
         Middles of the layers whose mean extinction is sought, m, equally spaced. Thinner ones than
         gates are known by the prior more than by the counts.
     phase : dict
-        Mitsuba phase function, as `rendering.backscatter.render_scans` takes it.
+        Mitsuba phase function, as `rendering.phase.ScatteringAir` has it.
     albedo : float
         Of single scattering.
     environment : float
@@ -228,9 +229,8 @@ def _renderer(
     air: LayeredAir,
     settings: RenderSettings,
 ) -> ScanRenderer:
-    return ScanRenderer(
-        _grid(profile, plan, air), plan, lidar, air.environment, air.phase, air.albedo, settings
-    )
+    around = ScatteringAir(air.environment, air.phase, air.albedo)
+    return ScanRenderer(_grid(profile, plan, air), plan, lidar, around, settings)
 
 
 def _grid(profile: np.ndarray, plan: ScanPlan, air: LayeredAir) -> xr.DataArray:

@@ -15,10 +15,10 @@ from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.io.exr import label_scan, unpack
-from lidar_mi.rendering.batches import Batches
+from lidar_mi.rendering.batches import ALL_IMAGES, Batches, Series
 from lidar_mi.rendering.memory import samples_at_once
 from lidar_mi.rendering.passes import within_memory
-from lidar_mi.rendering.phase import Molecules, loadable
+from lidar_mi.rendering.phase import Molecules, ScatteringAir, loadable
 from lidar_mi.rendering.settings import RenderSettings
 
 MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
@@ -95,15 +95,10 @@ def render_scans(
     extinctions: Sequence[xr.DataArray],
     plans: Sequence[ScanPlan],
     lidar: BackscatterLidar,
-    environment: float,
-    phase: dict[str, Any],
-    albedo: float,
+    air: ScatteringAir,
     settings: RenderSettings,
     seed: int,
-    progress: Callable[[int, int, int], None] | None = None,
-    scans: Sequence[int] | None = None,
-    molecules: Molecules | None = None,
-    batches: Callable[[int], Batches] | None = None,
+    series: Series = ALL_IMAGES,
 ) -> Iterator[xr.Dataset]:
     """Render one scan after the other in one scene; only the first compiles anything.
 
@@ -114,23 +109,13 @@ def render_scans(
         scan, all on one grid; a single x plane has its depth in ``x.attrs["cell_width"]``. With a
         first dimension ``time`` (s, equally spaced, from the scan's reference time) every beam
         meets the air of its own time, linear between these states.
-    environment : float
-        Extinction coefficient around the slab and up to it, m^-1.
-    phase : dict
-        Mitsuba phase function of slab and environment, also with a table as an array.
-    albedo : float
-        Single-scattering albedo of slab and environment.
+    air : ScatteringAir
+        Around the slab and up to it; its molecules are part of all ``extinctions``.
     seed : int
         Scan k uses `RenderSettings.scan_seed`: seed + k * 2^16, well separated for neighbouring
         experiments, or with common random numbers the same seed.
-    progress : callable, optional
-        Called with (scan, samples done, samples in all).
-    scans : sequence of int, optional
-        Which of the scans to render; default: all.
-    molecules : Molecules, optional
-        Part of all ``extinctions`` and of ``environment`` with a phase function of its own.
-    batches : callable, optional
-        Returns the store of a scan's samples while it is rendered.
+    series : Series
+        Which of the scans to render.
 
     Yields
     ------
@@ -143,17 +128,14 @@ def render_scans(
         a beam as reported crosses the plane in the middle of the gates. One scan at a time, as soon
         as it is rendered.
     """
-    chosen = list(range(len(plans)) if scans is None else scans)
     renderer = None
-    for index in chosen:
-        air, plan = extinctions[index], plans[index]
+    for index in range(len(plans)) if series.wanted is None else series.wanted:
+        extinction, plan = extinctions[index], plans[index]
         if renderer is None:
-            renderer = ScanRenderer(
-                air, plan, lidar, environment, phase, albedo, settings, molecules
-            )
-        report = partial(progress, index) if progress else None
-        store = batches(index) if batches else None
-        yield renderer.render(air, plan, settings.scan_seed(seed, index), report, store)
+            renderer = ScanRenderer(extinction, plan, lidar, air, settings)
+        report = partial(series.progress, index) if series.progress else None
+        store = series.batches(index) if series.batches else None
+        yield renderer.render(extinction, plan, settings.scan_seed(seed, index), report, store)
 
 
 class ScanRenderer:
@@ -165,7 +147,7 @@ class ScanRenderer:
         Of the first scan; those of all others are on its grid.
     plan : ScanPlan
         Of the first scan; all others have as many beams and gates.
-    lidar, environment, phase, albedo, settings, molecules
+    lidar, air, settings
         As `render_scans` takes them.
     """
 
@@ -174,19 +156,14 @@ class ScanRenderer:
         extinction: xr.DataArray,
         plan: ScanPlan,
         lidar: BackscatterLidar,
-        environment: float,
-        phase: dict[str, Any],
-        albedo: float,
+        air: ScatteringAir,
         settings: RenderSettings,
-        molecules: Molecules | None = None,
     ) -> None:
         import mitsuba as mi
 
-        air = (environment, phase, albedo, settings, molecules)
-        self._scene = mi.load_dict(scene_dict(extinction, plan, lidar, *air))
+        self._scene = mi.load_dict(scene_dict(extinction, plan, lidar, air, settings))
         self._parameters = mi.traverse(self._scene)
-        self._lidar, self._environment, self._settings = lidar, environment, settings
-        self._albedo, self._molecules = albedo, molecules
+        self._lidar, self._air, self._settings = lidar, air, settings
 
     def render(
         self,
@@ -210,15 +187,15 @@ class ScanRenderer:
         import drjit as dr
         import mitsuba as mi
 
-        _move(self._parameters, extinction, plan, self._albedo, self._molecules)
+        _move(self._parameters, extinction, plan, self._air)
         integrator = self._scene.integrator()
         integrator.progress, integrator.batches = progress, batches
         start = time.perf_counter()
         seed %= 2**31  # a header holds 32 bits with a sign
         image = within_memory(integrator, lambda: np.array(mi.render(self._scene, seed=seed)))
         dr.flush_malloc_cache()  # the buffers of the tracing are as large as the image
-        names = integrator.quantities()
-        scan = _as_dataset(image, names, plan, self._lidar, self._environment, self._settings, seed)
+        names, environment = integrator.quantities(), self._air.extinction
+        scan = _as_dataset(image, names, plan, self._lidar, environment, self._settings, seed)
         earlier = batches.seconds if batches else 0.0
         scan.attrs |= {"lit_pixels": integrator.lit, "untrusted_pixels": integrator.untrusted}
         scan.attrs["render_seconds"] = earlier + time.perf_counter() - start
@@ -229,11 +206,8 @@ def scene_dict(
     extinction: xr.DataArray,
     plan: ScanPlan,
     lidar: BackscatterLidar,
-    environment: float,
-    phase: dict[str, Any],
-    albedo: float,
+    air: ScatteringAir,
     settings: RenderSettings,
-    molecules: Molecules | None = None,
 ) -> dict[str, Any]:
     """The Mitsuba scene of one scan as a dictionary for ``mi.load_dict``."""
     import mitsuba as mi
@@ -249,14 +223,14 @@ def scene_dict(
         grid = mi.VolumeGrid(_voxels(field))
         return {"type": "gridvolume", "grid": grid, "to_world": place, "accel": False}
 
-    phase = loadable(phase)
-    around = within = {"albedo": albedo, "phase": phase}
-    if molecules:
-        mixed_albedo, fraction = _mixed(xr.DataArray(environment), albedo, molecules)
-        mixture = _blend(phase, molecules, float(fraction))
+    phase = loadable(air.phase)
+    around = within = {"albedo": air.albedo, "phase": phase}
+    if air.molecules:
+        mixed_albedo, fraction = _mixed(xr.DataArray(air.extinction), air.albedo, air.molecules)
+        mixture = _blend(phase, air.molecules, float(fraction))
         around = {"albedo": float(mixed_albedo), "phase": mixture}
-        mixed_albedo, fraction = _mixed(extinction, albedo, molecules)
-        mixture = _blend(phase, molecules, volume(fraction))
+        mixed_albedo, fraction = _mixed(extinction, air.albedo, air.molecules)
+        mixture = _blend(phase, air.molecules, volume(fraction))
         within = {"albedo": volume(mixed_albedo), "phase": mixture}
     return {
         "type": "scene",
@@ -273,7 +247,7 @@ def scene_dict(
                 settings.given_per_pass, settings.memory, mi.variant()
             ),
         },
-        "environment": {"type": "homogeneous", "sigma_t": environment, **around},
+        "environment": {"type": "homogeneous", "sigma_t": air.extinction, **around},
         "sensor": {
             "type": "scanning_lidar",
             "aperture_radius": lidar.aperture_radius,
@@ -330,13 +304,7 @@ def _blend(
     return {"type": "blendphase", "weight": fraction, "others": phase, "molecules": molecules.phase}
 
 
-def _move(
-    parameters: Any,
-    extinction: xr.DataArray,
-    plan: ScanPlan,
-    albedo: float,
-    molecules: Molecules | None,
-) -> None:
+def _move(parameters: Any, extinction: xr.DataArray, plan: ScanPlan, air: ScatteringAir) -> None:
     """Update the telescope, its beams and the air in the slab to a later scan."""
     import mitsuba as mi
 
@@ -348,8 +316,8 @@ def _move(
     parameters["sensor.gate_start"] = plan.gate_start
     parameters["sensor.gate_stop"] = plan.gate_stop
     fields = {"sigma_t": extinction}
-    if molecules:
-        mixed_albedo, fraction = _mixed(extinction, albedo, molecules)
+    if air.molecules:
+        mixed_albedo, fraction = _mixed(extinction, air.albedo, air.molecules)
         fields |= {"albedo": mixed_albedo, "phase_function.weight": fraction}
     for name, field in fields.items():
         parameters[f"slab.interior_medium.{name}.data"] = mi.TensorXf(_voxels(field))

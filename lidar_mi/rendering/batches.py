@@ -1,7 +1,8 @@
-"""Storage of the finished samples of an image while it is rendered."""
+"""Images that are rendered one after the other, and storage of the samples of an unfinished one."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -55,3 +56,26 @@ class Batches:
         end = time.monotonic()
         # for large images on slow disks, at most 10 % of the time is spent on storage
         self._next = end + max(INTERVAL, 10 * (end - start))
+
+
+@dataclass(frozen=True)
+class Series:
+    """Which images of a series are rendered, and who follows it; all by their number.
+
+    Attributes
+    ----------
+    wanted : sequence of int, optional
+        Default: all.
+    progress : callable, optional
+        Called with (image, samples done, samples in all).
+    batches : callable, optional
+        Gives the store of an image's samples while it is rendered.
+    """
+
+    wanted: Sequence[int] | None = None
+    progress: Callable[[int, int, int], None] | None = None
+    batches: Callable[[int], Batches] | None = None
+
+
+ALL_IMAGES = Series()
+"""Of a series that nobody follows."""

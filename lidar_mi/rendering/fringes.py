@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.instrument.lens import singlet
 from lidar_mi.io.exr import label_fringes
-from lidar_mi.rendering.batches import Batches
+from lidar_mi.rendering.batches import ALL_IMAGES, Series
 from lidar_mi.rendering.memory import samples_at_once
 from lidar_mi.rendering.passes import within_memory
 from lidar_mi.rendering.settings import FringeSettings
@@ -34,9 +34,7 @@ def render_fringes(
     v_los: Sequence[float],
     settings: FringeSettings,
     seed: int = 0,
-    progress: Callable[[int, int, int], None] | None = None,
-    images: Sequence[int] | None = None,
-    batches: Callable[[int], Batches] | None = None,
+    series: Series = ALL_IMAGES,
 ) -> Iterator[xr.Dataset]:
     """Render one velocity after the other in one scene; only the first compiles kernels.
 
@@ -50,12 +48,8 @@ def render_fringes(
         m/s; positive when the air approaches.
     seed : int
         Image k uses seed + k * 2^16.
-    progress : callable, optional
-        Called with (image number, paths done, paths in all).
-    images : sequence of int, optional
-        Which of the velocities to render; default: all.
-    batches : callable, optional
-        Gives what keeps the paths of an image while it is rendered, by the image's number.
+    series : Series
+        Which of the velocities to render; its samples are paths.
 
     Yields
     ------
@@ -76,13 +70,13 @@ def render_fringes(
         raise InputError(f"v_los: {wrong:g} m/s is not allowed; expected finite speeds")
     scene = mi.load_dict(scene_dict(etalon, camera, line, settings))
     parameters = mi.traverse(scene)
-    for index in range(len(speeds)) if images is None else images:
+    for index in range(len(speeds)) if series.wanted is None else series.wanted:
         speed = speeds[index]
         parameters["line.v_los"] = float(speed)
         parameters.update()
-        if progress:
+        if progress := series.progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
-        store = batches(index) if batches else None
+        store = series.batches(index) if series.batches else None
         scene.integrator().batches = store
         start = time.perf_counter()
         image = render_image(scene, seed=(seed + (index << 16)) % 2**31)

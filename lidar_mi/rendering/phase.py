@@ -34,6 +34,25 @@ class Molecules(NamedTuple):
     albedo: float
 
 
+class ScatteringAir(NamedTuple):
+    """Of what a scene is full: the surroundings of a slab, and how both scatter.
+
+    Attributes
+    ----------
+    extinction : float
+        Of the surroundings, m^-1.
+    phase, albedo
+        As of `Scatterer`, of slab and surroundings; ``phase`` also with a table as an array.
+    molecules : Molecules, optional
+        Part of the extinction, here and in the slab, with a phase function of its own.
+    """
+
+    extinction: float
+    phase: dict[str, Any]
+    albedo: float
+    molecules: Molecules | None = None
+
+
 def molecules(extinction: float, wavelength: float, band: str = "cabannes") -> Molecules | None:
     """Molecules of a given extinction coefficient; None without any.
 

@@ -1,8 +1,8 @@
-"""The aircraft that rises and pitches, against closed forms and an independent solution.
+"""The aircraft that rises and pitches, against closed forms.
 
-Detects 1 % in a load factor, a derivative, a mode or a bending moment, a wrong sign of pitch,
-elevator or symmetric aileron, a tail that meets a gust with the wing, roll that differs from that
-of the roll model.
+Detects 1 % in a derivative or a bending moment, a wrong sign of pitch, elevator or symmetric
+aileron, roll that differs from that of the roll model. `validation.loads` has gusts, the pull-up
+and the short period; tests/validation runs it.
 """
 
 import numpy as np
@@ -87,49 +87,6 @@ def test_static_margin_and_pitch_damping():
     assert -40 < moment[2] / unit < -25 and -17 < moment[1] / unit < -11
 
 
-def test_short_period():
-    """Frequency and damping of the free motion against the quadratic of its derivatives.
-
-    In alpha and q with the force derivatives of rates neglected, but for F_q (Etkin and Reid 1996,
-    equation 6.3,14): they differ by F_alpha' / m V, 1 %.
-    """
-    one = model()
-    (f_alpha, _, f_q), (m_alpha, m_late, m_q) = derivatives_of(Aircraft(), SPEED, one.density)[
-        :, :3
-    ]
-    inertia = 2.1e6
-    lift, turn = f_alpha / (MASS * SPEED), 1 - f_q / (MASS * SPEED)
-    damping = lift - (m_q + m_late * turn) / inertia
-    stiffness = lift * -m_q / inertia - m_alpha * turn / inertia
-    one.state = AircraftState(pitch_rate=0.01, airspeed=SPEED)
-    states = flown(one, 12.0)
-    # of the angle of attack alone: pitch has an integrator
-    alpha = of(states, "pitch") - of(states, "vertical_speed") / SPEED
-    # alpha'' + damping alpha' + stiffness alpha = 0, by prediction of the next sample
-    lags = np.stack([alpha[1:-1:1], alpha[:-2]], -1)
-    first, second = np.linalg.lstsq(lags[:600], alpha[2:][:600], rcond=None)[0]
-    roots = np.log(np.roots([1, -first, -second]).astype(complex)) / 0.01
-    assert -roots.sum().real == pytest.approx(damping, rel=0.02)
-    assert roots.prod().real == pytest.approx(stiffness, rel=0.02)
-    ratio = damping / (2 * np.sqrt(stiffness))
-    assert 0.35 < ratio < 1.3  # level 1 of MIL-F-8785C, category C
-
-
-def test_steady_pull_up():
-    """n - 1 = V q / g, and the elevator per g from the balance of moments."""
-    one = model()
-    states = flown(one, 20.0, commands=Commands(elevator=-0.02))
-    load, q = states[-1].load_factor - 1, states[-1].pitch_rate
-    assert q > 0.001 and load == pytest.approx(SPEED * q / g, rel=1e-6)
-    force, moment = derivatives_of(Aircraft(), SPEED, one.density)
-    # alpha is constant: force and moment by alpha, q and elevator
-    left = np.array([[force[0], force[2] - MASS * SPEED], [moment[0], moment[2]]])
-    alpha, expected = np.linalg.solve(left, 0.02 * np.array([force[3], moment[3]]))
-    assert q == pytest.approx(expected, rel=1e-5)
-    found = states[-1].pitch - states[-1].vertical_speed / SPEED
-    assert found == pytest.approx(alpha, rel=1e-5)
-
-
 def test_a_force_moves_the_mass_and_a_moment_turns_it():
     """At once: h'' = F / m but for the downwash of the rate of alpha (1 %), q' = M / I."""
     state = model().step(1e-3, Loads(np.array([0, 0, 1e4]), np.zeros(3)), Commands())
@@ -160,90 +117,6 @@ def test_roll_is_that_of_the_roll_model():
 
 
 # --- gusts ------------------------------------------------------------------------------------
-
-
-def test_sharp_edged_gust():
-    """rho V a U / (2 W / S) (Pratt and Walker 1954, equation 1) while the wing alone is in it."""
-    one, gust = model(), 3.0
-    first = 10.0
-    states = flown(one, 0.4, lambda x, t: gust * (x > first), step=1e-3)
-    enters = (first - wing_place(Aircraft())) / SPEED
-    after = int(np.searchsorted(of(states, "time"), enters)) + 1
-    sharp = one.density * SPEED * SLOPE * gust * AREA / (2 * MASS * g)
-    # the aircraft has not moved yet
-    assert states[after].load_factor - 1 == pytest.approx(sharp, rel=0.02)
-    # the tail follows, with the downwash of a wing that is in the gust
-    later = int(np.searchsorted(of(states, "time"), (first + ARM) / SPEED))
-    step = states[later + 1].load_factor - states[later - 1].load_factor
-    tail = sharp * (TAIL_SLOPE * TAIL_AREA / (SLOPE * AREA)) * (1 - DOWNWASH)
-    assert step == pytest.approx(tail, rel=0.05)
-
-
-def test_gust_alleviation_factor():
-    """Pratt's K = 0.88 mu / (5.3 + mu), of a gust of 25 chords on an aircraft that only rises.
-
-    K is for unsteady lift, which never reaches 0.12 of the quasi-steady lift's peak.
-    """
-    gust, chords = 3.0, 12.5 * CHORD
-    one = model(pitch_inertia=1e9, tail_area=0.011)
-
-    def profile(x, t):
-        inside = (x > 10) & (x < 10 + 2 * chords)
-        return np.where(inside, gust / 2 * (1 - np.cos(np.pi * (x - 10) / chords)), 0.0)
-
-    largest = (of(flown(one, 2.5, profile), "load_factor") - 1).max()
-    sharp = one.density * SPEED * SLOPE * gust * AREA / (2 * MASS * g)
-    mu = 2 * MASS / (one.density * CHORD * AREA * SLOPE)
-    assert largest / sharp == pytest.approx(mu / (5.3 + mu), rel=0.03)
-
-
-def transfer(omega, density):
-    """Load factor per vertical gust at the centre of gravity, with the delays as they are.
-
-    An independent solution: force and moment of wing and tail at x_w and x_t in a frozen wave, the
-    downwash as late as it is.
-    """
-    place, lift = wing_place(Aircraft()), 0.5 * density * SPEED
-    wing, tail = lift * AREA * SLOPE, lift * TAIL_AREA * TAIL_SLOPE
-    late = np.exp(-1j * omega * (place + ARM) / SPEED)
-
-    def at(x):
-        return np.exp(1j * omega * x / SPEED)  # of a wave that is met at the centre at time 0
-
-    # air along the normals, per h and theta, and by the gust
-    by_wing = np.array([-1j * omega, SPEED - 1j * omega * place, at(place)])
-    by_tail = np.array([-1j * omega, SPEED + 1j * omega * ARM, at(-ARM)])
-    by_tail = by_tail - DOWNWASH * late * by_wing
-    force = wing * by_wing + tail * by_tail
-    moment = wing * place * by_wing - tail * ARM * by_tail
-    left = np.diag([-(omega**2) * MASS, -(omega**2) * 2.1e6]) - [force[:2], moment[:2]]
-    h, _ = np.linalg.solve(left, [force[2], moment[2]])
-    return -(omega**2) * h / g
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("omega", [0.5, 1.0, 2.0, 4.0])
-def test_transfer_function_of_a_gust(omega):
-    """Against the resolvent of its equations (0.2 %), and the solution with true delays."""
-    one, gust = model(), 1.0
-    states = flown(one, 12 + 2 * 2 * np.pi / omega, lambda x, t: gust * np.cos(omega * x / SPEED))
-    time, load = of(states, "time"), of(states, "load_factor") - 1
-    # the last two periods: amplitude and phase
-    last = time > time[-1] - 4 * np.pi / omega
-    basis = np.stack([np.cos(omega * time), -np.sin(omega * time)], -1)[last]
-    real, imaginary = np.linalg.lstsq(basis, load[last], rcond=None)[0]
-    found = real + 1j * imaginary
-    heave, gusts = one.heave, np.exp(1j * omega * one.strips.places[:, 0] / SPEED)
-    weight = 0.5 * one.density * SPEED * one.strips.areas * one.strips.slopes * gusts
-    wind = np.array([weight.sum(), -(weight @ one.strips.places[:, 0])])
-    output, direct = heave.motion[:1] / g, heave.wind[:1] / g
-    resolvent = np.linalg.inv(1j * omega * np.eye(3) - heave.motion)
-    answer = (output @ resolvent @ heave.wind @ wind)[0]
-    # loads are held over steps of 10 ms: late by half a step in the motion, by one in the force
-    held, force = np.exp(-0.5j * omega * 0.01), (direct @ wind)[0]
-    assert found == pytest.approx(answer * held + force * held**2, rel=2e-3)
-    late = transfer(omega, one.density) - force
-    assert found == pytest.approx(late * held + force * held**2, rel=0.03)
 
 
 # --- bending, and symmetric ailerons ----------------------------------------------------------

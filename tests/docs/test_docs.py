@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 import yaml
 from pydantic import BaseModel
 
@@ -130,36 +129,6 @@ def test_plugin_reference_does_not_guess(docstring, message):
 
 
 # --- the table of wake_changing --------------------------------------------------------------
-
-
-def test_table_of_winds_from_their_errors():
-    """Four vectors, one of them flagged: errors of 0.3 and 0.4, of 1 and 2 standard errors."""
-    script = runpy.run_path(str(DOCS / "make_wake_changing.py"))
-    zeros = np.zeros((2, 2))
-    wind = xr.Dataset(
-        {
-            "v": (("z", "y"), [[0.3, -0.3], [0.3, 9.0]]),
-            "w": (("z", "y"), [[0.4, 0.4], [-0.4, 9.0]]),
-            "flag": (("z", "y"), [[0, 0], [0, 1]]),
-        }
-        | {f"{name}_true": (("z", "y"), zeros) for name in "vw"}
-        | {"v_stderr": (("z", "y"), zeros + 0.31), "w_stderr": (("z", "y"), zeros + 0.2)}
-    )
-    cells = "| 0.30 | 0.40 | 75 % | 50 / 50 % | 2.47 |"  # (0.94 + 4) / 2
-    assert script["row"]("a", "b", wind) == f"| a | b {cells}"
-    flagged = wind.assign(flag=wind["flag"] + 1)
-    assert script["row"]("a", "b", flagged) == "| a | b | - | - | 0 % | - | - |"
-
-
-def test_page_of_wake_changing_has_its_table():
-    script = runpy.run_path(str(DOCS / "make_wake_changing.py"))
-    page = script["PAGE"].read_text(encoding="utf-8")
-    assert script["HEAD"] in page
-    changed = script["with_table"](page, "| new |")
-    assert "| new |" in changed and script["HEAD"] not in changed
-    assert script["with_table"](changed, "| old |") == changed.replace("| new |", "| old |")
-    with pytest.raises(ValueError, match="winds: begin"):
-        script["with_table"]("no marks", "| new |")
 
 
 # --- the experiment file --------------------------------------------------------------------

@@ -1,6 +1,5 @@
-"""The page of JSBSim's aircraft says which fly: detects an outcome that is another one.
-
-A sample of the rows, and all of them in the slow tests.
+"""The page of JSBSim's aircraft says which fly: detects an outcome that is another one,
+in a sample of the rows.
 """
 
 import random
@@ -48,9 +47,3 @@ def test_all_are_listed():
 @pytest.mark.slow
 def test_some_do_as_listed(capfd):
     assert rows_as_flown(SAMPLE, capfd) == {name: ROWS[name] for name in SAMPLE}
-
-
-@pytest.mark.slow
-@of_this_version
-def test_all_do_as_listed(capfd):
-    assert rows_as_flown(ROWS, capfd) == ROWS

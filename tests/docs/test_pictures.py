@@ -40,13 +40,6 @@ def test_makers_name_what_there_is():
         assert (ROOT / "examples" / f"{example}.py").is_file()
 
 
-def test_every_picture_of_the_validation_has_a_check():
-    checks = "\n".join(path.read_text() for path in (ROOT / "validation").rglob("*.py"))
-    for path in DOCS.glob("validation/*.png"):
-        name = path.stem
-        assert name in checks or name.rpartition("_")[0] in checks, name
-
-
 def test_every_picture_is_on_a_page():
     pages = "\n".join(path.read_text() for path in (*DOCS.rglob("*.md"), ROOT / "README.md"))
     for path in (*DOCS.glob("pictures/**/*.png"), *DOCS.glob("validation/*.png")):

@@ -14,9 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 DOCS = Path(__file__).parents[2] / "docs"
 NEEDED = ("sphinx", "myst_parser", "furo", "latex2mathml")
@@ -162,23 +160,3 @@ def test_site_is_built_without_a_warning(tmp_path):
     # no script or style from elsewhere: it opens offline
     for page in (tmp_path / "site").rglob("*.html"):
         assert not re.search(r'(?:src|href)="https?://[^"]+\.(?:js|css)', page.read_text())
-
-
-@with_sphinx
-def test_pictures_of_two_panels_are_stacked_on_a_small_screen(tmp_path):
-    """A red and a blue panel with white between them; a picture of one panel stays."""
-    conf = runpy.run_path(str(DOCS / "conf.py"))
-    pixels = np.full((40, 100, 3), 255, np.uint8)
-    pixels[:, 2:48], pixels[:, 52:98] = (200, 0, 0), (0, 0, 200)
-    Image.fromarray(pixels).save(tmp_path / "two.png")
-    column = np.asarray(conf["stacked"](tmp_path / "two.png"))
-    assert column.shape[0] == 80 and column.shape[1] < 60
-    assert column[20, 20].tolist() == [200, 0, 0] and column[60, 20].tolist() == [0, 0, 200]
-    Image.fromarray(pixels[:, :50]).save(tmp_path / "one.png")
-    assert conf["stacked"](tmp_path / "one.png") is None
-    text = '<p><img alt="A" src="../_images/two.png" /></p><img alt="B" src="_images/one.png" />'
-    page = conf["with_narrow"](text, {"two.png": "two.narrow.webp"})
-    assert (
-        'srcset="../_images/two.narrow.webp"><img alt="A" src="../_images/two.png" /></pic' in page
-    )
-    assert page.endswith('</p><img alt="B" src="_images/one.png" />')

@@ -15,6 +15,7 @@ import pytest
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.eye_safety import (
+    PulsedBeam,
     PulseLimit,
     ViewingAid,
     assess_pulses,
@@ -237,7 +238,7 @@ def test_binoculars_see_seven_times_farther():
 
 
 def test_safe_at_the_exit_and_never_safe():
-    eye_safe = assess_pulses(1550e-9, 1e-3, 10e-9, 0.05, 1e-3, 10.0)
+    eye_safe = assess_pulses(PulsedBeam(1550e-9, 1e-3, 10e-9, 0.05, 1e-3), 10.0)
     assert eye_safe.hazard_distance == eye_safe.aided_hazard_distance == 0
     assert eye_safe.exposure_at_exit == pytest.approx(2e-3 / (math.pi * 0.05**2), rel=2e-3)
     assert math.isinf(hazard_distance(0.1, permissible_pulse(532e-9, 1e-8, 0, 1), 0.01, 0.0))
@@ -251,15 +252,22 @@ def test_distances_of_the_default_lidars():
     """As the theory quotes them."""
     lidar, doppler = BackscatterLidar(), DopplerLidar()
     beam = float(lidar.radius_at(0)), lidar.divergence_full
-    green = assess_pulses(lidar.wavelength, lidar.pulse_energy, 10e-9, *beam)
+    green = assess_pulses(PulsedBeam(lidar.wavelength, lidar.pulse_energy, 10e-9, *beam))
     assert green.hazard_distance == pytest.approx(558, abs=0.5)
     assert green.aided_hazard_distance == pytest.approx(3.9e3, abs=50)
     for wavelength in (355e-9, 1550e-9):
-        train = assess_pulses(wavelength, lidar.pulse_energy, 10e-9, *beam, 20.0, 10.0)
+        invisible = PulsedBeam(wavelength, lidar.pulse_energy, 10e-9, *beam)
+        train = assess_pulses(invisible, 20.0, 10.0)
         assert train.hazard_distance == train.aided_hazard_distance == 0
-    beam = doppler.pulse_duration, doppler.beam_radius, doppler.divergence_full
+    beam = PulsedBeam(
+        doppler.wavelength,
+        doppler.pulse_energy,
+        doppler.pulse_duration,
+        doppler.beam_radius,
+        doppler.divergence_full,
+    )
     for rate, distance in ((0.0, 52), (200.0, 365)):
-        found = assess_pulses(doppler.wavelength, doppler.pulse_energy, *beam, rate, 10.0)
+        found = assess_pulses(beam, rate, 10.0)
         assert found.hazard_distance == pytest.approx(distance, abs=0.5)
 
 
@@ -276,9 +284,12 @@ def test_distances_of_the_default_lidars():
         (lambda: permissible_pulse(532e-9, 1e-8, -1.0, 1.0), "repetition_rate: -1.0 Hz"),
         (lambda: permissible_pulse(532e-9, 1e-3, 1e4, 1.0), "repetition_rate: 10000 Hz"),
         (lambda: permissible_pulse(532e-9, 1e-3, 1.0, 1e6), "exposure_duration: 1e+06 s"),
-        (lambda: assess_pulses(532e-9, 0.0, 1e-8, 0.1, 1e-3), "energy: 0.0 J"),
-        (lambda: assess_pulses(532e-9, 1.0, 1e-8, 0.0, 1e-3), "beam_radius: 0.0 m"),
-        (lambda: assess_pulses(532e-9, 1.0, 1e-8, 0.1, -1e-3), "divergence_full: -0.001 rad"),
+        (lambda: assess_pulses(PulsedBeam(532e-9, 0.0, 1e-8, 0.1, 1e-3)), "energy: 0.0 J"),
+        (lambda: assess_pulses(PulsedBeam(532e-9, 1.0, 1e-8, 0.0, 1e-3)), "beam_radius: 0.0 m"),
+        (
+            lambda: assess_pulses(PulsedBeam(532e-9, 1.0, 1e-8, 0.1, -1e-3)),
+            "divergence_full: -0.001 rad",
+        ),
         (lambda: ViewingAid(magnification=0), "viewing_aid.magnification: 0"),
     ],
 )
@@ -293,25 +304,25 @@ def test_bad_input_is_named(call, start):
 
 def test_scan_whose_light_adds_up():
     """Infrared, 10 s: E rate t / (spacing r)^2 = 1e4 J/m^2 where beams overlap; 1e-3 J: 3.16 m."""
-    beam = {"beam_radius": 0.08, "divergence_full": 2e-3, "spacing": 1e-3, "beams": 30441}
+    scan = {"spacing": 1e-3, "beams": 30441, "scan_rate": 10, "exposure_duration": 10}
     for energy in (1e-3, 1e-2):
-        found = scan_hazard_distance(
-            1550e-9, energy, 1e-8, **beam, scan_rate=10, exposure_duration=10
-        )
+        found = scan_hazard_distance(PulsedBeam(1550e-9, energy, 1e-8, 0.08, 2e-3), **scan)
         assert found == pytest.approx(math.sqrt(energy * 100 / 1e4) / 1e-3, rel=0.01)
 
 
 def test_scan_of_beams_far_apart_is_one_beam():
     """Green, single pulses decide: as `hazard_distance`, wherever no neighbour overlaps."""
-    one = assess_pulses(532e-9, 1e-3, 1e-8, 0.08, 2e-3, 10, 10)
-    wide = scan_hazard_distance(532e-9, 1e-3, 1e-8, 0.08, 2e-3, 5e-3, 100, 10, 10)
+    beam = PulsedBeam(532e-9, 1e-3, 1e-8, 0.08, 2e-3)
+    one = assess_pulses(beam, 10, 10)
+    wide = scan_hazard_distance(beam, 5e-3, 100, 10, 10)
     assert wide == pytest.approx(one.hazard_distance, rel=1e-4)
 
 
 def test_weak_scan_is_safe_everywhere_and_none_without_spacing():
-    assert scan_hazard_distance(1550e-9, 1e-9, 1e-8, 0.08, 2e-3, 1e-3, 100, 10, 10) == 0
+    weak = PulsedBeam(1550e-9, 1e-9, 1e-8, 0.08, 2e-3)
+    assert scan_hazard_distance(weak, 1e-3, 100, 10, 10) == 0
     with pytest.raises(InputError, match=r"spacing: 0.0 rad is not allowed"):
-        scan_hazard_distance(1550e-9, 1e-3, 1e-8, 0.08, 2e-3, 0.0, 100, 10, 10)
+        scan_hazard_distance(weak, 0.0, 100, 10, 10)
 
 
 def test_pulses_of_a_burst_within_5_us_count_as_one():
@@ -329,7 +340,7 @@ def test_pulses_of_a_burst_within_5_us_count_as_one():
 
 
 def test_beams_that_follow_each_other_fast_act_together_near_the_scanner():
-    scan = (532e-9, 1e-3, 10e-9, 0.1, 1e-3, 5e-4, 10_000, 10.0, 0.25)
+    scan = (PulsedBeam(532e-9, 1e-3, 10e-9, 0.1, 1e-3), 5e-4, 10_000, 10.0, 0.25)
     slow, fast = scan_hazard_distance(*scan), scan_hazard_distance(*scan, (1, 1e6))
     assert fast > slow
     # far below a pulse in 5 us it makes no difference

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.instrument.beams import steered_beams
+from lidar_mi.instrument.beams import Targets, steered_beams
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
 from lidar_mi.instrument.motion import Motion, true_pose
@@ -51,9 +51,8 @@ def beams(motion=SHAKEN, reported=None, seconds=0.09):
     if reported:
         told = reported_pose(Reported(**reported), pose_at, time, SPEED, 1, 0)
     places = np.stack([y, z], -1)
-    return steered_beams(
-        time, places, LIDAR.range, 0.0, SPEED, pose_at(time), told, body_fixed=True
-    )
+    targets = Targets(time, places, LIDAR.range, body_fixed=True)
+    return steered_beams(targets, SPEED, pose_at(time), told)
 
 
 def measured(wind, one):

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lidar_mi.errors import InputError
-from lidar_mi.instrument.beams import steered_beams
+from lidar_mi.instrument.beams import Targets, steered_beams
 from lidar_mi.instrument.motion import Pose, attitude
 from lidar_mi.instrument.reported import Reported, reported_pose
 
@@ -38,7 +38,7 @@ def reported(pose_at, scan=0, seed=1, **keys):
 
 def steered(true, told, *, body_fixed=False, position=0.0, **keys):
     return steered_beams(
-        TIME, PLACES, FAR, position, SPEED, true, told, body_fixed=body_fixed, **keys
+        Targets(TIME, PLACES, FAR, position, body_fixed), SPEED, true, told, **keys
     )
 
 

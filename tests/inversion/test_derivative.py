@@ -13,6 +13,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.inversion.layers import Layers
 from lidar_mi.inversion.smoothness import precision
 from lidar_mi.rendering.backscatter import ScanRenderer
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 
 pytestmark = [
@@ -48,7 +49,7 @@ def test_simplified_derivative_costs_little_and_states_no_smaller_errors(variant
         return xr.DataArray(values, dims=("x", "y", "z"), coords={"x": X, "y": sides, "z": sides})
 
     fog = {"type": "hg", "g": 0.85}
-    renderer = ScanRenderer(field(PROFILE), PLAN, LIDAR, 1e-6, fog, 1.0, settings)
+    renderer = ScanRenderer(field(PROFILE), PLAN, LIDAR, ScatteringAir(1e-6, fog, 1.0), settings)
 
     def signal(profile):
         scan = renderer.render(field(profile), PLAN, 3)

@@ -14,6 +14,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.inversion import extinction as inversion
 from lidar_mi.inversion.extinction import LayeredAir, invert_extinction
 from lidar_mi.rendering.backscatter import ScanRenderer
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.retrieval.extinction.klett import klett
 
@@ -69,7 +70,9 @@ def signal():
     field = np.broadcast_to(profile[:, None, None], (x.size, 2, 2)).copy()
     sides = np.array([-120.0, 120.0])
     air = xr.DataArray(field, dims=("x", "y", "z"), coords={"x": x, "y": sides, "z": sides})
-    renderer = ScanRenderer(air, PLAN, LIDAR, 1e-6, FOG, 1.0, settings("llvm_ad_mono", 80_000))
+    renderer = ScanRenderer(
+        air, PLAN, LIDAR, ScatteringAir(1e-6, FOG, 1.0), settings("llvm_ad_mono", 80_000)
+    )
     scan = renderer.render(air, PLAN, 77)
     return scan["S0"].values.astype(float), scan["order1.S0"].values.astype(float)
 

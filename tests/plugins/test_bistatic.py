@@ -71,33 +71,6 @@ def test_a_beam_that_crosses_the_field_of_view(world):
     assert (error[seen] < 0.02 * expected.max()).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("offset", "tilt"), [(0.5, 0.0), (0.0, 1.0), (0.1, 0.1)], ids=["offset", "tilt", "both"]
-)
-def test_light_scattered_twice_of_a_bistatic_lidar(world, offset, tilt):
-    """Against the quadrature, also where the beam itself is out of view."""
-    case = Bistatic(
-        aperture=0.2, fov_half=2e-3, origin=(0, offset, 0), tilt=(math.radians(tilt), 0.0)
-    )
-    loaded = slab(
-        world,
-        pose((offset, 0.0), tilt),
-        case.gate,
-        orders=2,
-        phase="isotropic",
-        extinction=case.extinction,
-        aperture_radius=case.aperture,
-        fov_half_mrad=1e3 * case.fov_half,
-    )
-    found = [np.array(mi.render(loaded, spp=40_000, seed=k))[0, 0, 6] for k in range(20)]
-    expected, error = second_order(case, 17)[0], np.std(found, ddof=1) / math.sqrt(20)
-    assert error < 0.02 * expected
-    assert abs(np.mean(found) - expected) < 4 * error + 1e-3 * expected
-    monostatic = second_order(Bistatic(aperture=0.2, fov_half=2e-3), 15)[0]
-    assert abs(expected / monostatic - 1) > 0.1
-
-
 def test_a_turned_laser_emits_turned_polarisation(world):
     """Backscattering by molecules keeps linear polarisation, about an axis turned by 30 degrees."""
     loaded = slab(world, pose(turn=30.0), [110.0, 120.0])

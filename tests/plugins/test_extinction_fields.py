@@ -2,8 +2,7 @@
 
 Detects: a transmittance whose weights underflow or have a heavy tail in any field, bounds of blocks
 that a field exceeds, a filter, wrap mode, pose, scale or time taken wrongly, a standard error that
-is half too small or twice too large (slow: by 12 %), a second order that is wrong by 15 % (slow: by
-4 %).
+is wrong by 25 %, a second order that is wrong by 12 %. `make fuzz` draws further fields.
 """
 
 import drjit as dr
@@ -37,12 +36,7 @@ def assert_standard(found):
 
 @pytest.mark.slow
 def test_single_scattering():
-    assert_standard(deviations(range(12)))
-
-
-@pytest.mark.slow
-def test_single_scattering_of_a_thousand_fields():
-    assert_standard(deviations(range(1000, 2000)))
+    assert_standard(deviations(range(1000, 1200)))
 
 
 def second_order(seeds):
@@ -63,18 +57,10 @@ def second_order(seeds):
 
 @pytest.mark.slow
 def test_double_scattering():
-    found, ratio, error = second_order(range(4))
+    found, ratio, error = second_order(range(100, 112))
     assert {seed: z for seed, z in found.items() if abs(z) > 5} == {}
-    assert error < 0.05
+    assert error < 0.03
     assert abs(ratio - 1) < 4 * error, (ratio, error)
-
-
-@pytest.mark.slow
-def test_double_scattering_of_a_hundred_fields():
-    found, ratio, error = second_order(range(100, 200))
-    assert {seed: z for seed, z in found.items() if abs(z) > 5} == {}
-    assert error < 0.01
-    assert abs(ratio - 1) < 4 * error
 
 
 def layered(where, order=1, samples=4096):

@@ -101,30 +101,6 @@ def test_cells_outside_every_beam_have_no_gradient(slab):
     assert np.abs(gradient[2]).max() > 0
 
 
-@pytest.mark.slow
-def test_blurred_slab_is_recovered_by_gradient_descent(slab):
-    """From a flat start, Adam brings the image of the slab back to the true one."""
-    scene, parameters = slab
-    put(parameters, BASE)
-    target = np.array(mi.render(scene, spp=20_000, seed=77))[..., :1]
-    optimizer = mi.ad.Adam(lr=2e-3)
-    optimizer[KEY] = mi.TensorXf(np.full((*SHAPE, 1), BASE.mean(), np.float32))
-    parameters.update(optimizer)
-
-    def misfit(seed):
-        image = mi.render(scene, parameters, spp=2_000, seed=seed)[:, :, :1]
-        return dr.mean(dr.square((image - mi.TensorXf(target)) / float(target.mean())))
-
-    before = float(misfit(0).array[0])
-    for step in range(40):
-        loss = misfit(step)
-        dr.backward(loss)
-        optimizer.step()
-        optimizer[KEY] = dr.maximum(optimizer[KEY], 1e-4)
-        parameters.update(optimizer)
-    assert float(misfit(1000).array[0]) < 0.02 * before
-
-
 def test_gradient_of_the_albedo_is_the_image_over_the_albedo(variant, world):
     """Single scattering is proportional to the albedo where the vertex is: Euler's relation."""
     medium = world.homogeneous(2e-3, albedo=0.8)

@@ -75,14 +75,6 @@ def test_extinction_of_voxels():
     assert np.median(np.abs(found.values[lit]) / errors) > 5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("varied", [False, True])
-@pytest.mark.parametrize("depth", [0.1, 1.0, 3.0])
-def test_extinction_at_all_depths(depth, varied):
-    # the third order of thin air is one of rare paths
-    voxels(depth, varied, VOXELS[::3] + VOXELS[1::3], seeds=16, of_differences=30)
-
-
 @pytest.mark.parametrize("variant", UNPOLARISED, indirect=True)
 def test_extinction_in_other_variants(variant):
     voxels(1.0, True, VOXELS[1::9])

@@ -3,8 +3,8 @@
 Full overlap: telescope 0.5 m, field of view 5 mrad, beam 2 mrad. What the equation leaves out (the
 finite beam and telescope) is 1e-6 of the signal at 500 m.
 
-Detects: an error of 2e-5 in the scan's mean signal, of 0.2 % in any single beam on the axis, a
-standard error wrong by 5 %.
+Detects: a medium, gate or pulse that enters wrongly, a majorant that matters.
+`validation.lidar_equation` has the paper's whole scan and a valley of extinction.
 """
 
 import itertools
@@ -14,7 +14,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.special import erf
-from scipy.stats import binom
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -96,39 +95,6 @@ def slab_scene(world, size=(219, 139), gate=(500.0, 502.5), slab=None, low=490.0
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("medium", ["homogeneous", "grid"])
-def test_slab_in_an_environment(world, statistics, medium):
-    """The paper's 30 441 beams, 256 samples each; slab of 0.02 / m from 490 m, gate at 500 m.
-
-    Optical depth until the gate's middle 0.27, one way. Along an oblique beam everything is
-    longer by 1 / cos, and the gate's planes cut out a longer interval.
-    """
-    photons = 256
-    slab = world.homogeneous(2e-2)
-    if medium == "grid":
-        slab = world.grid(np.full((3, 4, 5), 2e-2), [490, -65, -45], [512, 65, 45])
-    scene = slab_scene(world, slab=slab)
-    stokes, error = world.render(scene, seed=1, spp=photons)
-    secant = secants(scene, (139, 219))
-    truth = layered_signal([500, 502.5], secant, [(0, 1e-4), (490, 2e-2)])
-    z = statistics.assert_agree(stokes[0, 0], error[0], truth[0], photons, bias=TRUNCATION)
-    # "within 3 standard errors": as many beams outside as there should be
-    outside = (np.abs(z) > 3).sum()
-    assert binom.ppf(1e-4, z.size, 0.0027) <= outside <= binom.ppf(1 - 1e-4, z.size, 0.0033)
-    mean = stokes[0, 0].mean() / truth.mean()
-    assert abs(mean - 1) < 2e-3  # what was promised; the statistics above are far sharper
-    # rows, columns and corners: no drift over the scan
-    ratio = stokes[0, 0] / truth[0]
-    relative = error[0] / truth[0]
-    for part in (np.s_[:10], np.s_[-10:], np.s_[:, :10], np.s_[:, -10:], np.s_[60:80, 100:120]):
-        sigma = math.sqrt((relative[part] ** 2).mean() / relative[part].size)
-        assert abs(ratio[part].mean() - 1) < 4 * sigma + 2 * TRUNCATION
-    # full overlap, backscatter: fully polarised along e_h, as emitted
-    assert stokes[0, 1] == pytest.approx(stokes[0, 0], rel=1e-5)
-    assert np.abs(stokes[0, 2:] / stokes[0, :1]).max() < 1e-5
-
-
 def test_nested_slabs(world, statistics):
     """Telescope in the environment, a slab around a denser slab; the gate straddles its face."""
     photons = 512
@@ -199,35 +165,6 @@ class TestMajorants:
         sigma = math.sqrt(((error[0] / truth) ** 2).mean() / ratio.size)
         assert sigma < 0.02
         assert abs(ratio.mean() - 1) < 4 * sigma
-
-
-@pytest.mark.slow
-def test_varying_grid(world, statistics):
-    """A valley of extinction along x: linear between cell centres, so known in closed form.
-
-    Strongly curved, so that no mean or middle value stands for the way through it.
-    """
-    photons = 4000
-    centres = 400 + 10 * (np.arange(20) + 0.5)
-    values = 1e-3 * (1 + np.abs(centres - 465) / 10)
-    slab = world.grid(np.broadcast_to(values, (2, 2, 20)), [400, -90, -90], [600, 90, 90])
-    scene = world.scene(
-        world.lidar((25, 20), (500.0, 540.0), gate_count=4, **SCAN),
-        slab=world.box([400, -90, -90], [600, 90, 90], slab),
-    )
-    stokes, error = world.render(scene, seed=5, spp=4 * photons)
-    secant = secants(scene, (20, 25))
-
-    def extinction(r):
-        return 1e-3 * (1 + (r / secant - 465) / 10)
-
-    def depth(r):
-        # 7e-3 in the outermost half cell, then down to 1e-3 at 465 m and up again
-        return secant * 1e-3 * (5 * 7 + 60 * 4 + (x := r / secant - 465) + x**2 / 20)
-
-    truth = lidar_equation(np.linspace(500, 540, 5)[:, None, None] * secant, extinction, depth)
-    for gate in range(4):
-        statistics.assert_agree(stokes[gate, 0], error[gate], truth[gate], photons, bias=5e-5)
 
 
 class TestGates:

@@ -15,6 +15,8 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.io.exr import read_scan, write_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
+from lidar_mi.rendering.batches import Series
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -39,9 +41,7 @@ def render(fields, plans, lidar=None, seed=1, environment=ENVIRONMENT, albedo=1.
             fields,
             plans,
             lidar or BackscatterLidar(),
-            environment,
-            RAYLEIGH,
-            albedo,
+            ScatteringAir(environment, RAYLEIGH, albedo),
             settings,
             seed,
         )
@@ -265,12 +265,10 @@ class TestScans:
                 fields,
                 plans,
                 BackscatterLidar(),
-                ENVIRONMENT,
-                RAYLEIGH,
-                1.0,
+                ScatteringAir(ENVIRONMENT, RAYLEIGH, 1.0),
                 RenderSettings(max_order=1),
                 1,
-                scans=[index],
+                Series([index]),
             )
             for name in ("S0", "S1", "S2", "S3", "S0_stderr", "Y"):
                 assert np.array_equal(alone[name], moved[name])
@@ -318,12 +316,10 @@ class TestScans:
                 list(self.fields(plans)),
                 plans,
                 lidar,
-                ENVIRONMENT,
-                RAYLEIGH,
-                1.0,
+                ScatteringAir(ENVIRONMENT, RAYLEIGH, 1.0),
                 settings,
                 5,
-                progress=lambda *call: calls.append(call),
+                Series(progress=lambda *call: calls.append(call)),
             )
         )
         for k, scan in enumerate(scans):

@@ -16,6 +16,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.io.exr import read_scan, write_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.scene import render_file
 from lidar_mi.rendering.settings import RenderSettings
 
@@ -65,9 +66,8 @@ def in_flight(plan, duration=0.1, speed=75.0, pitch=0.002, offset=(0.0, 0.0, 0.0
 
 def render(fields, plans, seed=1, environment=ENVIRONMENT, **settings):
     settings = RenderSettings(**({"max_order": 1} | settings))
-    return list(
-        render_scans(fields, plans, BackscatterLidar(), environment, RAYLEIGH, 1.0, settings, seed)
-    )
+    air = ScatteringAir(environment, RAYLEIGH, 1.0)
+    return list(render_scans(fields, plans, BackscatterLidar(), air, settings, seed))
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)

@@ -15,7 +15,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.io.scattering_table import aerosol_table
 from lidar_mi.rendering.backscatter import extrude, render_scans
-from lidar_mi.rendering.phase import molecules, scatterer
+from lidar_mi.rendering.phase import ScatteringAir, molecules, scatterer
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.schema.reading import check
 from lidar_mi.schema.scattering import Scattering
@@ -24,24 +24,17 @@ WAVELENGTH, MOLECULES, AROUND = 532e-9, 7e-5, 1e-4
 AXIS = np.arange(-4.0, 4.5, 0.5)
 
 
-def scans(fields, settings, **air):
+def scans(fields, settings):
     plans = plan_scans(Scan(range=100, thickness=2.5), AXIS, AXIS, (0.0, 5.0))
     lidar = BackscatterLidar(fov_half="20 mrad", divergence_full="0.1 mrad")
     solid = [extrude(field, plans[0], lidar) for field in fields]
     scattering = Scattering(phase="aerosol", aerosol="spheroids")
-    return list(
-        render_scans(
-            solid,
-            plans,
-            lidar,
-            AROUND + MOLECULES,
-            *scatterer(scattering, wavelength=WAVELENGTH),
-            settings,
-            1,
-            molecules=molecules(MOLECULES, WAVELENGTH),
-            **air,
-        )
+    air = ScatteringAir(
+        AROUND + MOLECULES,
+        *scatterer(scattering, wavelength=WAVELENGTH),
+        molecules(MOLECULES, WAVELENGTH),
     )
+    return list(render_scans(solid, plans, lidar, air, settings, 1))
 
 
 @pytest.mark.slow

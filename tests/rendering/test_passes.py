@@ -17,6 +17,7 @@ from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import ScanRenderer, extrude
 from lidar_mi.rendering.memory import FRACTION, PER_SAMPLE, host_bytes, samples_at_once
 from lidar_mi.rendering.passes import LEAST, within_memory
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.system.memory import UNKNOWN_GPU, gpu_memory
 
@@ -90,7 +91,7 @@ def renderer(**settings):
     air = extrude(xr.DataArray(values, {"z": z, "y": y}, ("z", "y")), plan, lidar)
     asked = RenderSettings(max_order=2, samples_per_beam=200, **settings)
     phase = {"type": "rayleigh_polarized"}
-    return ScanRenderer(air, plan, lidar, 1e-4, phase, 1.0, asked), air, plan
+    return ScanRenderer(air, plan, lidar, ScatteringAir(1e-4, phase, 1.0), asked), air, plan
 
 
 @pytest.mark.slow

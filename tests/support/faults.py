@@ -163,7 +163,7 @@ def make_fake(seed):
     page.page = lambda *_: "<html></html>"
 
 
-def run_once(folder, seed, real, number=-1, fault=""):
+def run_once(folder, seed, number=-1, fault=""):
     """A run in a process of its own: exit code, what it said, and the places it came by."""
     output = Path(f"{folder}.said")
     process = os.fork()
@@ -174,8 +174,7 @@ def run_once(folder, seed, real, number=-1, fault=""):
             os.dup2(descriptor, 2)
             # samples are kept after every pass
             batches.INTERVAL, batches.time = 0, SimpleNamespace(monotonic=lambda: 0.0)
-            if not real:
-                make_fake(seed)
+            make_fake(seed)
             places = Places(folder, number, fault)
             places.watch()
             code = exit_code(
@@ -210,14 +209,14 @@ def state(folder):
     }
 
 
-def tried(folder, start, seed, real, number, fault):
+def tried(folder, start, seed, number, fault):
     """A run with a fault in a folder like ``start``, and the next one without."""
     shutil.rmtree(folder, ignore_errors=True)
     if start:
         shutil.copytree(start, folder)
-    code, output = run_once(folder, seed, real, number, fault)
+    code, output = run_once(folder, seed, number, fault)
     left = state(folder) if Path(folder).exists() else {}
-    again, said_again = run_once(folder, seed, real)
+    again, said_again = run_once(folder, seed)
     return {
         "code": code,
         "said": output,
@@ -231,18 +230,18 @@ def tried(folder, start, seed, real, number, fault):
 def scenario(work, start, task):
     """What came of all faults in a folder that is new, or holds a run with the seed ``start``."""
     work.mkdir()
-    seed, real = task["seed"], task["real"]
+    seed = task["seed"]
     whole, begin = work / "whole", work / "start" if start else None
     if begin:
-        assert run_once(begin, start, real) == (0, "")
+        assert run_once(begin, start) == (0, "")
         shutil.copytree(begin, whole)
-    assert run_once(whole, seed, real) == (0, "")
+    assert run_once(whole, seed) == (0, "")
     places = json.loads(Path(f"{whole}.places").read_text())
     cases = []
     for fault, kinds in task["faults"].items():
         possible = [number for number, (kind, _) in enumerate(places) if kind in kinds]
         for number in possible[:: task["every"].get(fault, 1)]:
-            case = tried(work / "run", begin, seed, real, number, fault)
+            case = tried(work / "run", begin, seed, number, fault)
             cases.append({"place": f"{number} {' '.join(places[number])}", "fault": fault, **case})
     found = {"places": places, "start": state(begin) if begin else {}, "whole": state(whole)}
     return found | {"cases": cases}

@@ -1,7 +1,6 @@
 """Scans of moving air in which every pixel has its own time: images of exactly known motion."""
 
 import numpy as np
-import xarray as xr
 
 from lidar_mi.atmosphere.vortices.vortex import velocity
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
@@ -59,36 +58,3 @@ def moving_vortices(pattern, vortices, mean, size=(130, 90), seed=1, noise=0.0, 
     images, times = timed_pair(waves, wind, np.add(mean, induced), tau, y, z)
     random = np.random.default_rng([seed, 1])
     return [image + noise * random.standard_normal(image.shape) for image in images], times
-
-
-def scattered_vortices(pattern, vortices, mean, px, seed=1, noise=0.0, length=3.0, size=(100, 64)):
-    """Two scans as `moving_vortices`, of beams beside the nodes by px rms, in their own places.
-
-    With the wind (v, w) at places and times from the middle of both.
-    """
-    y, z = axes(*size)
-    random, waves = np.random.default_rng([seed, 2]), plane_waves(seed, length, 0.5)
-    induced = np.mean([velocity(vortices, o.y, o.z) for o in vortices], axis=0)
-    moving, tau, scans = np.add(mean, induced), scan_times(pattern, *size[::-1]), []
-
-    def wind(y, z):
-        return [part - rest for part, rest in zip(velocity(vortices, y, z), induced, strict=True)]
-
-    for reference in (-DT / 2, DT / 2):
-        places = np.stack(np.meshgrid(y, z)) + 0.5 * px * random.standard_normal((2, *tau.shape))
-        time = reference + tau
-        image = texture(waves, *origin(wind, *(places - time * moving[:, None, None]), time))
-        fields = {
-            "Y": image + noise * random.standard_normal(image.shape),
-            "Y_noise_std": np.full(image.shape, noise),
-            "beam_time": tau,
-            "y_reported": places[0],
-            "z_reported": places[1],
-        }
-        scans.append(xr.Dataset({name: data_array(part, y, z) for name, part in fields.items()}))
-
-    def truth(y, z, time):
-        within = y - moving[0] * time, z - moving[1] * time
-        return [part + rest for part, rest in zip(velocity(vortices, *within), mean, strict=True)]
-
-    return scans, truth

@@ -1,7 +1,7 @@
 """A bright blob in a uniform wind, from the wake file to the winds.
 
-Detects: any axis turned, mirrored or shifted by 0.05 px between wake, image and wind, the wrong
-planes of a volume in the gate, and air without structure that yields a wind."""
+Detects: any axis turned, mirrored or shifted by 0.05 px between wake, image and wind, and air
+without structure that yields a wind."""
 
 import json
 
@@ -84,45 +84,9 @@ def test_air_without_structure_is_flagged(blob_run):
         assert (far["flag"] != 0).all()
 
 
-def test_names_of_files_are_escaped_in_the_report(blob_run):
-    page = (blob_run / "report.html").read_text()
-    assert "a &lt;b&gt;blob &amp; more.nc" in page
-    assert "<b>" not in page
-
-
 def test_no_vortex_no_core_metrics(blob_run):
     metrics = json.loads((blob_run / "metrics.json").read_text())
     assert not [key for key in metrics if key.startswith("wake.") or "outside_cores" in key]
-
-
-@pytest.mark.slow
-def test_volume_shows_the_planes_in_the_gate(tmp_path, quick):
-    """Planes of 1 m: a port blob for x > 6 m, a starboard one for x < 4 m. A gate of 2.5 m around
-    x = 8 m holds only the first, around x = 2 m only the second."""
-    x = np.arange(0.5, 10, 1.0)
-    port, starboard = blob(8.0, 3.0), blob(-8.0, -3.0)
-    name = write_wake(
-        tmp_path / "volume.nc",
-        lambda x, y, z: (x > 6) * port(y, z) + (x < 4) * starboard(y, z),
-        x=x,
-    )
-    for plane, (row, column) in ((8.0, (24, 24)), (2.0, (36, 56))):
-        data = small()
-        data["wake"] = {"file": name, "depth": "volume", "x": plane, "texture": {"rms": 0}}
-        folder = tmp_path / f"run{plane:g}"
-        run(check(data), folder, beside=tmp_path)
-        image = as_seen(folder / IMAGES[0])
-        dark = np.median(image)
-        peak = np.unravel_index(image.argmax(), image.shape)
-        assert np.hypot(peak[0] - row, peak[1] - column) < 2
-        assert image[row, column] > 5 * dark
-        # the other blob, mirrored through the middle, is not there
-        assert image[60 - row, 80 - column] < 1.3 * dark
-        with xr.open_dataset(folder / "wind.nc") as wind:
-            one = wind.sel(source="extinction", algorithm="cc")
-            valid = (one["flag"] == 0).values
-            assert one["v"].values[valid].mean() == pytest.approx(10.0, abs=0.25)
-            assert one["w"].values[valid].mean() == pytest.approx(5.0, abs=0.25)
 
 
 @pytest.mark.slow

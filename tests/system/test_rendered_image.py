@@ -21,6 +21,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.io.exr import read_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.schema import reading as config
@@ -99,7 +100,9 @@ def test_image_is_the_blurred_extinction_within_its_standard_errors():
     for seed in seeds:
         settings = RenderSettings(samples_per_beam=64, max_order=1)
         phase = {"type": "rayleigh_polarized"}
-        scans = render_scans(solids, plans, lidar, environment, phase, 1.0, settings, seed)
+        scans = render_scans(
+            solids, plans, lidar, ScatteringAir(environment, phase, 1.0), settings, seed
+        )
         for k, scan in enumerate(scans):
             relative = (scan["S0_stderr"] / scan["S0"]).values[0]
             sums[k] = sums[k] + scan["Y"].values / len(seeds)

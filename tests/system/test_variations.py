@@ -17,7 +17,7 @@ from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.io.exr import read_scan
 from lidar_mi.schema import reading as config
-from tests.support.experiments import FIGURES, SOURCES, as_seen, check, small, without_figures
+from tests.support.experiments import FIGURES, SOURCES, check, small, without_figures
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
@@ -61,19 +61,6 @@ def test_second_snapshot_agrees_with_advection():
 
 
 @pytest.mark.slow
-def test_images_of_a_second_snapshot_are_those_of_advection(plain, variation):
-    """Texture (and noise, 0.5 % per pixel) is added in the images."""
-    folder, metrics = variation("wake.second=40.1 s")
-    first = [as_seen(path / IMAGES[0]) for path in (plain[0], folder)]
-    second = [as_seen(path / IMAGES[1]) for path in (plain[0], folder)]
-    np.testing.assert_array_equal(*first)
-    assert np.corrcoef(*((b - a).ravel() for a, b in zip(first, second, strict=True)))[0, 1] > 0.98
-    for name in ("v", "w"):
-        key = f"backscatter.cc.rmse_{name}"
-        assert metrics[key] == pytest.approx(plain[1][key], rel=0.1)
-
-
-@pytest.mark.slow
 def test_detector_adds_a_noisy_image_and_its_winds(variation):
     """Weak pulses by day: noise of the stated size in the images, worse winds."""
     weak = ["detector={}", "lidar.pulse_energy=1 mJ", "render.samples_per_beam=256"]
@@ -93,17 +80,6 @@ def test_detector_adds_a_noisy_image_and_its_winds(variation):
         assert metrics[f"backscatter_noisy.{key}"] > 1.02 * metrics[f"backscatter.{key}"]
     with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as wind:
         assert wind["source"].values.tolist() == [*SOURCES, "backscatter_noisy"]
-
-
-@pytest.mark.slow
-def test_strong_pulses_give_the_winds_without_noise(variation):
-    _, again = variation("detector={}", "lidar.pulse_energy=1 J", "scan.aim=angles")
-    assert again["detector.noise.all"] < 1e-3
-    for name in ("v", "w"):
-        key = f"cc.rmse_{name}"
-        assert again[f"backscatter_noisy.{key}"] == pytest.approx(
-            again[f"backscatter.{key}"], rel=0.01
-        )
 
 
 @pytest.mark.slow
@@ -160,23 +136,3 @@ def test_extinction_from_speed_and_spherical_gates(tmp_path, quick):
     ratio = scan["Y"].values / blur_by_beam(image, BackscatterLidar(), 501.25).values
     assert ratio.mean() == pytest.approx(3 / (8 * np.pi), rel=0.005)
     assert ratio.std() < 0.03 * ratio.mean()
-
-
-@pytest.mark.slow
-def test_whole_simulation_as_a_volume(tmp_path, quick):
-    """40 m of the simulation the sample plane was cut from, structure in all three dimensions:
-    winds as good as from the plane."""
-    data = Path(__file__).resolve().parents[3] / "shared" / "data"
-    if not (data / "wake_les_40s.nc").is_file():
-        pytest.skip("wake_les_40s.nc, 40 m of the wake, is not here")
-    volume = {
-        "name": "volume",
-        "wake": {"file": "wake_les_40s.nc", "time": "40 s", "depth": "volume"},
-        "retrieval": {"methods": ["cc"]},
-    }
-    metrics = run(check(volume), tmp_path / "run", beside=data).metrics
-    for name in ("v", "w"):
-        assert metrics[f"extinction.cc.rmse_{name}"] < 0.8
-        assert metrics[f"backscatter.cc.rmse_{name}"] < 1.0
-    assert metrics["wake.port_core.y"] == pytest.approx(23.4, abs=0.5)
-    assert metrics["wake.starboard_core.y"] == pytest.approx(-23.4, abs=0.5)

@@ -150,7 +150,7 @@ def chord_wind(
     ]
     place = np.stack([z, y]).astype(float)
     inside = np.isfinite(place).all(0)
-    middle = place = (place[:, inside] - np.array([axis[0] for axis in axes])[:, None]) / spacing
+    nodes = (place[:, inside] - np.array([axis[0] for axis in axes])[:, None]) / spacing
 
     def wind(at: np.ndarray) -> np.ndarray:
         return np.stack(
@@ -170,10 +170,11 @@ def chord_wind(
             at = at + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return at
 
+    middle = nodes
     # each iteration reduces the error to 1 - cos of the rotation in dt / 2
     for _ in range(4):
         before, after = moved(middle, -dt / 2), moved(middle, dt / 2)
-        middle = middle + place - (before + after) / 2
+        middle = middle + nodes - (before + after) / 2
     chord = np.full((2, *inside.shape), np.nan)
     chord[:, inside] = (moved(middle, dt / 2) - moved(middle, -dt / 2)) * spacing / dt
     return chord[1], chord[0]
@@ -308,6 +309,8 @@ def error_budget(
         The same from `images_without`, by cause, and from `moved_rigidly` as `shear`.
     truth : xr.Dataset
         v, w on (z, y).
+    cores : sequence of Core
+        Of the true vortices; without any there are no keys `outside_cores.*`.
     perfect : xr.Dataset, optional
         The same from the air without noise or blur: the cause `method` is its deviation from the
         truth.

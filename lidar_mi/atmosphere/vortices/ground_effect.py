@@ -4,7 +4,6 @@ Frame: x along the flight, forward; y left; z the height above the ground; y = 0
 begins.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -134,8 +133,3 @@ class PairAboveGround:
                 )
                 v, w = v - omega * dz, w + omega * dy
         return v, w
-
-
-def closest_approach(separation: float, height: float) -> float:
-    """Height (m) to which point vortices sink above the ground: b / 2 / sqrt(1 + (b / 2 h)^2)."""
-    return separation / 2 / math.sqrt(1 + (separation / 2 / height) ** 2)

@@ -1,10 +1,10 @@
 """From two images of a slab of air to its wind and its vortices, in real time."""
 
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import xarray as xr
@@ -114,13 +114,9 @@ class Estimator:
     @_without_garbage_collection()
     def pair_of(
         self,
-        image1: xr.DataArray,
+        first: FirstImage,
         image2: xr.DataArray,
-        dt: float,
-        noise: float | xr.DataArray | None = None,
-        expected: VortexPairFit | None = None,
         *,
-        times: Sequence[xr.DataArray] | None = None,
         frames: LineFrames | None = None,
         complete: Completion | None = None,
         telescope: tuple[float, float, float] | None = None,
@@ -130,16 +126,10 @@ class Estimator:
 
         Parameters
         ----------
-        image1, image2 : DataArray, dims (z, y)
-        dt : float
-            s.
-        noise : float or DataArray, optional
-            As `detected_fit` takes it.
-        expected : VortexPairFit, optional
-            The pair expected at mid-time, with its covariance. With slopes and a telescope the fit
-            is corrected for the motion in oblique beams by wind along x.
-        times : sequence of two DataArray, optional
-            Of the pixels, as `fit_vortices` takes them.
+        first : FirstImage
+            Vortices are fitted from the pair that it expects. With its slopes and a telescope the
+            fit is corrected for the motion in oblique beams by wind along x.
+        image2 : DataArray, dims (z, y)
         frames : LineFrames, optional
             Of the Doppler lidar, half way between both images.
         complete : Completion, optional
@@ -152,7 +142,7 @@ class Estimator:
         seconds: dict[str, float] = {}
         timed = partial(_timed, seconds, clock=self._clock)
         winds = self._winds if take[1] else None
-        first = FirstImage(image1, dt, noise, times, expected)
+        expected = first.expected
         wind: xr.Dataset | None = None
         lines: xr.Dataset | None = None
         flags: tuple[str, ...] = ()
@@ -161,26 +151,12 @@ class Estimator:
                 lines = self._speeds.read(frames)
         # submitted before this process fits: the other one works at the same time
         prepared = winds.prepare(first, self._last) if winds else None
-        fit: Callable[[xr.DataArray], VortexPairFit] = partial(
-            detected_fit,
-            image1,
-            dt=dt,
-            noise=noise,
-            times=times,
-            telescope=telescope,
-            device=self._device,
-        )
+        about = {"times": first.times, "telescope": telescope, "device": self._device}
+        given: dict[str, Any] = {"dt": first.dt, "noise": first.noise, **about}
+        fit: Callable[[xr.DataArray], VortexPairFit] = partial(detected_fit, first.image, **given)
         if expected and take[0]:
             with timed("vortices_before"):
-                fit = started_fit(
-                    image1,
-                    dt,
-                    noise,
-                    start=expected,
-                    times=times,
-                    telescope=telescope,
-                    device=self._device,
-                )
+                fit = started_fit(first.image, start=expected, **given)
         if prepared:
             # in flight the second image comes only now
             seconds["wind_before"] = prepared.result()

@@ -21,6 +21,7 @@ from lidar_mi.encounter.lidar.line_speeds import LineSpeeds
 from lidar_mi.encounter.lidar.pointing import pointing_error
 from lidar_mi.encounter.lidar.scan_store import Scan, ScanStore
 from lidar_mi.encounter.lidar.scan_window import ScanWindow
+from lidar_mi.encounter.lidar.slab_winds import FirstImage
 from lidar_mi.encounter.lidar.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.device import on_its_device
@@ -32,7 +33,7 @@ from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.instrument.products import with_products
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import ScanRenderer
-from lidar_mi.rendering.phase import molecules, scatterer
+from lidar_mi.rendering.phase import ScatteringAir, molecules, scatterer
 from lidar_mi.rendering.samples import choose_samples, pilot_samples
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
@@ -197,11 +198,8 @@ class VirtualLidar:
         complete = self._completion(x, midway, pose)
         estimate = self._estimated(
             number,
-            images.first,
+            FirstImage(images.first, period, images.noise, expected=expected),
             images.second,
-            period,
-            images.noise,
-            expected,
             frames=self._line_frames(number, x, valid, midway),
             complete=complete if self._doppler or complete.by_pointing else None,
             telescope=(midway.place[0] - x, midway.place[1], midway.place[2]),
@@ -312,15 +310,12 @@ class VirtualLidar:
         experiment = self.experiment
         lidar, scattering, wake = experiment.lidar, experiment.scattering, experiment.wake
         assert wake is not None  # of an encounter
-        return ScanRenderer(
-            air,
-            plan,
-            lidar,
+        around = ScatteringAir(
             wake.extinction.background + self.air.molecules,
             *scatterer(scattering, experiment.folder, lidar.wavelength),
-            settings,
             molecules(self.air.molecules, lidar.wavelength, scattering.band),
         )
+        return ScanRenderer(air, plan, lidar, around, settings)
 
     def _detected(self, scan: xr.Dataset, plan: ScanPlan, number: int) -> xr.Dataset:
         """A scan with the detector's noise, if there is one."""

@@ -22,9 +22,9 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
     """Pulses, gates, scans and the noise of a velocity."""
     laser, scan, signal = doppler.laser, doppler.scan, doppler.signal
     lines, lidar = line_scan(scan), coherent_lidar(doppler)
-    samples, bandwidth = receiver(doppler)
+    heard = receiver(doppler)
     ratio = np.array(10 ** (signal.cnr / 10))
-    noise = float(cramer_rao(ratio, np.array(lidar.pulse_width), bandwidth, samples))
+    noise = float(cramer_rao(ratio, np.array(lidar.pulse_width), heard.bandwidth, heard.samples))
     step = ""
     if scan.kind in ("rhi", "ppi"):
         angle = scan.rate * scan.accumulation
@@ -34,7 +34,7 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
         step = f", {math.degrees(angle):.3g} deg or {spacing} apart"
     count = int(np.unique(lines.sweep).size)
     noise_text = f"{noise:.2g} m/s in uniform air at {signal.range:g} m"
-    if noise > random_velocity(bandwidth):
+    if noise > random_velocity(heard.bandwidth):
         noise_text = f"no signal at {signal.range:g} m: velocities there are random"
     return [
         ("laser", f"{shown(laser.wavelength, 'nm')}, pulses of {laser.pulse_length:g} m"),
@@ -47,7 +47,7 @@ def coherent_rows(doppler: CoherentDoppler) -> Rows:
         ("lines", f"{lines.time.size} of {shown(scan.accumulation, 's')}{step}"),
         ("duration", f"{lines.time[-1] + scan.accumulation / 2:.4g} s"),
         ("noise of a velocity", noise_text),
-        ("largest velocity", f"{bandwidth / 2:.3g} m/s"),
+        ("largest velocity", f"{heard.bandwidth / 2:.3g} m/s"),
     ]
 
 

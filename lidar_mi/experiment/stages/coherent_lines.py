@@ -12,7 +12,7 @@ from lidar_mi.atmosphere.vortices.wake_volume import VolumeAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.truth.passing_wake import PassingWake, echo, passing_wake
-from lidar_mi.instrument.coherent.measurement import measured_lines
+from lidar_mi.instrument.coherent.measurement import Receiver, measured_lines
 from lidar_mi.instrument.coherent.scans import LineScan, dbs_scan, ppi_scan, rhi_scan, stare_scan
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.schema.coherent import CoherentDoppler, CoherentScan
@@ -66,13 +66,13 @@ def coherent_lidar(doppler: CoherentDoppler) -> CoherentLidar:
     )
 
 
-def receiver(doppler: CoherentDoppler) -> tuple[float, float]:
-    """Independent samples of a gate in all pulses of a line; bandwidth as velocities, m/s."""
+def receiver(doppler: CoherentDoppler) -> Receiver:
+    """The receiver of the laser's light; samples of all pulses of a line."""
     laser = doppler.laser
     gate = 2 * laser.gate_length / SPEED_OF_LIGHT
     pulses = max(1.0, laser.pulse_rate * doppler.scan.accumulation)
     samples = max(1.0, gate * laser.bandwidth) * pulses
-    return samples, laser.bandwidth * laser.wavelength / 2
+    return Receiver(samples, laser.bandwidth * laser.wavelength / 2)
 
 
 def passing_air(
@@ -140,14 +140,12 @@ def coherent_lines(
     pair = passing_air.vortices(float(scan.time[0]))
     if pair is not None:
         finest = min(finest, min(one.core_radius for one in pair) / 2)
-    samples, bandwidth = receiver(doppler)
     lines = measured_lines(
         passing_air.wind,
         scan,
         lidar,
         10 ** (doppler.signal.cnr / 10),
-        samples=samples,
-        bandwidth=bandwidth,
+        receiver(doppler),
         resolution=finest,
         signal=echo(doppler, wake, passing_air),
         seed=seed,

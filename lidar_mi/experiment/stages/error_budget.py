@@ -1,6 +1,6 @@
 """The error budget of an experiment's cross-flow wind: retrieved without each cause of error."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -89,7 +89,8 @@ def error_budgets(
 ) -> dict[str, dict[str, float]]:
     """`budgets` from a run's winds, where these need not be retrieved again."""
     log("retrieving winds without each cause of error")
-    return _budgets(sensor, retrieval, truth, scans, flows, log.bar, wind, cores)
+    cases = _winds_without(sensor, retrieval, truth, scans, flows, log.bar, wind)
+    return {method: _budget(winds, truth, cores) for method, winds in cases}
 
 
 def budgets(
@@ -103,14 +104,20 @@ def budgets(
 
     Without cores: those of the true wind.
     """
-    flows = None
-    if experiment.scan.air == "moving":
-        flows = flows_of(experiment)
-    sensor = call(_Sensor, experiment)
-    return _budgets(sensor, experiment.retrieval, truth, scans, flows, cores=cores, flagged=flagged)
+    flows = flows_of(experiment) if experiment.scan.air == "moving" else None
+    cores = find_cores(truth.wind) if cores is None else cores
+    cases = _winds_without(call(_Sensor, experiment), experiment.retrieval, truth, scans, flows)
+    return {method: _budget(winds, truth, cores, flagged) for method, winds in cases}
 
 
-def _budgets(
+def _budget(
+    winds: dict[str, xr.Dataset], truth: Truth, cores: Sequence[Core], flagged: bool = False
+) -> dict[str, float]:
+    measured, perfect = winds.pop("measured"), winds.pop("perfect")
+    return error_budget(measured, winds, truth.wind, cores, perfect, flagged)
+
+
+def _winds_without(
     sensor: _Sensor,
     retrieval: Retrieval,
     truth: Truth,
@@ -118,23 +125,15 @@ def _budgets(
     flows: Flows | None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
     known: xr.Dataset | None = None,
-    cores: Sequence[Core] | None = None,
-    flagged: bool = False,
-) -> dict[str, dict[str, float]]:
-    """As `budgets`.
+) -> Iterator[tuple[ImageMethod, dict[str, xr.Dataset]]]:
+    """Winds by every method, of the images as measured, without each cause, and perfect ones.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the name of the step and the fraction done.
-    known : xr.Dataset, optional
-        Winds that need not be retrieved again, from `cross_flow_winds`.
+    Those that are known, from `cross_flow_winds`, are not retrieved again.
     """
     from lidar_mi.retrieval.wind.pair import retrieve_wind
 
     plans = sensor.plans(truth)
     images, blurred = _images(sensor, truth, flows, plans, scans)
-    cores = find_cores(truth.wind) if cores is None else cores
     methods = retrieval.methods
     dt, sizes = sensor.observation.platform.dt, window_sizes(retrieval)
     settings: dict[str, Any] = {"dt": dt, **window_settings(retrieval, sensor.device)}
@@ -142,7 +141,6 @@ def _budgets(
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if sensor.detector:
         sources |= {"measured": Source.NOISY, "detector_noise": Source.BACKSCATTER}
-    budgets: dict[str, dict[str, float]] = {}
     for index, method in enumerate(methods):
         progress(f"retrieving without each cause of error, {method}", index / len(methods))
         winds = {}
@@ -167,7 +165,6 @@ def _budgets(
                     **flags,
                     **settings,
                 )
-        measured, perfect = winds.pop("measured"), winds.pop("perfect")
         # windows that move rigidly are photographs from where they were reported
         if all(plan.beams is None for plan in plans):
 
@@ -184,10 +181,9 @@ def _budgets(
                 )
 
             pair = images["measured"].pair
-            stiff = moved_rigidly(measured, pair, blurred, truth.wind, at_stride)
+            stiff = moved_rigidly(winds["measured"], pair, blurred, truth.wind, at_stride)
             winds |= {} if stiff is None else {"shear": stiff}
-        budgets[method] = error_budget(measured, winds, truth.wind, cores, perfect, flagged)
-    return budgets
+        yield method, winds
 
 
 def _images(

@@ -24,9 +24,9 @@ from lidar_mi.instrument.products import untrusted_pixels, with_products
 from lidar_mi.instrument.scan import Scan, ScanPlan, plan_scans
 from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.rendering.backscatter import extrude, render_scans
-from lidar_mi.rendering.batches import Batches
+from lidar_mi.rendering.batches import ALL_IMAGES, Batches, Series
 from lidar_mi.rendering.pair_error import unshared_fraction
-from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
+from lidar_mi.rendering.phase import Scatterer, ScatteringAir, molecules, scatterer
 from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import check_variant, use_variant
@@ -194,9 +194,7 @@ def render_images(
         with_samples(render, samples),
         seed,
         air,
-        scans=wanted,
-        progress=progress,
-        batches=batches_of(IMAGES, store, log, chosen),
+        Series(wanted, progress, batches_of(IMAGES, store, log, chosen)),
     )
     motion = {"platform_speed": platform.speed, "dt": platform.dt}
     for index, image in zip(wanted, rendered, strict=True):
@@ -232,21 +230,17 @@ def _rendered(
     render: RenderSettings,
     seed: int,
     air: Scatterer,
-    **how: Any,
+    series: Series = ALL_IMAGES,
 ) -> Iterator[xr.Dataset]:
     """The scans of these fields, from `render_scans`."""
     truth, plans = observed.truth, observed.plans
-    return render_scans(
-        _media(lidar, fields, plans),
-        plans,
-        lidar,
+    around = ScatteringAir(
         environment_extinction(observed.observation.wake, truth),
         *air,
-        render.for_winds(),
-        seed,
-        molecules=molecules(truth.molecules, lidar.wavelength, scattering.band),
-        **how,
+        molecules(truth.molecules, lidar.wavelength, scattering.band),
     )
+    slabs = _media(lidar, fields, plans)
+    return render_scans(slabs, plans, lidar, around, render.for_winds(), seed, series)
 
 
 def chosen_samples(

@@ -22,6 +22,7 @@ from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import DopplerLidar, photons, solar_background, speckle_modes
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_values, ring_radii
+from lidar_mi.rendering.batches import Series
 from lidar_mi.rendering.fringes import lens_surfaces, render_fringes
 from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory, host_bytes
 from lidar_mi.rendering.settings import FringeSettings
@@ -254,9 +255,11 @@ def render_ring_images(
                 speeds,
                 settings,
                 (seed + (before << 16)) % 2**31,
-                partial(_show_progress, log, before, total),
-                absent,
-                batches_of(names, store, log),
+                Series(
+                    absent,
+                    partial(_show_progress, log, before, total),
+                    batches_of(names, store, log),
+                ),
             )
             for k, image in zip(absent, rendered, strict=True):
                 yield names[k], image

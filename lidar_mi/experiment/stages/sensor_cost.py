@@ -10,7 +10,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.requirements import RequirementTable
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, pulse_train
 from lidar_mi.instrument.doppler import DopplerLidar, photons
-from lidar_mi.instrument.eye_safety import assess_pulses
+from lidar_mi.instrument.eye_safety import PulsedBeam, assess_pulses
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.pulse_budget import pulse_budget, pulses_for_error
 from lidar_mi.instrument.scan import Scan, plan_scans
@@ -107,16 +107,10 @@ def _eye_safety(
     """Limits of one beam, by the names of `LidarCost`; none for pulses without a duration."""
     if not beam.pulse_duration > 0:
         return {}
-    safety = assess_pulses(
-        beam.wavelength,
-        beam.pulse_energy,
-        beam.pulse_duration,
-        radius,
-        beam.divergence_full,
-        rate,
-        exposure,
-        burst=burst,
+    pulsed = PulsedBeam(
+        beam.wavelength, beam.pulse_energy, beam.pulse_duration, radius, beam.divergence_full
     )
+    safety = assess_pulses(pulsed, rate, exposure, burst=burst)
     # metrics are JSON, which has no infinity
     distances = {
         name: getattr(safety, name)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.instrument.beams import Beams, steered_beams
+from lidar_mi.instrument.beams import Beams, Targets, steered_beams
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.motion import ANGLES, PLACES, Motion, Pose, trajectory, true_pose
 from lidar_mi.instrument.reported import Reported, reported_pose
@@ -48,23 +48,11 @@ def timed_plans(
         _fits("scan.timing", schedule, platform.dt, "platform.dt")
         # a stream for each scan: what one draws does not depend on the other
         jitter = np.random.default_rng([seed, 3, 4, number + 1])
-        timed.append(
-            replace(
-                plan,
-                beams=_beams(
-                    scan,
-                    platform,
-                    seed,
-                    pose_at,
-                    number,
-                    schedule,
-                    plan.centre,
-                    plan.position,
-                    by_angle,
-                    jitter,
-                ),
-            )
+        targets = Targets(
+            schedule.time, schedule.places, plan.centre, plan.position, body_fixed=by_angle
         )
+        beams = _beams(targets, scan, platform, seed, pose_at, number, jitter)
+        timed.append(replace(plan, beams=beams))
     return timed
 
 
@@ -114,18 +102,9 @@ def line_beams(
     _fits("sensor.timing", schedule, 1 / sensor.slabs_per_second, "1 / sensor.slabs_per_second")
     # of a scanner of its own
     jitter = np.random.default_rng([seed, 3, 5, 1])
-    return _beams(
-        scan,
-        platform,
-        seed,
-        _poses(platform, seed, search_path),
-        0,
-        schedule,
-        doppler_lidar.range,
-        0.0,
-        True,
-        jitter,
-    )
+    pose_at = _poses(platform, seed, search_path)
+    targets = Targets(schedule.time, schedule.places, doppler_lidar.range, body_fixed=True)
+    return _beams(targets, scan, platform, seed, pose_at, 0, jitter)
 
 
 def timing_files(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
@@ -209,33 +188,26 @@ def _flies(platform: Platform, columns: dict[str, np.ndarray], source: str) -> N
 
 
 def _beams(
+    targets: Targets,
     scan: Scan,
     platform: Platform,
     seed: int,
     pose_at: Callable[[np.ndarray], Pose],
     number: int,
-    schedule: Schedule,
-    distance: float,
-    position: float,
-    body_fixed: bool,
     random: np.random.Generator,
 ) -> Beams:
     # both scans are of one flight, whose zero is the first one's reference time
-    clock = number * platform.dt + schedule.time
+    clock = number * platform.dt + targets.time
     true = reported = pose_at(clock)
     if platform.reported is not None and platform.reported != Reported():
         reported = reported_pose(platform.reported, pose_at, clock, platform.speed, seed, number)
     try:
         return steered_beams(
-            schedule.time,
-            schedule.places,
-            distance,
-            position,
+            targets,
             # in the frame of the air, in which the gates stay
             platform.speed - scan.follow,
             true,
             reported,
-            body_fixed=body_fixed,
             jitter=platform.motion.scanner_jitter if platform.motion else 0.0,
             random=random,
         )

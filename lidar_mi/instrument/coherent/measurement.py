@@ -1,6 +1,7 @@
 """Lines of sight that a coherent Doppler lidar measures, as the data set of its files."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -15,15 +16,29 @@ START = np.datetime64("2000-01-01T00:00:00", "ns")
 """Time 0 of simulated lines."""
 
 
+@dataclass(frozen=True)
+class Receiver:
+    """What a receiver makes of a line.
+
+    Attributes
+    ----------
+    samples : float
+        Independent ones, of a gate times pulses of a line.
+    bandwidth : float
+        As a range of velocities, m/s.
+    """
+
+    samples: float = 1e5
+    bandwidth: float = 38.8
+
+
 def measured_lines(
     wind: WindField,
     scan: LineScan,
     lidar: CoherentLidar,
     snr: float | np.ndarray | Callable[[np.ndarray], np.ndarray],
+    receiver: Receiver | None = None,
     *,
-    samples: float = 1e5,
-    bandwidth: float = 38.8,
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     resolution: float = 1.0,
     signal: Signal | None = None,
     seed: int = 0,
@@ -37,14 +52,12 @@ def measured_lines(
 
     Parameters
     ----------
-    wind, scan, lidar, origin, resolution, signal
+    wind, scan, lidar, resolution, signal
         As of `gate_moments`.
     snr : float, (gates,) array or callable of the range (m)
         Signal-to-noise ratio of the powers where the signal is 1, above 0.
-    samples : float
-        Of a gate times pulses of a line.
-    bandwidth : float
-        Of the receiver as a range of velocities, m/s.
+    receiver : Receiver, optional
+        Default: as `Receiver` has it.
 
     Returns
     -------
@@ -63,21 +76,22 @@ def measured_lines(
     ratio = np.asarray(snr(ranges) if callable(snr) else snr, float)
     if ratio.shape not in ((), ranges.shape):
         raise InputError(f"snr: shape {ratio.shape} is not allowed; expected ({ranges.size},)")
-    true, spread, power = gate_moments(
-        wind, scan, lidar, origin=origin, resolution=resolution, signal=signal
-    )
+    receiver = receiver or Receiver()
+    true, spread, power = gate_moments(wind, scan, lidar, resolution=resolution, signal=signal)
     width = np.hypot(lidar.pulse_width, spread)
     ratio = ratio * power
-    stderr = cramer_rao(ratio, width, bandwidth, samples)
+    stderr = cramer_rao(ratio, width, receiver.bandwidth, receiver.samples)
     random = np.random.default_rng(seed)
     shared = np.maximum(1 - np.abs(ranges - ranges[0]) / lidar.gate_length, 0.0)
     factor = np.linalg.cholesky(scipy.linalg.toeplitz(shared) + 1e-9 * np.eye(ranges.size))
     noise = random.standard_normal(true.shape) @ factor.T
     dims = "time", "range"
-    lost = stderr > random_velocity(bandwidth)
-    stderr = np.where(lost, random_velocity(bandwidth), stderr)
+    most = random_velocity(receiver.bandwidth)
+    lost = stderr > most
+    stderr = np.where(lost, most, stderr)
     # normal numbers made uniform
-    measured = np.where(lost, bandwidth * (scipy.special.ndtr(noise) - 0.5), true + stderr * noise)
+    uniform = receiver.bandwidth * (scipy.special.ndtr(noise) - 0.5)
+    measured = np.where(lost, uniform, true + stderr * noise)
 
     def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
         return dims, values, {"units": units, "long_name": long_name}

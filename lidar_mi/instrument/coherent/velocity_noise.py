@@ -14,15 +14,12 @@ def peak_ratio(snr: np.ndarray, width: np.ndarray, bandwidth: float) -> np.ndarr
     return np.asarray(snr) * bandwidth / (np.sqrt(2 * np.pi) * np.asarray(width))
 
 
-def rye_hardesty(
-    snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: float
-) -> np.ndarray:
-    """Standard deviation of the velocity, m/s, by an approximation of the Cramér-Rao bound.
+def cramer_rao(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: float) -> np.ndarray:
+    """The least standard deviation of the velocity of a Gaussian spectrum in white noise, m/s.
 
-    sigma^2 = sqrt(8) width^2 / (alpha N) (1 + alpha / sqrt(2 pi))^2, alpha = `peak_ratio`, N = SNR
-    samples (Rye & Hardesty, IEEE Trans. Geosci. Remote Sens. 31, 16-27, 1993, as given by O'Connor
-    et al., J. Atmos. Oceanic Technol. 27, 1652-1664, 2010). It agrees with `cramer_rao` to 7 % up
-    to alpha = 5, and is larger above.
+    For many samples, its square is B width / (samples J) with J = int (x alpha g / (1 + alpha g))^2
+    dx and g = exp(-x^2 / 2) (Whittle's likelihood; Levin, IEEE Trans. Inf. Theory 11, 100-107,
+    1965).
 
     Parameters
     ----------
@@ -34,19 +31,6 @@ def rye_hardesty(
         Of the receiver as a range of velocities, m/s: twice the largest that is measured.
     samples : float
         Of a gate times pulses.
-    """
-    _check(snr, width, bandwidth, samples)
-    alpha = peak_ratio(snr, width, bandwidth)
-    photons = np.asarray(snr) * samples
-    return np.sqrt(np.sqrt(8) / (alpha * photons)) * width * (1 + alpha / np.sqrt(2 * np.pi))
-
-
-def cramer_rao(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: float) -> np.ndarray:
-    """The least standard deviation of the velocity of a Gaussian spectrum in white noise, m/s.
-
-    For many samples, its square is B width / (samples J) with J = int (x alpha g / (1 + alpha g))^2
-    dx and g = exp(-x^2 / 2) (Whittle's likelihood; Levin, IEEE Trans. Inf. Theory 11, 100-107,
-    1965). Parameters as of `rye_hardesty`.
     """
     _check(snr, width, bandwidth, samples)
     alpha = np.asarray(peak_ratio(snr, width, bandwidth))

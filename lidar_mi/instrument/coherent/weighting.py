@@ -104,31 +104,11 @@ Signal = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Relative power of the echo at x, y, z (lines, points), in the order of range, and time."""
 
 
-def radial_velocities(
-    wind: WindField,
-    scan: LineScan,
-    lidar: CoherentLidar,
-    *,
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    resolution: float = 1.0,
-    signal: Signal | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Radial velocity of a wind field, positive away, and its spread within every gate.
-
-    Parameters and the first two results as of `gate_moments`.
-    """
-    mean, spread, _ = gate_moments(
-        wind, scan, lidar, origin=origin, resolution=resolution, signal=signal
-    )
-    return mean, spread
-
-
 def gate_moments(
     wind: WindField,
     scan: LineScan,
     lidar: CoherentLidar,
     *,
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     resolution: float = 1.0,
     signal: Signal | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -137,11 +117,9 @@ def gate_moments(
     Parameters
     ----------
     wind : callable
-        `WindField`.
+        `WindField`, with the lidar at its origin.
     scan : LineScan
         Every line at its own time; a moving beam averages over the angle that it moves through.
-    origin : (float, float, float)
-        Place of the lidar, m.
     resolution : float
         Distance of the points of the quadrature along a line, m: half of a vortex core or less.
     signal : callable, optional
@@ -170,7 +148,7 @@ def gate_moments(
         line = directions(
             scan.azimuth + node * scan.azimuth_span, scan.elevation + node * scan.elevation_span
         )
-        x, y, z = (line[:, k, None] * distance + origin[k] for k in range(3))
+        x, y, z = (line[:, k, None] * distance for k in range(3))
         # of a beam that moves up and down in turn, the middle of its angles is that of its time
         time = np.broadcast_to(scan.time[:, None], x.shape)
         along = sum(w * line[:, k, None] for k, w in enumerate(wind(x, y, z, time)))

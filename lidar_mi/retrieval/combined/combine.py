@@ -71,7 +71,8 @@ def combine(
         From `lidar_mi.retrieval.wind.pair.retrieve_wind`: `v`, `w`, `v_stderr`, `w_stderr`,
         `vw_correlation`, `flag`. Vectors are taken at the nodes. An error common to all of them
         (`lidar_mi.retrieval.common_error`) is an unknown of its own if it is ``free``; the lines
-        determine it as far as they are oblique, and u differs from a plane that leans against it.
+        determine it as far as they are oblique: a u that grows linearly over the plane looks the
+        same.
     scan : xr.Dataset, dim line
         Line-of-sight velocities of the same air, as for
         `lidar_mi.retrieval.combined.vectors.wind_from_triples`, with `range_bin`. A line of sight
@@ -156,9 +157,9 @@ def combine(
     )
     field = checked_crossflow(crossflow, crossflow_std)
     z, y = (crossflow[axis].values.astype(float) for axis in ("z", "y"))
-    lines, hull = lines_on_grid(scan, z, y)
+    lines, middles = lines_on_grid(scan, z, y)
     slope = apparent_slopes(z, y, distance)
-    # v and w for u = gate_speed; `forward` accounts for the remaining u
+    # v and w for u = 0: what images show are those for u = gate_speed. `forward` has the lines' u
     field = field._replace(value=field.value - gate_speed * slope)
     lines = with_slopes(lines, slope)
     if window is None:
@@ -169,21 +170,28 @@ def combine(
 
     forward, across = lines.forward.sum(1), lines.direction[:, 1:]
     mean = np.einsum("lk,lkc->lc", lines.weight, field.value[lines.z, lines.y])
+    # of the notes above: residual is b - H x_b, covariance_without_u is S but for the part of u
     residual = lines.along - (across * mean).sum(1)
     without_image = (lines.weight * ~field.valid[lines.z, lines.y]).sum(1)
-    fixed = lines.covariance + np.diag(without_image**2 * (across**2 @ field.prior_std**2))
+    covariance_without_u = lines.covariance + np.diag(
+        without_image**2 * (across**2 @ field.prior_std**2)
+    )
     # the mean of u is unknown: a prior so wide that it has no weight
-    fixed += _MEAN_STD**2 * np.outer(forward, forward)
-    fixed += covariance_of_lines(lines, crossflow_weights(field, lines), *overlap).sum(0)
+    covariance_without_u += _MEAN_STD**2 * np.outer(forward, forward)
+    covariance_without_u += covariance_of_lines(
+        lines, crossflow_weights(field, lines), *overlap
+    ).sum(0)
     # the lines' velocities per m/s of an error that all vectors share
     shared = across * lines.weight.sum(1, keepdims=True)
     if field.estimated:
-        fixed += (shared * field.common**2) @ shared.T
+        covariance_without_u += (shared * field.common**2) @ shared.T
 
     spacing = line_spacing(lines, z, y)
     relative_stds = relative_std(field, lines, z, y, spacing, u_power)
     known = u_std, u_length, u_exponent
-    drawn, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, known)
+    drawn, best = probable_statistics(
+        covariance_without_u, residual, lines, z, y, spacing, relative_stds, known
+    )
     valid = field.valid
     wind = np.zeros((*valid.shape, 3))
     covariance = np.zeros((*valid.shape, 3, 3))
@@ -195,12 +203,13 @@ def combine(
             chunk, field, lines, overlap, drawn, relative_stds, residual, shared, z, y
         )
     wind[..., 1:] += slope * wind[..., :1]
-    shear = np.zeros((*valid.shape, 3, 3)) + np.eye(3)
-    shear[..., 1:, 0] = slope
-    covariance = shear @ covariance @ shear.swapaxes(-1, -2)
+    # of (u, v, w) by u and by v and w for u = 0
+    jacobian = np.zeros((*valid.shape, 3, 3)) + np.eye(3)
+    jacobian[..., 1:, 0] = slope
+    covariance = jacobian @ covariance @ jacobian.swapaxes(-1, -2)
     wind[~valid, 1:] = np.nan
     covariance[~valid, 1:] = covariance[~valid, :, 1:] = np.nan
-    flag = CombinedFlag.NO_CROSSFLOW * ~valid + CombinedFlag.BEYOND_LINES * ~_inside(hull, z, y)
+    flag = CombinedFlag.NO_CROSSFLOW * ~valid + CombinedFlag.BEYOND_LINES * ~_inside(middles, z, y)
     attributes: dict[str, Any] = {
         "lines_used": len(residual),
         "misfit": best.misfit,
@@ -250,13 +259,13 @@ def _posterior(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Wind (z, y, 3) and covariance (z, y, 3, 3) at the nodes of some rows."""
     root = field.root[rows]
-    across = covariance_with_nodes(rows, lines, crossflow_weights(field, lines), *overlap)
-    across = np.einsum("zyab,bzyl->azyl", root, across)
-    known = np.einsum("zyab,zycb->zyac", root, root)
+    vw_with_lines = covariance_with_nodes(rows, lines, crossflow_weights(field, lines), *overlap)
+    vw_with_lines = np.einsum("zyab,bzyl->azyl", root, vw_with_lines)
+    vw_covariance = np.einsum("zyab,zycb->zyac", root, root)
     if field.estimated:
-        across = across + (field.common**2 * shared).T[:, None, None, :]
-        known = known + np.diag(field.common**2)
-    shape = known.shape[:2]
+        vw_with_lines = vw_with_lines + (field.common**2 * shared).T[:, None, None, :]
+        vw_covariance = vw_covariance + np.diag(field.common**2)
+    shape = vw_covariance.shape[:2]
     wind, covariance = np.zeros((len(choices), *shape, 3)), np.zeros((*shape, 3, 3))
     inverse = np.zeros((len(residual), len(residual)))
     probability = np.array([choice.probability for choice in choices])
@@ -271,11 +280,13 @@ def _posterior(
         # the variance of u is the difference of much larger numbers: not by the inverse of S
         whitened = choice.white @ along.reshape(-1, len(residual)).T
         gain = (whitened.T @ choice.white).reshape(along.shape)
-        of_lines = choice.white.T @ (choice.white @ np.column_stack([residual, shared]))
+        weighted = choice.white.T @ (choice.white @ np.column_stack([residual, shared]))
         wind[number, ..., 0] = gain @ residual
-        wind[number, ..., 1:] = field.value[rows] + np.moveaxis(across @ of_lines[:, 0], 0, -1)
+        wind[number, ..., 1:] = field.value[rows] + np.moveaxis(
+            vw_with_lines @ weighted[:, 0], 0, -1
+        )
         explained = (whitened**2).sum(0).reshape(shape)
-        mixed = -np.einsum("zyl,azyl->zya", gain, across)
+        mixed = -np.einsum("zyl,azyl->zya", gain, vw_with_lines)
         covariance[..., 0, 0] += choice.probability * (
             _MEAN_STD**2 + strength[rows] ** 2 - explained
         )
@@ -284,11 +295,13 @@ def _posterior(
         inverse += choice.probability * choice.white.T @ choice.white
         if field.common.any() and not field.estimated:
             # an error that the estimate does not allow for (Schmidt 1966)
-            response = np.concatenate([(gain @ shared)[None], across @ of_lines[:, 1:]])
+            response = np.concatenate([(gain @ shared)[None], vw_with_lines @ weighted[:, 1:]])
             effect = np.eye(3)[:, 1:] - np.moveaxis(response, 0, -2)
             covariance += choice.probability * (effect * field.common**2) @ effect.swapaxes(-1, -2)
     # mixture of the choices: mean of their covariances, plus the scatter of their means
-    covariance[..., 1:, 1:] += known - np.einsum("azyl,bzyl->zyab", across @ inverse, across)
+    covariance[..., 1:, 1:] += vw_covariance - np.einsum(
+        "azyl,bzyl->zyab", vw_with_lines @ inverse, vw_with_lines
+    )
     mean = np.tensordot(probability, wind, 1)
     off = wind - mean
     return mean, covariance + np.einsum("n,nzya,nzyb->zyab", probability, off, off)

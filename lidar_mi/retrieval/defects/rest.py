@@ -29,13 +29,13 @@ _SIZES = (3, 5, 9)
 # Part of the thresholds that suffices next to what exceeds them (hysteresis: Canny 1986, IEEE
 # Trans. PAMI 8, 679-698).
 _WEAK = 0.5
-# Half of the gaps in what stands out, px, that the motion is not looked for in.
+# Gaps of up to twice this between what stands out, px, are left out of the estimate of motion.
 _GAP = 2
 # Length of lines, px.
 _LINE = 9
-# Fraction of their height by which spots at rest differ at most.
+# Fraction of its height by which structure at rest differs at most.
 _DIFFER = 0.3
-# Spots at rest must be so many times those that are by chance.
+# Pixels of structure at rest must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
 # Iterations over motion and structure at rest.
 _ITERATIONS = 3
@@ -45,7 +45,7 @@ _SOFT = 1.5
 
 
 class AtRest(NamedTuple):
-    """What two or more images have in common that does not move, bool in the images' shape.
+    """What does not move with the air, in all images or in one; bool in the images' shape.
 
     Attributes
     ----------
@@ -103,28 +103,29 @@ class AtRest(NamedTuple):
             As they are.
         windows : Windows
         masked : bool
-            The vectors are from what was `masked` of the images. Flags of non-finite input stay
-            where the images themselves hold it. Otherwise the place in image 2 counts as well, and
-            of saturated areas all of the search region.
+            Whether the vectors are from `masked` images. If not, pixels where the template lies in
+            image 2 count as well, and saturated areas count in all of the search region.
         """
         flag = displacement.flag
         bad = non_finite(images, windows)
-        hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
-        flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
+        # that the mask is not finite is no reason
+        by_mask = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
+        flag = flag & ~(Flag.NON_FINITE_INPUT * by_mask).to(flag.dtype)
         parts = self.clipped, self.saturated, self.structure, self.stray
         if not any(bool(part.any()) for part in parts) and not self.pattern.spoils:
             return flag
-        wide = ~torch.isfinite(displacement.d).all(0) & ~bad
+        lost = ~torch.isfinite(displacement.d).all(0) & ~bad
         clipped = windows.of_templates(working(self.clipped)).amax(0) > _SATURATED
-        # an area of another brightness spoils a correlation from afar
         spoiled = torch.full_like(bad, self.pattern.spoils)
         hidden = self.hidden.any(0)
         spoiled |= windows.of_templates(working(hidden)) > _HIDDEN
         spoiled |= windows.of_centres(working(hidden)) > 0
-        structure = thick(hidden) if masked else hidden
+        # single masked lines leave a vector enough of the air
+        not_air = thick(hidden) if masked else hidden
         for bit, pixels, here, reach in (
-            (Flag.SATURATED, self.saturated, clipped, wide if masked else ~bad),
-            (Flag.AT_REST, structure, spoiled, wide),
+            # an area of another brightness spoils a correlation from afar
+            (Flag.SATURATED, self.saturated, clipped, lost if masked else ~bad),
+            (Flag.AT_REST, not_air, spoiled, lost),
         ):
             here = here | (windows.of_templates(working(pixels)) > 0)
             here |= reach & (windows.of_regions(working(pixels)) > 0)
@@ -190,7 +191,8 @@ def at_rest(
     (`impulses.stray`).
 
     Not found: soft structure as faint as the texture, and a pattern so weak or so dense that no
-    place stands out. Bright air that stands still amid moving air looks at rest, and is.
+    place stands out. Bright air that stands still
+    amid moving air counts as structure at rest.
 
     Parameters
     ----------
@@ -209,8 +211,8 @@ def at_rest(
     outstanding = impulses.outstanding(pair)
     pair = _normalised(pair, outstanding)
     structure = impulses.sharp(pair)
-    fields = [*map(_stored, _fields(pair))]
-    hidden = outstanding | _candidates(fields, structure)
+    detectors = [*map(_stored, _detectors(pair))]
+    hidden = outstanding | _candidates(detectors, structure)
     for _ in range(_ITERATIONS):
         soft = [_soft(image, ~(p | structure)) for image, p in zip(pair, hidden, strict=True)]
         motions = _motions(soft, windows)
@@ -219,7 +221,7 @@ def at_rest(
             return structure, torch.zeros_like(outstanding), d
         stray = impulses.stray(pair, outstanding, structure, chain([d], motions))
         known = torch.where(stray, torch.nan, pair)
-        new = _still([*_fields(known)] if bool(stray.any()) else fields, structure, d)
+        new = _still([*_detectors(known)] if bool(stray.any()) else detectors, structure, d)
         if not bool((new & ~structure).any()):
             break
         structure = structure | new
@@ -261,8 +263,8 @@ class _Field(NamedTuple):
     least: torch.Tensor
 
 
-_Of = Callable[[torch.Tensor], _Field]
-"""A field of two images without some pixels (z, y)."""
+_Detector = Callable[[torch.Tensor], _Field]
+"""From pixels (z, y) that are left out to a field of the two images without them."""
 R = TypeVar("R")
 
 
@@ -278,21 +280,21 @@ def _stored(function: Callable[[torch.Tensor], R]) -> Callable[[torch.Tensor], R
     return of_last
 
 
-def _fields(pair: torch.Tensor) -> Iterator[_Of]:
+def _detectors(pair: torch.Tensor) -> Iterator[_Detector]:
     """Single pixels, lines, edges, spots: each from the images without what was found before."""
-    same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
+    difference = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
 
     def known(hidden: torch.Tensor) -> torch.Tensor:
         return torch.where(hidden, torch.nan, pair)
 
-    def of(
+    def field_of(
         values: torch.Tensor,
         size: int,
         marked: Callable[[torch.Tensor], torch.Tensor],
-        same: torch.Tensor | None = None,
+        difference: torch.Tensor | None = None,
     ) -> _Field:
         change = (values[1] - values[0]).nan_to_num(0.0).abs()
-        change = change if same is None else change.minimum(same)
+        change = change if difference is None else change.minimum(difference)
         return _Field(values, change, size, marked, _least(values, size))
 
     @_stored
@@ -302,7 +304,7 @@ def _fields(pair: torch.Tensor) -> Iterator[_Of]:
     def pixels(hidden: torch.Tensor) -> _Field:
         images, heights = known(hidden), heights_of(hidden)
         soft = [~impulses.unresolved(i, h) for i, h in zip(images, heights, strict=True)]
-        field = of(heights, 1, lambda new: new, same)
+        field = field_of(heights, 1, lambda new: new, difference)
         change = field.change.masked_fill(torch.stack(soft).any(0), torch.inf)
         return field._replace(change=change)
 
@@ -311,28 +313,28 @@ def _fields(pair: torch.Tensor) -> Iterator[_Of]:
 
         def lines(hidden: torch.Tensor, axis: int = axis) -> _Field:
             means = _along(heights_of(hidden), axis)
-            return of(means, 3, lambda new: _along(new.double(), axis) > 0)
+            return field_of(means, 3, lambda new: _along(new.double(), axis) > 0)
 
         yield lines
     for axis in (-1, -2):
 
         def edges(hidden: torch.Tensor, axis: int = axis) -> _Field:
             steps = pad(known(hidden).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
-            either = same.minimum(same.roll(-1, axis))
-            # smoke rises over several pixels: an adjacent step is as large and of its sign, which
-            # that on the other side of a thin structure is not
+            either = difference.minimum(difference.roll(-1, axis))
+            # brightness changes over several pixels in smoke: a step two pixels away is of its sign
+            # and at least half as large, as that across a thin structure is not
             wide = pad(steps.nan_to_num(0.0), (0, 0) * (-1 - axis) + (2, 2))
-            adjacent = (wide.narrow(axis, place, steps.shape[axis]) for place in (0, 4))
-            soft = torch.stack([steps.square() < 2 * steps * other for other in adjacent])
+            two_away = (wide.narrow(axis, place, steps.shape[axis]) for place in (0, 4))
+            soft = torch.stack([steps.square() < 2 * steps * other for other in two_away])
             soft = soft.flatten(0, 1).any(0)
-            field = of(steps, 1, lambda new: new | new.roll(1, axis), either)
+            field = field_of(steps, 1, lambda new: new | new.roll(1, axis), either)
             return field._replace(change=field.change.masked_fill(soft, torch.inf))
 
         yield edges
     for size in _SIZES:
 
         def spots(hidden: torch.Tensor, size: int = size) -> _Field:
-            return of(_spots(known(hidden), size), size, lambda new: _grown(new, size))
+            return field_of(_spots(known(hidden), size), size, lambda new: _grown(new, size))
 
         yield spots
 
@@ -348,20 +350,22 @@ def _along(fields: torch.Tensor, axis: int) -> torch.Tensor:
     return box_sum(pad(fields.nan_to_num(0.0), rim), _LINE, axis) / _LINE
 
 
-def _candidates(fields: Sequence[_Of], hidden: torch.Tensor) -> torch.Tensor:
+def _candidates(detectors: Sequence[_Detector], hidden: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
-    for of in fields:
-        field = of(hidden)
+    for detector in detectors:
+        field = detector(hidden)
         alike = _beyond_chance(_alike(field, field.least), field)
         hidden = hidden | field.marked(alike)
     return _closed(hidden, _GAP)
 
 
-def _still(fields: Sequence[_Of], structure: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+def _still(
+    detectors: Sequence[_Detector], structure: torch.Tensor, d: torch.Tensor
+) -> torch.Tensor:
     """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots."""
     sharp = structure
-    for of in fields:
-        field = of(structure)
+    for detector in detectors:
+        field = detector(structure)
         new = field.marked(_stays(field, d))
         if field.size == 1:
             sharp = sharp | new

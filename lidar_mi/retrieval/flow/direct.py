@@ -49,10 +49,9 @@ class Posterior(NamedTuple):
     prior: Prior
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """By kind of motion: the variance removed by the images, and its square in the flow."""
+        """By kind of motion: prior less posterior variance, and its square in the flow."""
         after = covariance_near(self.root, self.whole)
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
-        # at the largest evidence the two are equal (MacKay's fixed point)
         return variances(self.before.covariance() - after, self.prior), energy
 
     def response(self, gradients: torch.Tensor) -> torch.Tensor:

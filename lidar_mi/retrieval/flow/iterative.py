@@ -46,7 +46,7 @@ class Posterior(NamedTuple):
     response: None = None
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """By kind of motion: the variance removed by the images, and its square in the flow."""
+        """By kind of motion: prior less posterior variance, and its square in the flow."""
         solver = self.settings.solver
         before, after = (
             self.single.by_kind(self.single.rates(flows).square()).mean(0)

@@ -53,7 +53,10 @@ class Posterior(Protocol):
         """Coefficients by gradients (n, ...), with the prior's precision times a strength."""
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """By kind of motion: the variance removed by the images, and its square in the flow."""
+        """By kind of motion: prior less posterior variance, and its square in the flow.
+
+        They are equal at the largest evidence (MacKay's fixed point).
+        """
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before."""

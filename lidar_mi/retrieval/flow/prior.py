@@ -187,7 +187,7 @@ class Prior(NamedTuple):
         Parameters
         ----------
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
-            Variance of each kind of motion removed by the images, and its square in the flow.
+            Of each kind of motion: prior less posterior variance, and its square in the flow.
         """
         known, square = (self.local * self.cell * part for part in (informed, energy))
         around = self._number_around()

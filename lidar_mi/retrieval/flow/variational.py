@@ -48,12 +48,13 @@ def variational(
 
     Minimised over the flow u (displacement in dt) as B-splines is
 
-        sum_k sum_x (I_k(x + path(u, t_k)) - mean_k)^2 / (2 s^2)
+        sum_k sum_x (I_k(x + path(u, t_k)) - m(x))^2 / (2 sigma^2)
             + 1/2 integral s(x) (L vorticity^2 + M |grad vorticity|^2
                                  + D divergence^2 + N |grad divergence|^2),
 
-    with the images warped to mid-time along the curved paths of the flow, so that no texture has
-    to be known; residuals beyond 3 s count linearly. The prior's strength s(x), which may vary over
+    with the images warped to mid-time along the curved paths of the flow, their mean m, so that no
+    texture has to be known, and the standard deviation sigma of their noise; residuals beyond
+    3 sigma count linearly. The prior's strength s(x), which may vary over
     about a template, and L, M, D, N are those of the largest evidence (`prior.Prior`). So the flow
     is smoothed little in cores and strongly around them. In volumes vorticity along x, across x and
     divergence have a strength each (`prior.KINDS`). The variance of the differences, by place and
@@ -92,8 +93,9 @@ def variational(
     -------
     Displacement
         Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of an
-        image with the mean of the others, `covariance` that of the posterior, and of motion finer
-        than the splines.
+        image with the mean of the others, `covariance` that of the posterior, larger where the
+        prior proves wrong, plus those of motion finer than the splines, of noise that is not white
+        and of offsets of lines.
         On undersampled images displacements have an error that is correlated among
         neighbours: up to 0.04 px on particles of 2 px (1/e^2), 0.01 px of 2.5 px, none on larger
         ones.
@@ -128,8 +130,9 @@ def variational_and_flow(
     """`variational`, and if asked what the retrieval of the next images may start from.
 
     There is none for volumes, for images of more than `settings.strips.largest` knots, and for
-    images that do not determine the flow. Where lines of two images have offsets the fit is
-    repeated on images without them, and where these do not explain the images on the images.
+    images that do not determine the flow. Where lines of two images have offsets, the fit is
+    repeated on images without them. If offsets never explain the images, these are fitted as they
+    are.
     """
     fitted: Callable[..., tuple[Displacement, Flow | None] | LineOffsets] = partial(
         _fitted,
@@ -143,10 +146,9 @@ def variational_and_flow(
     )
     result = fitted(stack)
     while isinstance(result, LineOffsets):
-        unexplained = result.settled
-        result = (
-            fitted(stack, sought=False) if unexplained else fitted(result.images, offsets=result)
-        )
+        # settled: a further fit would not change offsets that do not explain the images
+        given_up = result.settled
+        result = fitted(stack, sought=False) if given_up else fitted(result.images, offsets=result)
     return result
 
 
@@ -162,9 +164,10 @@ def _fitted(
     offsets: LineOffsets | None = None,
     sought: bool = True,
 ) -> tuple[Displacement, Flow | None] | LineOffsets:
-    """`variational_and_flow` of images without `offsets` of lines.
+    """`variational_and_flow` of images from which `offsets` of lines were subtracted.
 
-    If they are `sought`, and those that are found now do not explain the images yet, these.
+    If `sought`, offsets are looked for; those that do not yet explain the images are returned in
+    place of the fit.
     """
     check_between("min_correlation", min_correlation, -1, 1)
     for image in stack[1:]:
@@ -182,7 +185,8 @@ def _fitted(
     levels = zip(settings.knots, settings.rounds, settings.noise_rounds, strict=True)
     for knots, rounds, noise_rounds in levels:
         axes = [Axis(n, max(2.0, knots * windows.template)) for n in windows.shape]
-        mesh, single = Mesh(axes, pixels), Mesh(axes, [place.float() for place in pixels])
+        mesh = Mesh(axes, pixels)
+        mesh_in_single = Mesh(axes, [place.float() for place in pixels])
         solve = _solver(axes, settings)
         coefficients = mesh.fitted(flow)
         if prior is None:
@@ -194,29 +198,30 @@ def _fitted(
         in_single = images.single()
         for iteration in range(rounds):
             if posterior is not None and iteration in noise_rounds:
-                flow_in_single = coefficients.float()
-                linear = linearised(in_single, single, flow_in_single, settings)
+                coefficients_in_single = coefficients.float()
+                linear = linearised(in_single, mesh_in_single, coefficients_in_single, settings)
                 components = differences(
                     images,
                     linear,
-                    single,
-                    flow_in_single,
+                    mesh_in_single,
+                    coefficients_in_single,
                     prior,
                     windows.template,
                     posterior.response,
                 )
                 images, unresolved = components.images, components.unresolved
                 in_single = images.single()
-            linear = linearised(in_single, single, coefficients.float(), settings)
-            posterior = solve(linear, single, coefficients, prior, settings, iteration)
+            linear = linearised(in_single, mesh_in_single, coefficients.float(), settings)
+            posterior = solve(linear, mesh_in_single, coefficients, prior, settings, iteration)
             coefficients = posterior.coefficients.to(like)
             # the first flow on coarse knots is too far off to estimate the prior from
             if iteration or len(axes) > 2 or knots != settings.knots[0]:
                 prior = prior.updated(*posterior.evidence(), settings)
         flow = mesh.field(coefficients)
     assert prior is not None  # settings have a level at least
-    linear = linearised(in_single, single, coefficients.float(), settings)
-    posterior = solve(linear, single, coefficients, prior, settings, settings.rounds[-1])
+    # the posterior under the last prior; that of the loop is under the one before
+    linear = linearised(in_single, mesh_in_single, coefficients.float(), settings)
+    posterior = solve(linear, mesh_in_single, coefficients, prior, settings, settings.rounds[-1])
     if sought and len(stack) == 2 and windows.dims == 2 and posterior.response is not None:
         offsets = line_offsets(
             images, linear, mesh, coefficients, settings, posterior.response, offsets
@@ -227,27 +232,27 @@ def _fitted(
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     # never narrower: one ratio scatters by half in flows of few vortices
-    check = prior_check(posterior, linear, single)
+    check = prior_check(posterior, linear, mesh_in_single)
     factor = check.factor(centres).to(covariance).clamp(min=1.0)
     covariance = factor * covariance
     score = agreement(linear, windows)
     result = flagged(d, covariance, before, score, stack, windows, min_correlation)
     # what the splines do not resolve is not in the posterior, nor noise that is not white
     eye = torch.eye(windows.dims).to(covariance)
-    finer = interpolated(unresolved.to(like), pixels, centres).to(covariance)
-    lines, coloured = "", torch.zeros_like(finer)
+    beyond_posterior = interpolated(unresolved.to(like), pixels, centres).to(covariance)
+    noisy_lines = ""
     if windows.dims == 2 and posterior.response is not None:
-        coloured, lines = variance_by_coloured_noise(
-            linear, images, single, windows, posterior.response
+        coloured, noisy_lines = variance_by_coloured_noise(
+            linear, images, mesh_in_single, windows, posterior.response
         )
-        finer = finer + coloured.to(finer)
-    additional = eye.reshape(*eye.shape, *[1] * windows.dims) * finer
+        beyond_posterior = beyond_posterior + coloured.to(beyond_posterior)
+    additional = eye.reshape(*eye.shape, *[1] * windows.dims) * beyond_posterior
     if offsets:
         by_lines = Mesh(mesh.axes, centres).field(offsets.flows.to(like)).to(covariance)
         additional = additional + torch.einsum("nazy,nbzy->abzy", by_lines, by_lines)
-        lines = offsets.names
+        noisy_lines = offsets.names
     covariance = covariance + additional
-    said = {"noise_of_lines": lines} if lines else {}
+    said = {"noise_of_lines": noisy_lines} if noisy_lines else {}
     result = result._replace(covariance=covariance, attributes=said)
     if untextured is None:
         return result, None

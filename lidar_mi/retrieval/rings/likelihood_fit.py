@@ -79,11 +79,12 @@ class RingFit:
     rings : torch.Tensor
         Rings that were detected.
     outliers : torch.Tensor
-        Fraction of the cells that was masked.
+        Masked fraction: of the cells that do not fit, plus of the pixels in bright patches. Single
+        hot and dead pixels do not count.
     sensitivity : torch.Tensor, shape (images, 8)
         Change of v_los per error of the model's calibration (`RingModel.systematic`).
     systematic : torch.Tensor, shape (8, 8)
-        The covariance of that.
+        Covariance of the calibration's error, in the order of `sensitivity`.
     """
 
     values: torch.Tensor
@@ -156,7 +157,8 @@ def fit_rings(
     method : {"annular", "pixels"}
     centre : (float, float), optional
         (x, y) of the rings, pixels: where the fit starts, and where it stays if x and y are not
-        free. Found from the images' gradients if not given.
+        free. Default: from the images' gradients if x and y are both free, else that of
+        the model.
     free : names out of `lidar_mi.retrieval.rings.model.PARAMETERS`, optional
         Fitted parameters; all that the model has if not given. The others stay at the model's
         values, the background at 0.
@@ -244,7 +246,8 @@ class _Task(NamedTuple):
     max_chi_square: float
     centre: tuple[float, float] | None
     response: torch.Tensor | None
-    spotless: bool = False
+    spots_removed: bool = False
+    """Whether hot and dead pixels were masked."""
 
     @property
     def moves(self) -> bool:
@@ -269,7 +272,7 @@ def _fit(images: torch.Tensor, task: _Task, number: int, method: str) -> RingFit
             each = enumerate(images[:, None], number)
             return _joined([_fit(image, task, k, method) for k, image in each])
         bright = patches(images[0])
-        if method != "annular" or task.spotless or not bright.any():
+        if method != "annular" or task.spots_removed or not bright.any():
             raise
     fit = _fit_together(images, task.without(bright), number, method)
     return replace(fit, outliers=fit.outliers + bright.double().mean())
@@ -297,7 +300,7 @@ def _fit_together(images: torch.Tensor, task: _Task, number: int, method: str) -
             start = float(fit.of("x")[k]), float(fit.of("y")[k])
             alone = _fit(images[k, None], task._replace(centre=start), number + k, method)
             fit = _joined([_part(fit, slice(0, k)), alone, _part(fit, slice(k + 1, None))])
-    if method == "annular" and not task.spotless:
+    if method == "annular" and not task.spots_removed:
         fit = _without_spots(fit, images, task, number)
     _check(fit, task, number)
     return fit
@@ -309,7 +312,7 @@ def _without_spots(fit: RingFit, images: torch.Tensor, task: _Task, number: int)
         bad = spots(images[k].double(), task.noise)
         if 0 < bad.sum() < MOST_SPOTS * bad.numel():
             place = float(fit.of("x")[k]), float(fit.of("y")[k])
-            clean = task.without(bad)._replace(spotless=True, centre=place)
+            clean = task.without(bad)._replace(spots_removed=True, centre=place)
             alone = _fit(images[k, None], clean, number + k, "annular")
             fit = _joined([_part(fit, slice(0, k)), alone, _part(fit, slice(k + 1, None))])
     return fit
@@ -345,7 +348,8 @@ def _fit_about(
     means = annular.cells.means(images)
     parameters = _start(model, annular, means, noise, number)
     end = robust_scoring([annular], [means], parameters, model, noise, task.free, number)
-    rings = _rings(model, annular, means, end, noise)
+    in_cells = end
+    rings = _detected(model, annular, means, end, noise)
     if method == "pixels":
         blocks = list(pixel_waves(model, centre, images.device))
         split = [len(block.cells.count) for block in blocks]
@@ -367,7 +371,8 @@ def _fit_about(
     covariance = np.zeros((size, size)) if model.systematic is None else model.systematic
     sensitivity = end.parameters.new_zeros((len(images), size))
     if model.systematic is not None:
-        sensitivity = _sensitivity(annular, end, task)
+        end_in_cells = in_cells._replace(parameters=end.parameters)
+        sensitivity = _sensitivity(annular, end_in_cells, task)
     systematic = torch.as_tensor(covariance, dtype=torch.float64, device=images.device)
     return RingFit(values, std, chi_square, rings, end.outliers, sensitivity, systematic)
 
@@ -401,7 +406,8 @@ def _start(
             )
     parameters = model.start(means.device).repeat(len(means), 1)
     first = model.amplitudes(parameters[:1])[0][0, 0]
-    # level Re(2 A_1 exp(2 pi i (m + s v))) = a cos + b sin: A_1 exp(2 pi i s v) ~ a - i b
+    # 2 level Re(A_1 exp(2 pi i (fraction + v / velocity_range))) = a cos + b sin, so that
+    # 2 level A_1 exp(2 pi i v / velocity_range) = a - i b
     wave = torch.complex(coefficients[:, 1], -coefficients[:, 2])
     v = torch.angle(wave / first) / (2 * torch.pi) * model.velocity_range
     # no higher than the mean, so that the background is not negative
@@ -414,25 +420,26 @@ def _start(
 def _sensitivity(waves: Waves, end: Scored, task: _Task) -> torch.Tensor:
     """Change of the fitted speed per error of the calibration, (images, 8).
 
-    A change d of the instrument moves the fit by -F^-1 J^T W (dmu/dd) d.
+    A change d of the instrument moves the fit by -F^-1 J^T W (dmu/dd) d, with the Fisher matrix F,
+    the derivatives J of the mean mu by the free parameters, and the weights W.
     """
     model = task.model
     exact = ring_waves(model, waves.cells, derivatives=True)
     mean, jacobian = mean_and_jacobian(model, exact, end.parameters, [*task.free, *INSTRUMENT])
     weight = end.used[0] * waves.cells.count / cell_variance(mean, end.parameters, task.noise)
-    free, known = jacobian.split([len(task.free), len(INSTRUMENT)], 1)
+    free, by_instrument = jacobian.split([len(task.free), len(INSTRUMENT)], 1)
     information = prior_information(model, task.free, mean.device)
     fisher = torch.diag(information) + fisher_matrix(free, weight)
-    moved = torch.linalg.solve(fisher, (free * weight[:, None]) @ known.transpose(1, 2))
-    first = moved[:, task.free.index("v_los")]
+    moved = torch.linalg.solve(fisher, (free * weight[:, None]) @ by_instrument.transpose(1, 2))
+    of_speed = moved[:, task.free.index("v_los")]
     # an error of the zero shifts all speeds
-    return -torch.cat([torch.ones_like(first[:, :1]), first], 1)
+    return -torch.cat([torch.ones_like(of_speed[:, :1]), of_speed], 1)
 
 
-def _rings(
+def _detected(
     model: RingModel, waves: Waves, means: torch.Tensor, end: Scored, noise: PixelNoise
 ) -> torch.Tensor:
-    """Orders whose rings are significant and at least half as strong as fitted."""
+    """Number of orders whose rings are significant and at least half as strong as fitted."""
     cells, parameters = waves.cells, end.parameters
     v, dx, dy, level, background = (
         parameters[:, PARAMETERS.index(name), None]

@@ -37,7 +37,7 @@ from lidar_mi.retrieval.vortices.track_motion import (
 
 MEASURED = len(PARAMETERS)
 _MOVING = MEASURED + len(SLOPES)
-# A fit observes the parameters and the error that slabs share, which follows the slopes.
+# A fit is the parameters plus the error that slabs share; in a state that follows the slopes.
 _OBSERVED = np.hstack([np.eye(MEASURED), np.zeros((MEASURED, len(SLOPES))), np.eye(MEASURED)])
 # Least variance of the shared error, over that of the fit: covariances must have an inverse.
 _LEAST_SHARED = 1e-6
@@ -127,7 +127,8 @@ class Slab:
     predicted : ndarray, shape (24,)
         Before it.
     transition, noise : ndarray, shape (24, 24)
-        Derivatives of the prediction by the state of the slab before, and its own covariance.
+        Derivatives of the prediction by the state of the slab before, and the covariance that the
+        random walks add.
     innovation : float or None
         Normalised square of the fit's departure from the prediction, also of a rejected fit; None
         where there is nothing to compare.
@@ -205,9 +206,10 @@ class Track:
     def inflation(self) -> np.ndarray:
         """Factors (14,) of the state's variances that the recent innovations ask for, 1 or more.
 
-        For each kind of quantity their mean square over what is expected, from rejected fits too,
-        if that is beyond the gate for so many slabs and kinds; else 1 (Birge 1932, Phys. Rev. 40,
-        207-227). Above 1 the wake is curved, or the fits err, by more than stated.
+        For each kind of quantity the sum of the squared normalised innovations, of rejected fits
+        too, over its degrees of freedom (Birge 1932, Phys. Rev. 40, 207-227), where the sum is
+        beyond the gate; else 1. The kinds share the gate's rate of false alarms. Above 1 the wake
+        is curved, or the fits err, by more than stated.
         """
         recent = [slab.by_kind for slab in self.slabs[-self.settings.window :] if slab.by_kind]
         factors = np.ones(_MOVING)
@@ -240,11 +242,11 @@ class Track:
         """The pair in a plane at a time, from all slabs so far.
 
         From the slab nearest to the plane, whose state all later slabs have improved
-        (Rauch-Tung-Striebel), it moves along the slopes and with the drift. Its covariance, times
-        `inflation`, grows by the random walks over the distance and the time from that slab, and by
-        the unknown steady rates. The velocity of a curved pair is uncertain by the difference of
-        this slab's mutual induction from the mean over all. Beyond the newest slab this is the
-        prediction of the filter.
+        (Rauch-Tung-Striebel), it moves along the slopes and with the drift. Its covariance
+        grows by the random walks over the distance and the time from that slab. Both are multiplied
+        by `inflation`, and the unknown steady rates are added. The velocity of a curved pair is
+        uncertain by the difference of this slab's mutual induction from the mean over all. Beyond
+        the newest slab this is the prediction of the filter.
 
         Parameters
         ----------
@@ -357,7 +359,7 @@ def first_track(
     if not _is_fit(pair):
         reason = pair.reasons[0] if pair.reasons else "numbers that are no pair and its covariance"
         raise InputError(f"pair: {reason}; expected an accepted fit")
-    if not _has_sense(pair):
+    if not _rotates_as_wake(pair):
         port, starboard = pair.parameters[CIRCULATIONS]
         raise InputError(
             f"pair: circulations of {port:.0f} (port) and {starboard:.0f} m2/s are not allowed; "
@@ -369,7 +371,7 @@ def first_track(
     covariance = np.zeros((len(state), len(state)))
     shared = _shared(pair)
     covariance[:MEASURED, :MEASURED] = pair.covariance
-    # the parameters err by what the fit erred: with the other sign
+    # parameters = fit - shared error - own error: hence the other sign
     covariance[_MOVING:, _MOVING:] = shared
     covariance[:MEASURED, _MOVING:] = covariance[_MOVING:, :MEASURED] = -shared
     # of each slope, and of port and starboard in common
@@ -407,10 +409,10 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
     fit = pair if pair is not None and _is_fit(pair) else None
     if fit is not None and fit.profile != track.profile:
         raise InputError(f"pair.profile: {fit.profile!r} is not that of the track")
-    if track.lost and fit is not None and _has_sense(fit):
+    if track.lost and fit is not None and _rotates_as_wake(fit):
         return first_track(fit, x, time, track.settings)
     last = track.slabs[-1]
-    state, covariance, transition, noise = _further(
+    state, covariance, transition, noise = _predicted_with_shared(
         last.state,
         last.covariance,
         x - track.x,
@@ -427,7 +429,7 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         by_kind = tuple(
             kalman.innovation(state, covariance, *measured, part=kind) for kind, _ in _KINDS
         )
-        if _has_sense(fit) and square <= chi2.ppf(track.settings.gate, MEASURED):
+        if _rotates_as_wake(fit) and square <= chi2.ppf(track.settings.gate, MEASURED):
             used = fit
             state, covariance = kalman.updated(state, covariance, *measured)
     slab = Slab(
@@ -451,16 +453,16 @@ def _predicted(
     wandering: Wandering,
     profile: Profile,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """State and covariance after a move, its derivatives and its own covariance."""
-    reached, along, later = advected(state, dx, dt, profile)
-    path, time = wandered(state, dx, dt, wandering)
-    transition = later @ along
+    """State and covariance after a move, its derivatives, the covariance that the walks add."""
+    reached, by_path, by_time = advected(state, dx, dt, profile)
+    path_walk, time_walk = wandered(state, dx, dt, wandering)
+    transition = by_time @ by_path
     # the walk along the path comes first, so that it drifts on in time
-    noise = later @ path @ later.T + time
+    noise = by_time @ path_walk @ by_time.T + time_walk
     return reached, transition @ covariance @ transition.T + noise, transition, noise
 
 
-def _further(
+def _predicted_with_shared(
     state: np.ndarray,
     covariance: np.ndarray,
     dx: float,
@@ -506,9 +508,10 @@ def _is_fit(pair: VortexPairFit) -> bool:
     return True
 
 
-def _has_sense(pair: VortexPairFit) -> bool:
+def _rotates_as_wake(pair: VortexPairFit) -> bool:
     """Whether port is the vortex of positive circulation, starboard that of negative."""
-    return bool(pair.parameters[0] > 0 > pair.parameters[4])
+    port, starboard = pair.parameters[CIRCULATIONS]
+    return bool(port > 0 > starboard)
 
 
 def _check_finite(**numbers: float) -> None:

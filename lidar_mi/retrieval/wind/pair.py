@@ -69,9 +69,8 @@ def retrieve_wind(
     validation : VectorValidation
         Tests that a vector must pass.
     noise : float or xr.DataArray, optional
-        Standard deviation of image 1's noise, in its unit. Default: methods that weight by it
-        ("multipass", "variational", "vortex_fit") estimate it, and the test of texture assumes
-        none.
+        Standard deviation of image 1's noise, in its unit. Default: "multipass",
+        "variational" and "vortex_fit" estimate it; the test of texture assumes none.
     more : sequence of xr.DataArray
         Further images on the same grid, each dt after the one before ("variational"): a burst.
         The winds are those at its mid-time.
@@ -160,6 +159,7 @@ def retrieve_wind(
     with threads_for(image1.size):
         clean, vectors = within_memory(retrieve)
     wind = pair_dataset(chosen, inputs, clean, vectors, validation)
+    # the sampling is at rest and draws displacements to its periods, or leaves too few samples
     if structure.spoilt or structure.thinned:
         wind["flag"] = wind["flag"] | np.int16(Flag.AT_REST)
     return wind.assign_attrs(sampling=structure.said) if structure.said else wind
@@ -181,17 +181,18 @@ def _vectors(
     estimate = _estimator(method, inputs, frames[2:], validation, settings)
     displacement = estimate(*frames[:2], stride=windows.stride)
     pair: Sequence[torch.Tensor] = frames[:2]
-    pattern, copy, unexplained = Standing(), Copy(), False
+    pattern, copy, copy_remains = Standing(), Copy(), False
     tested = checks and not (inputs.times and method.timed)
     if tested and len(frames) == 2 and displacement.quantities:
-        # its effect on the parameters is unknown
+        # how a copy biases parameters is unknown: it is detected, not removed
         copy = copy_at_rest(pair, displacement, windows)
-        unexplained = copy.significant
+        copy_remains = copy.significant
     elif tested and len(frames) == 2:
-        again, raw = partial(estimate, stride=windows.stride), pair
+        again, before = partial(estimate, stride=windows.stride), pair
         field = Displacement.medians if method.local else lambda d: d
         displacement, copy, pair = without_copy(again, displacement, pair, windows, field)
-        unexplained = copy.significant and pair is raw
+        # a copy that cannot be removed leaves the images as they were
+        copy_remains = copy.significant and pair is before
         displacement = copy.widened(displacement)
     flag = clean.defects.flags(displacement, clean.raw, windows, method.centred)
     if method.local:
@@ -214,17 +215,18 @@ def _vectors(
     # parameters fitted beside the vectors would stay biased
     if pattern.spoils or (pattern.fraction and displacement.quantities):
         flag = flag | Flag.AT_REST.value
-    elif unexplained and not pattern.fraction:
+    elif copy_remains and not pattern.fraction:
         flag = flag | Flag.AT_REST.value
     else:
         displacement = pattern.corrected(displacement)
     if method.local:
         flag = flag | _flags_among_neighbours(displacement.d, low, windows, validation)
     if checks and method.reach:
-        different = _flags_of_unrelated(clean, inputs, method)
-        # images that differ have large errors, however strong the texture
-        named = (different > 0) & ~low.to(flag.device)
-        flag = torch.where(named, flag & ~Flag.LOW_TEXTURE.value, flag) | different
+        unrelated_flag = _flags_of_unrelated(clean, inputs, method)
+        # unrelated images have large errors, which count as low texture: where it is strong the
+        # one reason is that they are unrelated
+        unrelated_only = (unrelated_flag > 0) & ~low.to(flag.device)
+        flag = torch.where(unrelated_only, flag & ~Flag.LOW_TEXTURE.value, flag) | unrelated_flag
     if inputs.same:
         flag = flag | Flag.AT_REST.value
     times = None if method.timed else inputs.times
@@ -252,7 +254,7 @@ def _estimator(
         "times": inputs.times,
         "blur": inputs.blur_px,
         "settings": settings,
-        "partly": True,
+        "partly": True,  # windows with masked pixels are matched by the others, and flagged
     }
     windows = inputs.windows
     options = {name: offered[name] for name in method.options}

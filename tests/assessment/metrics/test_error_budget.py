@@ -257,29 +257,6 @@ def advected(move, columns=81, rows=61):
 
 
 @pytest.mark.parametrize("method", ["cc", pytest.param("multipass", marks=pytest.mark.slow)])
-def test_noise_alone_has_all_of_it(method):
-    """An even wind of a whole pixel, 10 % white noise: without the noise hardly anything is
-    left, as correlation sees whole pixels exactly."""
-    sharp = advected(lambda y, z: (y - H, z + H))
-    rng = np.random.default_rng(11)
-    observed = [i + 0.1 * rng.standard_normal(i.shape) for i in sharp]
-    images = images_without(observed, sharp, sharp, sharp)
-    truth = flow(lambda y, z: H / DT + 0 * y, lambda y, z: -H / DT + 0 * y)
-    settings = {"dt": DT, "method": method, "windows": WindowSizes(stride=2)}
-    found = retrieve_wind(*observed, noise=0.1, **settings)
-    without = {
-        cause: retrieve_wind(*pair, noise=0.0 if cause == "detector_noise" else 0.1, **settings)
-        for cause, pair in images.items()
-    }
-    budget = error_budget(found, without, truth, [])
-    assert budget["rmse_v"] > 0.05
-    assert budget["detector_noise.fraction"] > 0.9
-    # neither simulation's noise nor blur is in these images
-    assert budget["monte_carlo.fraction"] == pytest.approx(0, abs=1e-6)
-    assert budget["beam_blur.fraction"] == pytest.approx(0, abs=1e-6)
-
-
-@pytest.mark.parametrize("method", ["cc", pytest.param("multipass", marks=pytest.mark.slow)])
 def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
     """Noise taken away as it fell, or drawn anew six times: its fraction of the error is the same.
 

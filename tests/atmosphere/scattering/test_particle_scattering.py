@@ -1,8 +1,8 @@
 """Particles against published numbers, independent solvers and closed forms.
 
-Detects: 1e-5 in a sphere's matrix, 0.1 % in a spheroid's, a wrong sign of b1 or b2, prolate taken
-for oblate, radius of equal volume taken for another one, a size average or normalisation off by
-1 %. Tests that compute need the library scatrs.
+Detects: a wrong sign of b1 or b2, spheroids that do not become spheres, a size average or
+normalisation off by 1 %. `validation.scattering_matrices` has other solvers; tests/validation runs
+it. Tests that compute need the library scatrs.
 """
 
 import math
@@ -68,95 +68,6 @@ def test_sphere_of_bohren_and_huffman(scatrs):
     assert (a2 == a1).all() and (a4 == a3).all()
 
 
-@pytest.mark.parametrize(
-    "radius, m", [(0.05e-6, 1.75 + 0.44j), (0.4e-6, 1.53 + 0.008j), (2e-6, 1.334 + 1e-9j)]
-)
-def test_table_of_one_sphere_against_miepython(scatrs, radius, m):
-    """Through the whole of make_table, so cross-section, albedo and normalisation count too."""
-    miepython = pytest.importorskip("miepython", reason="miepython (extra 'test') is not installed")
-    table = make_table(single_size(radius, m), GREEN, nodes=2)
-    x = 2 * math.pi * radius / GREEN
-    # its index has a negative imaginary part
-    q_ext, q_sca, q_back, g = miepython.efficiencies_mx(np.conj(m), x)
-    area = math.pi * radius**2
-    assert table.extinction_cross_section == pytest.approx(q_ext * area, rel=3e-5)
-    assert table.albedo == pytest.approx(q_sca / q_ext, rel=1e-5)
-    # its q_back is 4 pi times the backward differential cross-section over the area
-    assert table.lidar_ratio == pytest.approx(4 * math.pi * q_ext / q_back, rel=2e-4)
-    assert table.asymmetry == pytest.approx(g, abs=3e-4)
-    cosine = np.cos(np.radians(table.angle))
-    s1, s2 = miepython.S1_S2(np.conj(m), x, cosine, norm="4pi")
-    expected = [
-        (abs(s1) ** 2 + abs(s2) ** 2) / 2,
-        (abs(s2) ** 2 - abs(s1) ** 2) / 2,
-        (s2 * s1.conj()).real,
-        # its amplitudes are the complex conjugates of Bohren & Huffman's
-        -(s2 * s1.conj()).imag,
-    ]
-    got = table.elements[:, [0, 4, 2, 5]].T
-    np.testing.assert_allclose(got, expected, rtol=0, atol=2e-5 * got[0].max())
-
-
-def test_water_cloud(scatrs):
-    """Lidar ratio 18.8 +- 0.8 sr at 905 nm (O'Connor, Illingworth & Hogan 2004, J. Atmos. Oceanic
-    Technol. 21, 777); extinction of C.1 twice its geometric cross-section, a few per cent more."""
-    assert make_table("droplets", 905e-9, nodes=3000).lidar_ratio == pytest.approx(18.8, abs=0.8)
-    table = make_table("droplets", GREEN, nodes=1000)
-    assert table.albedo == pytest.approx(1, abs=1e-6)
-    assert table.depolarization_ratio == 0
-    # mean r^2 of n(r) = r^6 exp(-1.5 r): Gamma(9)/Gamma(7)/1.5^2 um^2
-    area = math.pi * 7 * 8 / 1.5**2 * 1e-12
-    assert 2.05 < table.extinction_cross_section / area < 2.20
-
-
-def test_opac_water_soluble(scatrs):
-    """OPAC (Hess et al. 1998): single-scattering albedo 0.962 at 550 nm, dry."""
-    table = make_table("continental", GREEN, nodes=1000)
-    assert table.albedo == pytest.approx(0.962, abs=0.002)
-
-
-def rayleigh_spheroid(m, elongation, angle):
-    """Small randomly oriented prolate spheroids in closed form.
-
-    Depolarising factors and polarisabilities: Bohren & Huffman 1983, eqs. 5.32-5.33; orientation
-    average: their sec. 5.5 (the same Placzek sums as for molecules). Returns Q_ext/x of the
-    equal-volume sphere and the normalised elements (absorbing, so scattering is neglected in
-    Q_ext).
-    """
-    e = math.sqrt(1 - elongation**-2)
-    along = (1 - e**2) / e**2 * (math.log((1 + e) / (1 - e)) / (2 * e) - 1)
-    contrast = m**2 - 1
-    # polarisabilities over 4 pi r_v^3
-    a, b = (contrast / (3 + 3 * factor * contrast) for factor in (along, (1 - along) / 2))
-    mean, difference = (a + 2 * b) / 3, a - b
-    anisotropy = abs(difference) ** 2 / abs(mean) ** 2
-    c = np.cos(np.radians(angle))
-    isotropic, turned = 45.0, anisotropy
-    a1 = isotropic * (1 + c**2) / 2 + turned * (13 + c**2) / 2
-    a2 = (isotropic + turned) * (1 + c**2) / 2
-    a3 = (isotropic + turned) * c
-    a4 = (isotropic - 5 * turned) * c
-    b1 = -(isotropic + turned) * (1 - c**2) / 2
-    norm = (isotropic * 4 / 3 + turned * 40 / 3) / 2
-    elements = np.stack([a1, a2, a3, a4, b1, 0 * c], axis=1) / norm
-    return 4 * mean.imag, elements
-
-
-@pytest.mark.parametrize("elongation", [1.3, 2.0, 3.0])
-def test_small_spheroids_are_rayleigh_scatterers(scatrs, elongation):
-    """Next order is x^2 = 1e-4: 0.1 % of a1 allowed; an oblate spheroid would be 4 % off."""
-    x, m = 0.01, 1.53 + 0.1j
-    angle = np.linspace(0, 180, 19)
-    q_ext, q_sca, elements = one_matrix(x, m, elongation, angle)
-    expected_ext, expected = rayleigh_spheroid(m, elongation, angle)
-    assert q_ext - q_sca == pytest.approx(expected_ext * x, rel=1e-3)
-    np.testing.assert_allclose(elements, expected, atol=1e-3)
-    # d of natural light at 90 degrees, d/(2 - d) of linear light backwards
-    (across, polarised), (back, kept) = elements[9, [0, 4]], elements[-1, [0, 1]]
-    d = (across + polarised) / (across - polarised)
-    assert (back - kept) / (back + kept) == pytest.approx(d / (2 - d), rel=5e-3)
-
-
 def test_nearly_round_spheroid_is_a_sphere(scatrs):
     """Elongation 1 + 1e-5 against Lorenz-Mie: the two solvers share no formula."""
     angle = np.linspace(0, 180, 37)
@@ -185,7 +96,7 @@ def test_published_amplitude_matrix_of_a_prolate_spheroid(rustmatrix):
 
     Width/length 0.5, equal-surface-area radius 10 (that of equal volume is 0.963711 times it),
     wavelength 2 pi, m = 1.5 + 0.02i. Makes rustmatrix, with the definition of the phase matrix
-    used below, a witness for the next test.
+    used below, a witness for `validation.scattering_matrices`.
     """
     spheroid = rustmatrix.Scatterer(
         radius=9.63711, wavelength=2 * math.pi, m=1.5 + 0.02j, axis_ratio=0.5, ddelt=1e-6, ndgs=4
@@ -195,39 +106,6 @@ def test_published_amplitude_matrix_of_a_prolate_spheroid(rustmatrix):
     np.testing.assert_allclose(s, expected, atol=6e-4)
     published = [650.3172, 631.6323, 635.2768, 643.1738, -17.9846, -34.7730]
     np.testing.assert_allclose(phase_matrix(s[None])[0], published, atol=6e-3)
-
-
-@pytest.mark.parametrize("x, elongation", [(2.0, 3.0), (5.0, 2.0)])
-def test_random_orientation_against_brute_force(scatrs, rustmatrix, x, elongation):
-    """Quadrature over orientations of a solver that shares no code: all six elements to 0.1 %."""
-    m = 1.53 + 0.008j
-    angle = np.array([0.0, 30.0, 75.0, 120.0, 165.0, 180.0])
-    solver = rustmatrix.Scatterer(
-        radius=x, wavelength=2 * math.pi, m=m, axis_ratio=1 / elongation, ddelt=1e-6, ndgs=4
-    )
-    cosine, weight = np.polynomial.legendre.leggauss(24)
-    # the length axis has no direction: half the sphere of orientations is enough
-    cosine, weight = cosine[cosine > 0], weight[cosine > 0]
-    turns = (np.arange(24) + 0.5) * 15.0
-    elements = np.zeros((len(angle), 6))
-    for c, w in zip(cosine, weight, strict=True):
-        beta = math.degrees(math.acos(c))
-        for k, scattered in enumerate(angle):
-            s = [amplitudes(solver, 0.0, scattered, (0.0, 0.0), turn, beta) for turn in turns]
-            elements[k] += w * phase_matrix(np.array(s)).mean(axis=0)
-    q_ext, q_sca, ours = one_matrix(x, m, elongation, angle)
-    # differential cross-section = C_sca a1/(4 pi); here k = 1 and C = pi x^2 Q
-    ours = ours * q_sca * math.pi * x**2 / (4 * math.pi)
-    np.testing.assert_allclose(ours / elements[:, :1], elements / elements[:, :1], atol=1e-3)
-    # optical theorem, forward amplitude averaged over orientations and both polarisations
-    forward = 0.0
-    for c, w in zip(cosine, weight, strict=True):
-        s = [
-            amplitudes(solver, 0.0, 0.0, (0.0, 0.0), turn, math.degrees(math.acos(c)))
-            for turn in turns
-        ]
-        forward += w * np.trace(np.mean(s, axis=0)).imag / 2
-    assert q_ext * math.pi * x**2 == pytest.approx(4 * math.pi * forward, rel=1e-4)
 
 
 def test_spheroid_table_keeps_every_law(scatrs):

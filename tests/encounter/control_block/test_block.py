@@ -19,8 +19,7 @@ import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.aircraft.models import aircraft_of
-from lidar_mi.aircraft.state import Commands, loads_in_wind
-from lidar_mi.aircraft.strips import Loads
+from lidar_mi.aircraft.state import loads_in_wind
 from lidar_mi.encounter.control_block.block import control_block
 from lidar_mi.encounter.control_block.gust_axes import gusts, span_nodes
 from lidar_mi.encounter.control_block.sensor_samples import (
@@ -268,65 +267,10 @@ def example():
     return runpy.run_path(str(EXAMPLE))
 
 
-def rolled(moments, estimates, forward):
-    """Roll angles of a flight with the controller of the example, by the roll model.
-
-    Rolling moments of the wind (N m) have a row for each period and a column for each of its parts.
-    Estimates of p are of planes from 20 periods on.
-    """
-    aircraft = aircraft_of(experiment().encounter)
-    damping, power = -aircraft.roll_damping, aircraft.control_moments[0, 0]
-    rolls, state = [], aircraft.state
-    for k, in_period in enumerate(moments):
-        expected = (estimates[k - 20] + estimates[k - 19]) / 2 if k >= 20 else 0.0
-        aileron = -forward * damping / power * expected - state.roll - 0.5 * state.roll_rate
-        for moment in in_period:
-            loads = Loads(np.zeros(3), np.array([moment, 0.0, 0.0]))
-            dt = PERIOD / len(in_period)
-            state = aircraft.step(dt, loads, Commands(aileron=float(aileron)))
-            rolls.append(state.roll)
-    return np.array(rolls)
-
-
-@pytest.fixture(scope="module")
-def weather():
-    """Rolling moments of the wind in all flights, and what a lidar with other noise says of it."""
-    found = []
-    for seed in SEEDS:
-        one = experiment(seed)
-        aircraft = aircraft_of(one.encounter)
-        times = PERIOD / 4 * (np.arange(2320) + 0.5)
-        loads = loads_in_wind(
-            aircraft.strips, aircraft.state, air_along_path(one).wind, aircraft.density, times
-        )
-        lidar = KnownLidar(one, seed + 100)
-        found.append((loads.moment[:, 0].reshape(-1, 4), lidar.estimates["p"]))
-    return found
-
-
 def with_losses(block, lost, run):
     """The block of a lidar that loses so many estimates, in runs of this mean length."""
     begin = lost / run / (1 - lost)
     return block | {"loss_transition": np.array([[1 - begin, begin], [1 / run, 1 - 1 / run]])}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("forward", "lost"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.05)])
-def test_predicted_roll_agrees_with_flights(block, weather, forward, lost):
-    """Within 10 %: the variance of roll of nonlinear flights, by the roll model and its aileron.
-
-    The air is that of the flights from which the block is identified: the variance of turbulence
-    differs by more from realisation to realisation. A lost estimate announces nothing.
-    """
-    block = with_losses(block, lost, 3)
-    predicted = example()["rms"](block, forward)[0] ** 2
-    random, found = np.random.default_rng(5), []
-    for moments, estimates in weather:
-        modes = chain(random, block["loss_transition"], len(estimates))[:, 0]
-        # the first 5 s are transient
-        rolls = rolled(moments, np.where(modes == 0, estimates, 0.0), forward)[200:]
-        found.append(np.mean(rolls**2))
-    assert abs(np.mean(found) / predicted - 1) < 0.1
 
 
 @pytest.mark.slow

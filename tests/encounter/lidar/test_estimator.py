@@ -9,6 +9,7 @@ from benchmarks.cases import drifting_pair_images, vortex_pair_images
 from benchmarks.realtime import UNFORESEEN
 from lidar_mi.encounter.lidar.estimate import SKIPPED
 from lidar_mi.encounter.lidar.estimator import Estimator
+from lidar_mi.encounter.lidar.slab_winds import FirstImage
 from lidar_mi.schema.reading import load_experiment
 from tests.support.vortex_pairs import uneven, vector
 
@@ -22,30 +23,33 @@ def images():
 
 def test_vortices_from_nothing_and_from_the_last_fit(images):
     estimator = Estimator(load_experiment("wake_sensor"), vectors=False)
-    wind, cold, seconds, *_ = estimator.pair_of(images.first, images.second, DT, 0.03)
+    wind, cold, seconds, *_ = estimator.pair_of(FirstImage(images.first, DT, 0.03), images.second)
     assert wind is None and cold.success and not cold.from_start
-    warm = estimator.pair_of(images.first, images.second, DT, 0.03, cold).pair
+    warm = estimator.pair_of(FirstImage(images.first, DT, 0.03, expected=cold), images.second).pair
     assert warm.success and warm.from_start
     stderr = np.sqrt(np.diag(cold.covariance))
     assert (np.abs(warm.parameters - cold.parameters) < 0.1 * stderr).all()
     assert (np.abs(warm.parameters - vector(*images.vortices)) < 4 * stderr).all()
     assert set(seconds) == {"vortices"} and seconds["vortices"] > 0
-    warm = estimator.pair_of(images.first, images.second, DT, 0.03, cold)
+    warm = estimator.pair_of(FirstImage(images.first, DT, 0.03, expected=cold), images.second)
     assert set(warm.seconds) == {"vortices_before", "vortices"}
 
 
 def test_slopes_that_are_expected_correct_the_fit(images):
     estimator = Estimator(load_experiment("wake_sensor"), vectors=False)
-    cold = estimator.pair_of(images.first, images.second, DT, 0.03).pair
+    cold = estimator.pair_of(FirstImage(images.first, DT, 0.03), images.second).pair
     slopes = np.array([0.4, 0.0])
     told = replace(cold, slopes=slopes, slope_covariance=np.zeros((2, 2)))
-    given = images.first, images.second, DT, 0.03
-    plain = estimator.pair_of(*given, told).pair
+
+    def given(pair):
+        return FirstImage(images.first, DT, 0.03, expected=pair), images.second
+
+    plain = estimator.pair_of(*given(told)).pair
     telescope = (-148.75, 0.0, 0.0)
-    seen = estimator.pair_of(*given, cold, telescope=telescope).pair
+    seen = estimator.pair_of(*given(cold), telescope=telescope).pair
     assert plain.slopes is None and seen.slopes is None
     np.testing.assert_array_equal(plain.parameters, seen.parameters)
-    found = estimator.pair_of(*given, told, telescope=telescope).pair
+    found = estimator.pair_of(*given(told), telescope=telescope).pair
     expected = seen.with_slopes(slopes, np.zeros((2, 2)))
     np.testing.assert_allclose(found.parameters, expected.parameters)
     np.testing.assert_allclose(found.covariance, expected.covariance)
@@ -54,14 +58,15 @@ def test_slopes_that_are_expected_correct_the_fit(images):
 @pytest.mark.slow
 def test_the_wind_is_by_the_most_accurate_method(images):
     estimator = Estimator(load_experiment("wake_sensor"))
-    wind, _, seconds, *_ = estimator.pair_of(images.first, images.second, DT, 0.03)
+    wind, _, seconds, *_ = estimator.pair_of(FirstImage(images.first, DT, 0.03), images.second)
     assert wind.attrs["method"] == "variational"
     valid = wind["flag"] == 0
     assert valid.mean() > 0.9
     off = wind["v"] - images.v.interp(y=wind["y"], z=wind["z"])
     assert float(off.where(valid).std()) < 0.5
     assert set(seconds) == {"vortices", "wind_before", "wind"}
-    found = estimator.pair_of(images.first, images.second, DT, 0.03, take=(False, False))
+    first = FirstImage(images.first, DT, 0.03)
+    found = estimator.pair_of(first, images.second, take=(False, False))
     assert found.wind is None and not found.seconds
     assert found.pair.reasons == (SKIPPED,) and found.flags == (f"wind: {SKIPPED}",)
 
@@ -74,12 +79,12 @@ def test_the_next_slab_starts_from_the_last_one():
     for seed, y in ((1, 0.0), (2, 0.25)):
         vortices = [replace(v, y=v.y + y) for v in uneven()]
         slab = drifting_pair_images(vortices, (0.5, 0.0), 0.03, seed, columns=130, rows=90)
-        found = near.pair_of(slab.first, slab.second, DT, 0.03, last)
+        found = near.pair_of(FirstImage(slab.first, DT, 0.03, expected=last), slab.second)
         last = replace(found.pair, covariance=found.pair.covariance + np.diag(UNFORESEEN**2))
         far.forget()
         for name, one in {
             "near": found,
-            "far": far.pair_of(slab.first, slab.second, DT, 0.03),
+            "far": far.pair_of(FirstImage(slab.first, DT, 0.03), slab.second),
         }.items():
             off = one.wind["v"] - slab.v.interp(y=one.wind["y"], z=one.wind["z"])
             errors[name].append(float(off.std()))

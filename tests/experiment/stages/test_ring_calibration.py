@@ -16,7 +16,6 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
 from lidar_mi.experiment.stages.ring_images import exposed_frames, ring_instrument
 from lidar_mi.experiment.stages.ring_instrument import pixel_noise
-from lidar_mi.experiment.stages.ring_reference import calibration_drift
 from lidar_mi.experiment.stages.ring_velocities import speeds_to_laser
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.io.netcdf import write_netcdf
@@ -80,27 +79,6 @@ def test_calibrated_instrument():
 
 
 @pytest.mark.slow
-def test_camera_that_is_tilted_out_of_focus_and_distorts():
-    """Defects of the true camera; each alone is in the table of defects."""
-    camera = CAMERA | {"tilt": ["0.5 deg", "0 deg"], "distortion": 0.002, "defocus": "50 um"}
-    asked = {
-        "camera": camera,
-        "assumed": {"tilt": ["0 deg", "0 deg"], "distortion": 0, "defocus": "0 um"},
-        "retrieval": {"background_degree": 0, "max_chi_square": math.inf},
-    }
-    before, wrong = retrieved(experiment(**asked))
-    after, assumed = retrieved(experiment(**asked, calibration={"frames": 8}))
-    total = math.hypot(np.sqrt((after[1] ** 2).mean() / PULSES), after[2].mean())
-    assert abs(before[0].mean() - SPEED) > 5 * total
-    assert abs(after[0].mean() - SPEED) < 4 * total
-    assert total < 0.1
-    assert (wrong.model.tilt, wrong.model.distortion, wrong.model.blur) == ((0, 0), 0, 0)
-    assert assumed.model.distortion == pytest.approx(0.002, rel=0.02)
-    assert assumed.model.tilt == pytest.approx((math.radians(0.5), 0), abs=1e-3)
-    assert assumed.model.blur == pytest.approx((25 / 29.6) ** 2, rel=0.05)
-
-
-@pytest.mark.slow
 def test_hot_and_dead_pixels_are_masked():
     """0.1 % hot, 0.1 % dead: hot ones are left out, and speeds are right within their errors."""
     ccd = {"full_well": 1e7, "hot_pixels": 0.001, "dead_pixels": 0.001}
@@ -111,31 +89,6 @@ def test_hot_and_dead_pixels_are_masked():
     # dead pixels between rings are nearly as dark as their neighbours
     left_out = int((assumed.response == 0).sum())
     assert 47 + 10 <= left_out <= 2 * 47 + 5
-
-
-@pytest.mark.slow
-def test_frames_of_the_calibration_drift():
-    """Random walks of laser and etalon: found as drift, with its size in the systematic error."""
-    quiet, drifting = (
-        experiment(calibration={"frames": 8}, reference={"laser_drift": drift})
-        for drift in ("0 Hz", "30 MHz")
-    )
-    found = []
-    for asked in (quiet, drifting):
-        rings = call(
-            assumed_rings,
-            asked,
-            rings=ring_instrument(asked.doppler),
-            calibration_file=None,
-            log=QUIET,
-        )
-        found.append(math.sqrt(rings.laser.systematic[0, 0]))
-    walk = calibration_drift(drifting.doppler, 8, drifting.seed)
-    long = np.diff(calibration_drift(drifting.doppler, 1000, drifting.seed))
-    step = 354.7e-9 / 2 * 30e6
-    assert walk[4] == 0 and long.std() == pytest.approx(step, rel=4 / math.sqrt(2000))
-    assert found[0] < 0.3
-    assert found[1] == pytest.approx(walk.std(ddof=1) * math.sqrt(9 / 8), rel=0.1)
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ simulation's by half.
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
 
 from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
@@ -126,25 +125,6 @@ def test_an_image_of_chosen_samples_is_that_of_the_number_alone(prepared, number
 
 
 @pytest.mark.slow
-def test_the_mean_of_chosen_images_is_unbiased(prepared):
-    """Twenty-four images, each with a number of its own, against one of as many samples in all."""
-    asked = newcomer(render={"monte_carlo_fraction": 2})
-    images = [
-        rendered(reseeded(asked, seed), prepared, missing=IMAGES[:1])["image_t1"]
-        for seed in range(100, 124)
-    ]
-    s0 = np.stack([image["S0"].values[0].astype(float) for image in images])
-    whole = sum(image.attrs["samples_per_beam"] for image in images)
-    true = rendered(with_number(asked, whole), prepared, missing=IMAGES[:1])["image_t1"]
-    off = s0.mean(0) - true["S0"].values[0]
-    spread = np.hypot(s0.std(0, ddof=1) / np.sqrt(len(s0)), true["S0_stderr"].values[0])
-    z = off / spread
-    # over the beams, as one number and each
-    assert abs(off.sum()) < 4 * np.sqrt((spread**2).sum())
-    assert (z**2).mean() == pytest.approx(1, abs=0.2)
-
-
-@pytest.mark.slow
 def test_the_winds_of_a_newcomer_are_those_of_many_samples(prepared, number):
     """Errors of w with a tenth of the variance, beside eight times as many and with eight samples:
     noise of the detector is that of one seed."""
@@ -196,45 +176,6 @@ def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared
         # chi-square of 7 x vectors beside 8 x vectors, half of which overlap
         sigma = np.sqrt(2 / (7 * valid.sum() / 2) + 2 / (len(changes) / 2))
         assert np.log((changes**2).mean() / spread) == pytest.approx(0, abs=max(4 * sigma, 0.3))
-
-
-@pytest.mark.slow
-def test_common_numbers_state_the_error_that_images_do_not_share(prepared):
-    """Of 12 seeds, differences between images moved by the true wind about their mean; and fewer
-    samples are enough for the same fraction of the detector's noise."""
-    asked = newcomer(render={"samples_per_beam": 32, "random_numbers": "common"})
-    wind, dt = prepared.results["truth"].wind, asked.platform.dt
-    z, y = (wind[axis].values for axis in "zy")
-    there = np.meshgrid(z, y, indexing="ij")
-    there = [
-        (nodes + dt * wind[name].transpose("z", "y").values - nodes.min()) / (axis[1] - axis[0])
-        for nodes, name, axis in zip(there, ("w", "v"), (z, y), strict=True)
-    ]
-    differences, stated, errors, s0 = [], [], [], []
-    for seed in range(1, 13):
-        one = reseeded(asked, seed)
-        scans = detect(one, prepared, rendered(one, prepared))
-        first, second = (scan["S0"].values[0].astype(float) for scan in scans)
-        differences.append(
-            (map_coordinates(second, there, order=3, mode="nearest") - first) / 2**0.5
-        )
-        stated.append((scans[0]["S0_pair_stderr"].values[0].astype(float) ** 2)[3:-3, 3:-3])
-        errors.append(scans[0]["S0_stderr"].values[0].astype(float) ** 2)
-        s0.append(first)
-    seen = np.var(differences, 0, ddof=1)[3:-3, 3:-3]
-    assert np.mean(stated) == pytest.approx(seen.mean(), rel=0.25)
-    # by place: where shear deforms the air, and where it does not
-    large = np.mean(stated, 0) > np.median(np.mean(stated, 0))
-    for part in (large, ~large):
-        assert np.mean(stated, 0)[part].mean() == pytest.approx(seen[part].mean(), rel=0.4)
-    # of a pixel by itself the whole error is stated
-    assert np.mean(errors) == pytest.approx(np.var(s0, 0, ddof=1).mean(), rel=0.4)
-    assert seen.mean() < np.mean(errors) / 10
-    number, fewer = (
-        call(chosen_samples, newcomer(render={"random_numbers": numbers}), **needed(prepared))
-        for numbers in ("independent", "common")
-    )
-    assert fewer.reached and fewer.number < number.number / 5
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans
-from lidar_mi.rendering.phase import molecules
+from lidar_mi.rendering.phase import ScatteringAir, molecules
 from lidar_mi.rendering.settings import RenderSettings
 
 SPACING, DT = 0.5, 0.1
@@ -212,12 +212,11 @@ def scan_of(air, times_of_rows, mixed=False, samples=1024):
         [solid],
         [plan],
         lidar,
-        1e-4,
-        {"type": "rayleigh_polarized"},
-        1.0,
+        ScatteringAir(
+            1e-4, {"type": "rayleigh_polarized"}, 1.0, molecules(1e-4, 532e-9) if mixed else None
+        ),
         RenderSettings(max_order=1, samples_per_beam=samples),
         1,
-        molecules=molecules(1e-4, 532e-9) if mixed else None,
     )
     return scan
 

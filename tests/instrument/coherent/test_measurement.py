@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lidar_mi as lm
-from lidar_mi.instrument.coherent.measurement import measured_lines
+from lidar_mi.instrument.coherent.measurement import Receiver, measured_lines
 from lidar_mi.instrument.coherent.scans import ppi_scan, stare_scan
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 
@@ -59,7 +59,7 @@ def test_without_a_signal_velocities_are_uniform_and_flagged():
     lidar = CoherentLidar(gates=8)
     snr = np.where(np.arange(8) < 4, 0.1, 1e-6)
     scan = stare_scan(0.0, 1.0, 1.0, 500)
-    lines = measured_lines(wind, scan, lidar, snr, bandwidth=40.0)
+    lines = measured_lines(wind, scan, lidar, snr, Receiver(bandwidth=40.0))
     assert (lines["flag"].values == (np.arange(8) >= 4)).all()
     lost = lines["radial_velocity"].values[:, 4:]
     assert np.abs(lost).max() < 20

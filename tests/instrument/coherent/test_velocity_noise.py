@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.instrument.coherent.velocity_noise import cramer_rao, peak_ratio, rye_hardesty
+from lidar_mi.instrument.coherent.velocity_noise import cramer_rao, peak_ratio
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 
 BANDWIDTH, WIDTH = 38.8, 1.5
+
+
+def rye_hardesty(snr, width, bandwidth, samples):
+    """Their approximation of the bound (1993), as given by O'Connor et al. (2010)."""
+    alpha = peak_ratio(snr, width, bandwidth)
+    factor = np.sqrt(np.sqrt(8) / (alpha * snr * samples))
+    return factor * width * (1 + alpha / np.sqrt(2 * np.pi))
 
 
 def test_both_agree_where_the_signal_is_weak():

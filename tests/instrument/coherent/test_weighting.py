@@ -17,7 +17,6 @@ from lidar_mi.instrument.coherent.weighting import (
     CoherentLidar,
     echo_shift,
     gate_moments,
-    radial_velocities,
     range_weight,
 )
 
@@ -31,7 +30,7 @@ def uniform(x, y, z, time):
 def test_a_uniform_wind_is_projected():
     scan = ppi_scan(np.deg2rad(35), (0.0, 2 * np.pi), np.deg2rad(10), 1.0)
     assert len(scan.time) == 36
-    found, spread = radial_velocities(uniform, scan, LIDAR)
+    found, spread, _ = gate_moments(uniform, scan, LIDAR)
     a, e = scan.azimuth, scan.elevation
     # the mean over the angle that a beam moves through
     smear = np.sinc(scan.azimuth_span / 2 / np.pi)
@@ -48,7 +47,7 @@ def test_linear_shear_is_measured_at_the_middle_of_the_gate():
         return 0.05 * z, 0 * z, 0 * z
 
     scan = stare_scan(np.pi / 2, np.deg2rad(30), 1.0, 2)
-    found, spread = radial_velocities(wind, scan, LIDAR)
+    found, spread, _ = gate_moments(wind, scan, LIDAR)
     expected = 0.05 * LIDAR.ranges * np.sin(np.deg2rad(30)) * np.cos(np.deg2rad(30))
     np.testing.assert_allclose(found[0], expected, atol=1e-6)
     # variance of the weight: of the pulse and of the window
@@ -74,7 +73,7 @@ def test_a_power_law_is_that_of_quadrature():
     def wind(x, y, z, time):
         return 0 * z, 8 * (np.maximum(z, 0) / 10) ** 0.2, 0 * z
 
-    found, _ = radial_velocities(wind, stare_scan(0.0, np.deg2rad(20), 1.0, 1), LIDAR)
+    found, *_ = gate_moments(wind, stare_scan(0.0, np.deg2rad(20), 1.0, 1), LIDAR)
     for gate in (0, 5, 40):
         expected = by_quadrature(
             lambda r: 8 * (max(r * sine, 0.0) / 10) ** 0.2 * cosine, LIDAR.ranges[gate]
@@ -97,7 +96,7 @@ def test_a_vortex_is_that_of_quadrature():
 
     scan = rhi_scan(np.pi / 2, (0.0, np.deg2rad(15)), np.deg2rad(2), 0.25)
     still = type(scan)(scan.time, scan.azimuth, scan.elevation, scan.sweep)
-    found, _ = radial_velocities(wind, still, LIDAR)
+    found, *_ = gate_moments(wind, still, LIDAR)
     assert len(scan.time) == 30 and np.abs(found).max() > 3.5
     line = directions(still.azimuth, still.elevation)
     for number in (8, 13, 14):
@@ -115,7 +114,7 @@ def test_bright_air_counts_more():
     """Echoes that grow along the gate, in a sheared wind."""
     scan = stare_scan(0.0, 0.0, 1.0, 1)
     middle = LIDAR.ranges[40]
-    found, _ = radial_velocities(
+    found, *_ = gate_moments(
         lambda x, y, z, t: (0 * y, 0.01 * y, 0 * y),
         scan,
         LIDAR,

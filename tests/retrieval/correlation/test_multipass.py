@@ -1,7 +1,7 @@
 """Multi-pass correlation on images of exactly known flows.
 
-Detects errors above those of the best public PIV code, 15 % in the standard errors, a bias of
-0.01 px, paths taken for straight lines in a core, outliers that spread, and confident nonsense.
+Detects errors above those of the best public PIV code, a bias of 0.01 px, paths taken for straight
+lines in a core, outliers that spread, and confident nonsense.
 """
 
 import math
@@ -16,7 +16,6 @@ from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.errors import InputError
 from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.multipass import multipass, travelled
-from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import data_array, plane_waves, texture
 
@@ -52,27 +51,6 @@ def test_errors_are_below_the_best_window_deformation(noise, everywhere, beyond)
     for component in errors:
         assert rms(component) < everywhere
         assert rms(component[far]) < beyond
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(
-    reason="errors of the cores enter the means around them: 78 to 80 % within one", strict=True
-)
-def test_standard_errors_cover_the_errors():
-    """Beyond the cores, where windows are uniform: 68 and 95 % within 7 and 5 points.
-
-    Errors in the cores enter the means around them, so that there 73 % are covered.
-    """
-    reduced = []
-    for seed in (1, 2):
-        errors, stderr, far = wind_errors(
-            vortex_pair_images(0.03, seed), "multipass", windows=WindowSizes(stride=2)
-        )
-        reduced.append((errors / stderr)[:, far].ravel())
-    reduced = np.concatenate(reduced)
-    assert np.std(reduced) == pytest.approx(1, abs=0.15)
-    assert np.mean(np.abs(reduced) < 1) == pytest.approx(0.683, abs=0.07)
-    assert np.mean(np.abs(reduced) < 1.96) == pytest.approx(0.95, abs=0.05)
 
 
 def shifted(dz, dy, pattern=None, rows=60, columns=70, seed=3):
@@ -174,43 +152,3 @@ def test_bad_input_is_named(change, message):
     pair = dict(zip(("image1", "image2"), shifted(0, 0), strict=True))
     with pytest.raises(InputError, match=message):
         multipass(**pair | change)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["cc", "multipass", "variational"])
-def test_particle_images(method):
-    """Gaussian particles of 3.2 px (1/e^2), 0.05 a pixel, in a plane shear; exact positions."""
-    rows, columns, density, radius = 90, 110, 0.05, 3.2 / 4
-    random = np.random.default_rng(9)
-    z0, y0 = random.uniform(-15, (rows + 15, columns + 15), (int(density * 120 * 140), 2)).T
-    bright = random.uniform(0.5, 1, len(z0))
-    shear = 0.03
-
-    def rendered(part):
-        """v = 1.3 px + 0.03 (z - 45), w = -0.6 px: a place moves on a parabola."""
-        z = z0 - 0.6 * part
-        y = y0 + (1.3 + shear * (z0 - 45)) * part - 0.3 * shear * part**2
-        total = np.zeros((rows, columns))
-        edges = [
-            np.exp(-((np.arange(n)[:, None] - p) ** 2) / (2 * radius**2))
-            for n, p in ((rows, z), (columns, y))
-        ]
-        np.matmul(edges[0] * bright, edges[1].T, out=total)
-        return total + 0.01 * random.standard_normal(total.shape)
-
-    axes = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
-    pair = [data_array(rendered(part), *axes) for part in (-0.5, 0.5)]
-    # a pixel is 1 m and dt 1 s: winds are px. Particles on black have no mean to compare with
-    wind = retrieve_wind(
-        *pair,
-        1.0,
-        method,
-        windows=WindowSizes(template=12, search=24),
-        validation=VectorValidation(min_texture=0.0),
-    )
-    good = (wind.flag == 0).values
-    assert good.mean() > 0.9
-    true = 1.3 + shear * (wind["z_vector"].values - 45)
-    error = np.stack([wind["v"].values - true, wind["w"].values + 0.6])[:, good]
-    limit = {"cc": 0.1, "multipass": 0.03, "variational": 0.03}[method]
-    assert rms(error) < limit

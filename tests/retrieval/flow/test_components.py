@@ -1,8 +1,8 @@
 """Variance components of the differences of warped images, on images whose components are known.
 
 Detects noise that the flow absorbs and nobody counts, texture that is replaced and motion through
-the plane of the wrong size, a tail of the prior that is not what splines leave, and standard errors
-of flows drawn from a known spectrum that are wrong by a seventh.
+the plane of the wrong size, a tail of the prior that is not what splines leave.
+`validation.flows` has the standard errors.
 """
 
 from dataclasses import replace
@@ -102,30 +102,6 @@ def test_noise_that_the_flow_absorbs_is_counted(level, unbiased, monkeypatch):
     assert np.mean(found) == pytest.approx(1, abs=unbiased)
     assert max(np.abs(np.log(found))) < 5 * unbiased
     assert np.mean(residuals) < 0.97 or level < 0.05
-
-
-@pytest.mark.slow
-def test_noise_told_by_a_map_stays_where_it_is(monkeypatch):
-    """It grows five times along y: variance by columns to 35 %, in the mean to 25 %.
-
-    At its lower end motion that splines resolve in part is as large as noise of half its size.
-    """
-    ratios = []
-    for seed in (1, 2, 3):
-        flow, _ = random_flow(SHAPE, 0.6, 0.1, SETTINGS.ratio, seed, shortest=8.0)
-        level = np.broadcast_to(np.linspace(0.01, 0.05, SHAPE[1]), SHAPE).copy()
-        images = [a + level * noise(1.0, 10 * seed + k) for k, a in enumerate(advected(seed, flow))]
-        _, model, _ = retrieved(images, torch.as_tensor(level), monkeypatch)
-        assert model.amplitudes["noise"] == pytest.approx(np.mean(level**2), rel=0.03)
-        variance = (model.images.noise**2 / model.images.weight).numpy()
-        ratios.append(
-            [
-                np.mean(variance[:, c : c + 16]) / np.mean(level[:, c : c + 16] ** 2)
-                for c in range(0, SHAPE[1], 16)
-            ]
-        )
-    assert np.mean(ratios, 0) == pytest.approx(1, abs=0.35)
-    assert np.mean(ratios) == pytest.approx(1, abs=0.25)
 
 
 @pytest.mark.slow
@@ -315,33 +291,3 @@ def test_mean_square_strain():
     assert _mean_square_strain(slopes) == pytest.approx(np.mean(along**2))
     turning = [torch.stack([0 * one, c * one]), torch.stack([-c * one, 0 * one])]
     assert _mean_square_strain(turning) == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("turnover", "rms"), [(0.1, 0.8), (0.4, 0.4)])
-def test_errors_of_flows_drawn_from_a_spectrum(turnover, rms, monkeypatch):
-    """Variance of normalised errors of six flows in noise of 1 and 5 % that is told.
-
-    Flows of waves down to 6 px; the mean of one noise scatters by 5 %.
-    """
-    shape = 128, 160
-    of_levels = []
-    for level in (0.01, 0.05):
-        reduced = []
-        for seed in range(1, 7):
-            flow, _ = random_flow(shape, rms, turnover, SETTINGS.ratio, seed, shortest=6.0)
-            images = [
-                image + noise(level, 10 * seed + k, shape)
-                for k, image in enumerate(advected(seed, flow))
-            ]
-            found, _, _ = retrieved(images, level, monkeypatch)
-            centres = [
-                variational.Windows(shape, 8, 16, 4).centres(axis).numpy() for axis in (0, 1)
-            ]
-            at = np.meshgrid(*centres, indexing="ij")
-            true = [map_coordinates(p.numpy(), at, order=5, mode="grid-wrap") for p in flow]
-            variance = found.covariance.diagonal().movedim(-1, 0).numpy()
-            reduced.append(np.mean((found.d.numpy() - true) ** 2 / variance))
-        of_levels.append(np.mean(reduced))
-    assert 0.85 < np.mean(of_levels) < 1.15
-    assert 0.8 < min(of_levels) and max(of_levels) < 1.25

@@ -1,7 +1,7 @@
 """The variational retrieval on images of exactly known flows.
 
-Detects errors above those of a prototype four times better than the best public code, standard
-errors that are wrong by 15 %, an aperture problem that is not admitted.
+Detects errors above those of a prototype four times better than the best public code, an aperture
+problem that is not admitted. `validation.flows` has the standard errors.
 """
 
 import math
@@ -17,7 +17,6 @@ from lidar_mi.atmosphere.vortices.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 from lidar_mi.flags import Flag
 from lidar_mi.retrieval.flow.variational import variational
-from lidar_mi.retrieval.images.bound import displacement_bound
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.options import WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
@@ -28,65 +27,17 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def wind_errors(pair):
-    """Errors of v and w (2, z, y), m/s, their standard errors, and which are far from the cores."""
-    wind = retrieve_wind(pair.first, pair.second, DT, "variational", noise=pair.noise or None)
+@pytest.mark.slow
+def test_errors_are_below_the_prototypes():
+    """At 3 % noise, m/s: everywhere, and away from the cores."""
+    pair = vortex_pair_images(0.03, 1)
+    wind = retrieve_wind(pair.first, pair.second, DT, "variational", noise=0.03)
     assert (wind.flag == 0).mean() > 0.95
     z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
-    errors = np.stack(
-        [wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z), strict=True)]
-    )
-    stderr = np.stack([wind["v_stderr"].values, wind["w_stderr"].values])
     far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 6
-    return errors, stderr, far
-
-
-KNOWN = [(0.0, 0.09, 0.06), (0.01, 0.12, 0.09), (0.03, 0.19, 0.13), (0.06, 0.38, 0.28)]
-
-
-def check_errors(noise, everywhere, beyond, seeds):
-    found = [wind_errors(vortex_pair_images(noise, seed)) for seed in seeds]
-    for component in (0, 1):
-        assert np.mean([rms(errors[component]) for errors, _, _ in found]) < everywhere
-        assert np.mean([rms(errors[component][far]) for errors, _, far in found]) < beyond
-    return found
-
-
-def check_coverage(found):
-    """Fractions to 5 points and three standard errors of the mean over the seeds."""
-    reduced = [(errors / stderr).ravel() for errors, stderr, _ in found]
-    assert np.std(np.concatenate(reduced)) == pytest.approx(1, abs=0.2)
-    for limit, expected in ((1.0, 0.683), (1.96, 0.950)):
-        inside = [np.mean(np.abs(one) < limit) for one in reduced]
-        error = np.std(inside, ddof=1) / len(inside) ** 0.5
-        assert np.mean(inside) == pytest.approx(expected, abs=0.05 + 3 * error)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("noise", "everywhere", "beyond"), [KNOWN[2]])
-def test_errors_are_below_the_prototypes(noise, everywhere, beyond):
-    check_errors(noise, everywhere, beyond, [1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("noise", "everywhere", "beyond"), KNOWN)
-def test_errors_and_coverage_over_five_seeds(noise, everywhere, beyond):
-    """Without noise the spline's own error is left, which the standard error does not hold."""
-    found = check_errors(noise, everywhere, beyond, range(1, 6))
-    if noise:
-        check_coverage(found)
-
-
-@pytest.mark.slow
-def test_standard_errors_cover_the_errors_and_beat_the_bound_of_a_window():
-    """Beyond the cores, within 1.5 of what any method could get from a window of 16 px."""
-    pairs = [vortex_pair_images(0.03, seed) for seed in (1, 2)]
-    found = [wind_errors(pair) for pair in pairs]
-    check_coverage(found)
-    for pair, (errors, _, far) in zip(pairs, found, strict=True):
-        images = [torch.tensor(image.values) for image in (pair.first, pair.second)]
-        bound = displacement_bound(*images, 0.03, 16)[1].mean().sqrt() * SPACING / DT
-        assert rms(errors[0][far]) < 1.5 * bound
+    for name, true in zip("vw", velocity(pair.vortices, y, z), strict=True):
+        error = wind[name].values - true
+        assert rms(error) < 0.19 and rms(error[far]) < 0.13
 
 
 def burst(number, noise, columns=90, rows=80, seed=3):
@@ -191,32 +142,6 @@ def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
     assert float(errors.square().mean()) < float(other.square().mean())
 
 
-@pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="weak texture beside strong: displacements of 0.4 px are 0.055 px too small"
-)
-def test_noise_does_not_bias_displacements_to_whole_pixels():
-    """Fine texture that is weak in half the image: the other half has the filter let noise pass.
-
-    Splines through pixels damp noise half way between them, which alone would pull by 0.11 px.
-    """
-    z, y = grid(80, 110)
-    pattern = waves(3, 2.0)
-    strong = np.where(y < 55, 1.0, 0.15)
-    errors = []
-    for seed in (1, 2, 3):
-        random = np.random.default_rng(seed)
-        pair = [
-            torch.tensor(
-                strong * pattern(y - 0.4 * t, z - 0.4 * t) + 0.1 * random.standard_normal(z.shape)
-            )
-            for t in (-0.5, 0.5)
-        ]
-        found = variational(*pair, noise=0.1)
-        errors.append(torch.stack([found.dz, found.dy])[:, :, 60:] - 0.4)
-    assert float(torch.stack(errors).mean()) == pytest.approx(0, abs=0.03)
-
-
 @pytest.mark.parametrize("moved", [0.7, 1.35])
 def test_short_waves_do_not_bias_displacements_to_whole_pixels(moved):
     """Texture down to waves of 2 px; read by a cubic spline through pixels, 0.7 became 0.77."""
@@ -306,16 +231,6 @@ def blurred_errors(seed, noise, sigma, undone=(False, True), length=2.0, shape=(
             ]
         )
     return np.reshape(errors, (-1, 2, 2))
-
-
-@pytest.mark.slow
-def test_blurred_images_with_less_noise_have_no_larger_errors():
-    """Beyond the cores they were seven times larger with half of the noise: a filter that whitens
-    a hardly coloured misfit makes images differ where the air is strained."""
-    noisy, clean = (
-        blurred_errors(1, noise, 0.5, [False], 3.0, (219, 139))[0, 1] for noise in (0.002, 0.001)
-    )
-    assert (clean < 1.1 * noisy).all()
 
 
 @pytest.mark.slow

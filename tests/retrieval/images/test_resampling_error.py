@@ -1,13 +1,11 @@
 """Errors that resampling of scattered beams leaves, against fields known everywhere.
 
-Detects a variance that is wrong by a factor of 2.5, weights of other times, and winds of scattered
-beams whose stated errors do not hold.
+Detects a variance that is wrong by a factor of 2.5, and weights of other times.
 """
 
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.special import erf
 
 from lidar_mi.flags import Flag
 from lidar_mi.retrieval.images.gridding import on_nodes
@@ -17,12 +15,7 @@ from lidar_mi.retrieval.images.resampling_error import (
     flag_resampled,
     variance,
 )
-from lidar_mi.retrieval.vortices.image_fit import fit_vortices
-from lidar_mi.retrieval.wind.options import WindowSizes
-from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture
-from tests.support.timed import DT, scattered_vortices
-from tests.support.vortex_pairs import uneven, vector
 
 MEAN, NOISE = (3.0, -4.0), 0.03
 
@@ -119,63 +112,3 @@ def test_error_of_beams_that_are_dense_in_calm_air_only():
     # per pixel; what is stated counts as white noise, twice to 4 times the variance
     made = (off[inside] ** 2).mean() ** 0.5
     assert made < stated < 4 * made
-
-
-def normalised(pattern, px, seeds, noise=NOISE, length=3.0):
-    """Errors over stated ones: of variational's vectors, and of the pair's parameters."""
-    winds, fits = [], []
-    for seed in seeds:
-        scans, truth = scattered_vortices(pattern, uneven(), MEAN, px, seed, noise, length)
-        scans = [on_nodes(scan) for scan in scans]
-        images, times = ([scan[name] for scan in scans] for name in ("Y", "beam_time"))
-        added = (
-            sum(scan.get("Y_resampling_std", 0 * scan["Y"]).fillna(0.0) ** 2 for scan in scans) / 2
-        )
-        level = np.sqrt(scans[0]["Y_noise_std"].fillna(noise) ** 2 + added)
-        found = retrieve_wind(
-            *images,
-            DT,
-            "variational",
-            times=times,
-            noise=level,
-            windows=WindowSizes(stride=3),
-            checks=False,
-        )
-        valid = (found["flag"] == 0).values
-        y, z = np.meshgrid(found["y"], found["z"])
-        for name, true in zip("vw", truth(y, z, found["time"].values - DT / 2), strict=True):
-            off = (found[name].values - true) / found[f"{name}_stderr"].values
-            winds.append(off[valid])
-        fit = fit_vortices(*images, DT, level, times=times)
-        assert fit.success, fit.reasons
-        off = fit.parameters - vector(*uneven(), mean=MEAN)
-        fits.append(off / np.sqrt(np.diag(fit.covariance)))
-    return np.concatenate(winds), np.concatenate(fits)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("px", [0.3, 0.6])
-def test_stated_errors_of_scattered_beams(px):
-    """A serpentine of 0.1 s whose beams scatter, 3 of 20 % noise, over 12 seeds.
-
-    Seeds are independent, vectors are not: 3 standard errors of the mean over seeds. Not too small,
-    and at most 30 % too large, as what resampling adds is an upper estimate for short scales, and
-    vectors' have twice what a more even prior changes (they are a third too large, 8 % of it for
-    that; those of fits are right).
-    """
-    runs = [normalised("serpentine", px, [seed]) for seed in range(101, 113)]
-    large = 1.3
-    for offs in zip(*runs, strict=True):
-        for statistic, least, most in (
-            (lambda off: (off**2).mean(), large**-2, 1.0),
-            (lambda off: (np.abs(off) < 1).mean(), *within(1.0, large)),
-            (lambda off: (np.abs(off) < 1.96).mean(), *within(1.96, 1.96 * large)),
-        ):
-            values = np.array([statistic(off) for off in offs])
-            three = 3 * values.std(ddof=1) / len(values) ** 0.5
-            assert least - three < values.mean() < most + three
-
-
-def within(*sigma):
-    """Probability of a normal error below."""
-    return erf(np.array(sigma) / 2**0.5)

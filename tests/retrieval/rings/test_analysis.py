@@ -17,9 +17,6 @@ from lidar_mi.retrieval.rings.frames import few_levels
 from tests.support import ring_reference as reference
 
 LABORATORY = Path(__file__).parents[4] / "shared" / "data" / "fringes"
-# r of the laser's rings on the default camera: order 77248.5, closed form
-ORDERS = 77248.5 - np.arange(77248, 77241, -1)
-RADII = reference.FOCAL_LENGTH / reference.PIXEL * np.sqrt((1 - ORDERS / 77248.5) ** -2.0 - 1)
 
 
 def split_rings(shape, centre, spacing, fractions, finesse=60.0, ellipticity=0.0, tilt=0.0):
@@ -32,17 +29,6 @@ def split_rings(shape, centre, spacing, fractions, finesse=60.0, ellipticity=0.0
     x, y = x * (1 + ellipticity) / (1 + tilt * x), y * (1 - ellipticity) / (1 + tilt * x)
     order = (x**2 + y**2) / spacing
     return sum(1 / (1 + finesse * np.sin(np.pi * (order - f)) ** 2) for f in fractions)
-
-
-@pytest.mark.slow
-def test_rings_of_the_emitted_laser():
-    """0.02 px: what quarter-pixel sectors and a Gaussian for Airy's peak leave."""
-    found = analyse_rings(reference.ring_image(0.0, temperature=None))
-    np.testing.assert_allclose(found.centre, (479.5, 389.5), atol=0.01)
-    np.testing.assert_allclose(found.radius, RADII[: len(found.radius)], atol=0.06)
-    assert list(found.order) == list(range(len(found.order))) and not found.line.any()
-    assert found.fraction[0] == pytest.approx(0.5, abs=1e-3)
-    assert found.misfit < 5e-4
 
 
 @pytest.mark.slow

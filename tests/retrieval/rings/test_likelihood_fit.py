@@ -1,8 +1,8 @@
 """Winds from all rings at once, on images made without the program (`ring_reference`).
 
-Detects: a bias of 0.1 m/s, a standard deviation 1.2 times the Cramer-Rao bound or more (slow; the
-default suite sees 1.4 times), error bars that are not the scatter, an order lost between -300 and
-+300 m/s, and images that are no rings but give a number.
+Detects: a bias of 0.1 m/s, a standard deviation 1.4 times the Cramer-Rao bound or more, error bars
+that are not the scatter, an order lost between -300 and +300 m/s, and images that are no rings but
+give a number.
 """
 
 import numpy as np
@@ -38,15 +38,6 @@ def test_no_noise_no_error(v_los, centre):
     assert float(fit.of("x")) == pytest.approx(x, abs=1e-3)
     assert float(fit.of("y")) == pytest.approx(y, abs=1e-3)
     assert float(fit.chi_square) < 1e-3 and fit.rings >= 9
-
-
-@pytest.mark.slow
-def test_full_size_both_ways():
-    image = torch.as_tensor(reference.ring_image(-77.0, centre=(470.2, 402.9)))
-    for method in ("annular", "pixels"):
-        fit = fit_rings(image, ring_model(), method=method)
-        assert abs(float(fit.v_los) + 77) < 1e-3
-        assert float(fit.of("temperature")) == pytest.approx(reference.TEMPERATURE, abs=0.01)
 
 
 def exposures(case, number, seed, v_los=20.0, **size):
@@ -91,33 +82,6 @@ def test_reaches_the_bound(case):
     assert (flat.v_los_std / fit.v_los_std[:4] - 1).abs().max() < 0.02
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", TABLE)
-def test_reaches_the_bound_on_the_whole_camera(case):
-    """400 images of 960 x 780 px: std to 4 %, bias to 0.01 m/s. The 2-D fit sees 24 of them.
-
-    Both fits see the same noise: that they differ by less than 20 % of the bound makes the 2-D
-    fit's standard deviation that of the annular one within 2 %.
-    """
-    number, some = 400, 24
-    found, both = [], None
-    for seed in range(number // 50):
-        images = exposures(case, 50, [1000, seed])
-        found.append(fit_rings(images, ring_model(), TABLE[case][2]).v_los)
-        if both is None:
-            flat = fit_rings(images[:some], ring_model(), TABLE[case][2], method="pixels").v_los
-            both = flat - found[0][:some]
-    v = torch.cat(found)
-    bound = bound_of(case)
-    print(
-        f"{case}: bound {bound:.4f} std {v.std():.4f} bias {v.mean() - 20:+.4f} "
-        f"2-D less annular {both.std():.4f}"
-    )
-    assert v.std() <= 1.2 * bound
-    assert abs(v.mean() - 20) <= 0.1
-    assert both.std() < 0.2 * bound
-
-
 def test_nuisances_do_no_harm():
     """Warmer air, weaker light at the rim, background: found, and not in the velocity."""
     rng = np.random.default_rng(12)
@@ -150,6 +114,23 @@ def test_images_are_independent_of_each_other():
         assert abs(float(together.v_los[k] - alone.v_los)) < 2e-3
         assert abs(float(together.v_los[k]) - 10 * k) < 5e-3
     np.testing.assert_allclose(together.of("x"), [c[0] for c in centres], atol=1e-3)
+
+
+@pytest.mark.parametrize("method", ["annular", "pixels"])
+def test_calibration_error_is_in_the_speed(method):
+    """As a fit with that error in its model tells; the zero shifts all speeds."""
+    image = torch.as_tensor(reference.ring_image(40.0, **COARSE))
+    zero, relative = 0.2, 2e-5
+    covariance = np.zeros((8, 8))
+    covariance[0, 0], covariance[1, 1] = zero**2, relative**2
+    known = {"centre": (119.5, 97.0), "free": ("v_los", "level", "temperature"), "method": method}
+    fit = fit_rings(image, ring_model(**COARSE, systematic=covariance), **known)
+    longer = ring_model(**COARSE, focal_length=(1 + relative) * reference.FOCAL_LENGTH)
+    shift = float(fit_rings(image, longer, **known).v_los - fit.v_los)
+    assert abs(shift) > 0.05
+    assert float(fit.sensitivity[0, 0]) == -1
+    assert float(fit.sensitivity[0, 1]) * relative == pytest.approx(shift, rel=0.05)
+    assert float(fit.v_los_systematic) == pytest.approx(np.hypot(zero, shift), rel=0.05)
 
 
 def test_known_centre_stays():
@@ -348,16 +329,3 @@ def test_aerosol_up_to_half_of_the_echo(aerosol, number):
     assert -0.004 * aerosol - 1e-4 < blurred < 1e-4
     known = float(fit.std_of("aerosol").mean()) / np.sqrt(number)
     assert abs(float(found.mean()) - blurred) < 4 * known
-
-
-@pytest.mark.slow
-def test_rate_of_the_bound_over_many_frames():
-    """Rms error over 4032 frames in batches of 63: at most 1.05 of the bound, known to 1.1 %."""
-    bound, given = bound_of("read noise", **COARSE), (ring_model(**COARSE), PixelNoise(5))
-    errors = [
-        fit_rings(exposures("read noise", 63, [24, part], **COARSE), *given).v_los - 20
-        for part in range(64)
-    ]
-    rms = float(torch.cat(errors).square().mean().sqrt())
-    # not below what is possible by more than its own scatter
-    assert 1 - 4 / np.sqrt(2 * 4032) < rms / bound < 1.05

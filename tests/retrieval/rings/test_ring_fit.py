@@ -14,7 +14,6 @@ from lidar_mi.retrieval.rings.analysis import analyse_rings
 from tests.support.ring_frames import Frame
 
 LINES = {"fraction": (0.62, 0.31), "height": (1.0, 0.5)}
-SMALL = {"shape": (200, 250), "centre": (120.3, 102.7), "spacing": 3750.0}
 
 
 def normalised_errors(frame: Frame, seed) -> list[float]:
@@ -34,14 +33,6 @@ def normalised_errors(frame: Frame, seed) -> list[float]:
 def allowed(number: int) -> float:
     """4 sigma above the rms of Student's law with 5 degrees of freedom: 5/3, variance 22.2."""
     return math.sqrt(5 / 3 + 4 * math.sqrt(22.2 / number))
-
-
-@pytest.mark.slow
-def test_errors_of_uneven_plates():
-    """Three frames of two lines; three of the six errors of a frame are independent, about."""
-    frame = Frame(**SMALL, **LINES, plates=0.005, patch=25.0)
-    z = [normalised_errors(frame, [61, number]) for number in range(3)]
-    assert np.sqrt(np.mean(np.square(z))) < allowed(3 * len(z))
 
 
 def test_rings_say_that_plates_are_uneven():

@@ -105,21 +105,6 @@ def test_any_light_any_mask_any_defect():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("background", "hiding", "defect"),
-    [
-        ("steep", "nothing", "none"),
-        pytest.param("bright corner", "half", "none", marks=pytest.mark.slow),
-        pytest.param("even", "bar", "hidden centre", marks=pytest.mark.slow),
-        ("vignetting", "aperture", "hot pixels"),
-    ],
-)
-def test_the_step_is_not_doubled(background, hiding, defect):
-    image, step, fraction, _ = frame(background, hiding, defect, "one", 3)
-    assert verdict(image, step, fraction) == "right"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 300.0, 600.0])
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_gradient_or_half_of_the_rings(slope, hidden):

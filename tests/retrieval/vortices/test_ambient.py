@@ -167,13 +167,3 @@ def test_a_pair_within_the_pair_is_refused():
     found = fit_vortices_to_wind(vectors(2, inner=120.0))
     assert any("more than two vortices" in reason for reason in found.reasons)
     assert not any("more than" in r for r in fit_vortices_to_wind(vectors(2, rms=1.0)).reasons)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rms, length", [(0.5, 30.0), (1.0, 100.0)])
-def test_turbulence_is_in_the_errors(rms, length):
-    """24 draws: the variance of normalised errors of circulations is 1 within 3 standard errors."""
-    found = [fit_vortices_to_wind(vectors(100 + k, rms=rms, length=length)) for k in range(24)]
-    error = [(f.parameters[:8] - TRUE) / np.sqrt(np.diag(f.covariance)[:8]) for f in found]
-    square = np.square(error)[:, [0, 4]].mean()
-    assert abs(square - 1) < 3 * np.sqrt(2 / 48), square

@@ -86,19 +86,6 @@ def test_probabilities_hold_on_other_draws():
     assert not reliable(odds / (1 + odds), there)
 
 
-@pytest.mark.slow
-def test_probabilities_hold_on_many_draws():
-    """1000 draws: in all, and in each tenth of them."""
-    ratio, there = log_ratios(range(1000))
-    probability = np.array([probability_of(one) for one in ratio])
-    assert reliable(probability, there)
-    for some in np.array_split(np.argsort(probability), 10):
-        expected, variance = probability[some].sum(), probability[some] * (1 - probability[some])
-        # 3 sigma of ten tenths, and of their calibration; 1 for counts of rare outcomes
-        limit = 1 + 3 * np.sqrt(1.25 * variance.sum())
-        assert abs(there[some].sum() - expected) < limit
-
-
 def test_log_odds_are_those_of_greatest_likelihood():
     """Of outcomes drawn with known odds: those of the nodes, within 4 of their errors of 0.2."""
     random = np.random.default_rng(7)
@@ -143,15 +130,3 @@ def test_as_many_fits_as_by_a_search():
                 searched += by_search.success
                 both += by_search.success and found.success
     assert searched >= 10 and both >= 0.95 * searched
-
-
-@pytest.mark.slow
-def test_a_single_vortex_at_the_border_is_detected():
-    """Wakes of which one core is in the image: most are sure, and few of the fits are accepted."""
-    probable = []
-    for seed in range(60):
-        wake = draw(seed, "pair")
-        if inside(wake.vortices, wake.first) == 1 and wake.texture:
-            found = detected_fit(wake.first, wake.second, 0.1, wake.noise)
-            probable.append(found.probability)
-    assert len(probable) >= 12 and np.mean(np.array(probable) > 0.9) > 0.4

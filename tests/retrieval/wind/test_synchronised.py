@@ -80,17 +80,6 @@ def test_scans_by_angles_from_a_platform_that_moves():
         assert abs(float(valid.mean()) - true) < 3 * float(valid.std()) / np.sqrt(independent)
 
 
-@pytest.mark.slow
-def test_the_clock_does_not_matter():
-    """Times from any zero that is the same in both scans."""
-    scans = [scan(*lissajous(0.09), at) for at in (0.0, DT)]
-    later = [one.assign(beam_time=one["beam_time"] + 100.0) for one in scans]
-    for one, other in zip(*(synchronised(s, [DT], "Y") for s in (scans, later)), strict=True):
-        np.testing.assert_allclose(one["Y"], other["Y"], atol=1e-4)
-        later = float((other["beam_time"] - one["beam_time"]).mean())
-        assert later == pytest.approx(100.0)
-
-
 def test_times_that_are_linear_in_place_are_not_mixed():
     """A raster's are, those of a curve are not unless it is over at once; frozen air has none."""
     y, z = np.meshgrid(Y, Z)
