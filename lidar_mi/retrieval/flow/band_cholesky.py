@@ -14,6 +14,7 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]  # not in torch's own list
 
 from lidar_mi.retrieval.flow.flow_spline import REACH
+from lidar_mi.retrieval.threads import mapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +156,7 @@ def factored(forms: torch.Tensor) -> list[BandCholesky]:
     torch.linalg.LinAlgError
         A form is not positive definite.
     """
-    roots = [root for form in forms.double() if (root := cholesky(form))]
+    roots = [root for root in mapped(cholesky, forms.double()) if root]
     if len(roots) < len(forms):
         raise LinAlgError("the quadratic form of a flow is not positive definite")
     return roots

@@ -15,7 +15,6 @@ from lidar_mi.retrieval.flow.posterior import Root
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.windows import working
-from lidar_mi.retrieval.threads import mapped
 
 # Relative rounding error of a factorisation: fifty times that of one entry.
 _ROUNDING = 1e-14
@@ -178,11 +177,10 @@ def solved_in_single(
     return coefficients + factored(whole[None])[0].solve(gradient)
 
 
-def factored_in_single(forms: Sequence[torch.Tensor]) -> Sequence[Root]:
-    """Factors in single precision, in double where there is none, and on other devices."""
-    if not by_lapack(forms[0]):
-        return factored(torch.stack([*forms]))
-    return mapped(lambda form: cholesky(form.float()) or factored(form[None])[0], forms)
+def factor_in_single(form: torch.Tensor) -> Root:
+    """Factor of a form in single precision; in double where there is none, and on other devices."""
+    single = cholesky(form.float()) if by_lapack(form) else None
+    return single or factored(form[None])[0]
 
 
 def _band(mesh: Mesh) -> Band:

@@ -11,8 +11,7 @@ from lidar_mi.retrieval.flow.band import spread
 from lidar_mi.retrieval.flow.direct import (
     Posterior,
     PriorTerm,
-    Root,
-    factored_in_single,
+    factor_in_single,
     form_of_slopes,
     prior_term_of,
     solved_in_single,
@@ -27,6 +26,7 @@ from lidar_mi.retrieval.flow.likelihood import (
     linearised_there,
     path,
 )
+from lidar_mi.retrieval.flow.posterior import Root
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
@@ -203,7 +203,7 @@ def expected_flow(
     sampled = images.sample(*places[:, :1])
     slope, information = information_of_first(images, mesh, places, sampled, len(images.time))
     prior_term = prior_term_of(placed.prior, start.coefficients, start.settings.ridge)
-    (root,) = factored_in_single([form_of_slopes(information, slope, mesh) + prior_term.whole])
+    root = factor_in_single(form_of_slopes(information, slope, mesh) + prior_term.whole)
     # the recursion for the inverse damps rounding: 1e-5 in single precision
     inverse = root.covariance().float()
     at_centres = _of_centres(axes, start.windows, inverse)

@@ -14,7 +14,6 @@ from lidar_mi.retrieval.flow.direct import (
     covariance_near,
     data_form,
     factored,
-    factored_in_single,
     prior_and_gradient,
     prior_form,
     rounding,
@@ -179,8 +178,7 @@ def _band(prior: Prior) -> Band:
 def _inverse(whole: torch.Tensor, prior: Prior, settings: VariationalSettings) -> Inverse:
     solver, band = settings.strips, _band(prior)
     cut = strips(prior.mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
-    # a preconditioner need not be exact
-    roots = factored_in_single([whole[:, :, :, strip.knots] for strip in cut])
+    roots = factored(torch.stack([whole[:, :, :, strip.knots] for strip in cut]))
     parts = list(zip(cut, roots, strict=True))
 
     def preconditioned(right: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,7 @@ import torch
 from benchmarks.cases import DT, SPACING, drifting_pair_images
 from lidar_mi.retrieval.flow.direct import (
     data_form,
-    factored_in_single,
+    factor_in_single,
     prior_term_of,
     solved,
     solved_in_single,
@@ -71,7 +71,7 @@ def test_a_step_with_a_factor_in_single_precision(slabs, learnt):
     exact = solved(linear, mesh, start, flow.prior, flow.settings, 0)
     prior_term = prior_term_of(flow.prior, start, flow.settings.ridge)
     # by its own factor, and from that of a similar form
-    (similar,) = factored_in_single([1.2 * data_form(linear, mesh) + prior_term.whole])
+    similar = factor_in_single(1.2 * data_form(linear, mesh) + prior_term.whole)
     assert similar.lower.dtype == np.float32
     stderr = learnt[0].covariance.diagonal().sqrt().median()
     for near in (None, similar):
@@ -82,7 +82,7 @@ def test_a_step_with_a_factor_in_single_precision(slabs, learnt):
     # stronger by far than single precision resolves beside the data
     stiff = flow.prior._replace(local=1e12 * flow.prior.local)
     prior_term = prior_term_of(stiff, start, flow.settings.ridge)
-    (root,) = factored_in_single([data_form(linear, mesh) + prior_term.whole])
+    root = factor_in_single(data_form(linear, mesh) + prior_term.whole)
     assert root.lower.dtype == np.float64
 
 
