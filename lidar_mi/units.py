@@ -79,10 +79,7 @@ def registry() -> "pint.UnitRegistry[float]":
 def to_si(value: object, unit: str, example: str) -> float:
     """``value`` as a float in the SI unit ``unit``.
 
-    Raises
-    ------
-    ValueError
-        The text is no quantity, or its unit is no multiple of ``unit``.
+    Raises ValueError: the text is no quantity, or its unit is no multiple of ``unit``.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError(f"{value!r} is not allowed; expected a quantity such as '{example}'")
@@ -120,10 +117,7 @@ def to_si(value: object, unit: str, example: str) -> float:
 def split_quantity(value: object) -> tuple[float, str]:
     """A number and the text of its unit, "150 m" as (150.0, "m"); a plain number has none.
 
-    Raises
-    ------
-    ValueError
-        It is neither a number nor text that begins with one.
+    Raises ValueError: it is neither a number nor text that begins with one.
     """
     if isinstance(value, int | float) and not isinstance(value, bool):
         return float(value), ""
@@ -334,10 +328,7 @@ def parse_units(text: str) -> "pint.Quantity[float]":
 
     CF (UDUNITS) writes powers as digits behind a unit and products as a dot, pint does not.
 
-    Raises
-    ------
-    ValueError
-        If it is not a unit.
+    Raises ValueError: if it is not a unit.
     """
     text = str(text).strip()
     if len(text) > _LONGEST:
@@ -354,10 +345,7 @@ def parse_units(text: str) -> "pint.Quantity[float]":
 def conversion(text: str, target: str) -> float:
     """Factor from a CF units string to another.
 
-    Raises
-    ------
-    ValueError
-        The text is no unit, or none that converts to the other.
+    Raises ValueError: the text is no unit, or none that converts to the other.
     """
     if text == target:
         return 1.0

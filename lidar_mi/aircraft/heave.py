@@ -24,22 +24,13 @@ class Heave:
 
     The sum of both is bending s + bending_controls c - relief h'', and that of the wind itself.
 
-    Attributes
-    ----------
-    motion : ndarray, shape (3, 3)
-        Of the state (vertical speed in m/s, pitch in rad, pitch rate in rad/s).
-    wind : ndarray, shape (3, 2)
-        Per force upwards (N) and moment (N m, nose down).
-    controls : ndarray, shape (3, 2)
-        Per elevator and symmetric aileron (rad).
-    bending : ndarray, shape (3,)
-        N m per unit of the state: air loads.
-    bending_controls : ndarray, shape (2,)
-        N m per rad.
-    relief : float
-        Of the wing's mass, kg m.
-    level_bending : float
-        Sum of both bending moments of level flight, N m.
+    motion (3, 3): of the state (vertical speed in m/s, pitch in rad, pitch rate in rad/s).
+    wind (3, 2): per force upwards (N) and moment (N m, nose down).
+    controls (3, 2): per elevator and symmetric aileron (rad).
+    bending (3,): N m per unit of the state: air loads.
+    bending_controls (2,): N m per rad.
+    relief: of the wing's mass, kg m.
+    level_bending: sum of both bending moments of level flight, N m.
     """
 
     motion: np.ndarray
@@ -75,16 +66,10 @@ def bending_of(
     Lift and mass are spread as the chord, so that half a wing has both at 4 / (3 pi) of half the
     span.
 
-    Parameters
-    ----------
-    aircraft : lidar_mi.schema.encounter.Aircraft
-        The lift slope of its sections, the wing's part of the mass.
-    mass, pressure, speed : float
-        kg, dynamic pressure in Pa, m/s.
-    place : float
-        Of the wing, x in the body frame, m.
-    span, area : float
-        m and m^2.
+    aircraft: the lift slope of its sections, the wing's part of the mass.
+    mass, pressure, speed: kg, dynamic pressure in Pa, m/s.
+    place: of the wing, x in the body frame, m.
+    span, area: m and m^2.
     """
     arm = 4 / (3 * np.pi) * span / 2
     slope = finite_span_slope(aircraft.lift_slope, span**2 / area)
@@ -97,12 +82,8 @@ def bending_of(
 class AileronLift:
     """Ailerons between two stations of an elliptic wing, deflected to one side, per rad.
 
-    Attributes
-    ----------
-    lift : float
-        Coefficient with the wing's area.
-    bending : float
-        Sum of both bending moments over dynamic pressure, area and span.
+    lift: coefficient with the wing's area.
+    bending: sum of both bending moments over dynamic pressure, area and span.
     """
 
     lift: float
@@ -177,17 +158,11 @@ def linear_heave(
 ) -> Heave:
     """The equations of an aircraft with these derivatives.
 
-    Parameters
-    ----------
-    derivatives : ndarray, shape (2, 5)
-        Force upwards (N) and moment nose up (N m) per angle of attack (rad), its rate (rad/s),
-        pitch rate (rad/s), elevator (rad, nose down) and symmetric aileron (rad).
-    mass, inertia, speed : float
-        kg, kg m^2, m/s.
-    bending : tuple
-        From `bending_of`.
-    aileron_bending : float
-        Sum of both bending moments per symmetric aileron, N m per rad.
+    derivatives (2, 5): force upwards (N) and moment nose up (N m) per angle of attack (rad), its
+        rate (rad/s), pitch rate (rad/s), elevator (rad, nose down) and symmetric aileron (rad).
+    mass, inertia, speed: kg, kg m^2, m/s.
+    bending: from `bending_of`.
+    aileron_bending: sum of both bending moments per symmetric aileron, N m per rad.
     """
     lift, lag, damping = derivatives[:, :3].T
     # per vertical speed, pitch, pitch rate; up, nose down; elevator, symmetric aileron

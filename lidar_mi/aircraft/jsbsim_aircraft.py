@@ -55,18 +55,12 @@ class JSBSimAircraft:
     has JSBSim's areas and arms. There are no symmetric ailerons. The controls move at the rate of
     `Aircraft.aileron_rate`, in addition to the dynamics of JSBSim's own actuators.
 
-    Parameters
-    ----------
-    aircraft : lidar_mi.schema.encounter.Aircraft
-        Its model, the lift slope of the sections, the rate of the controls.
-    path : lidar_mi.schema.encounter.Path
-        Speed, climb angle and altitude.
+    aircraft: its model, the lift slope of the sections, the rate of the controls.
+    path: speed, climb angle and altitude.
 
-    Raises
-    ------
-    InputError
-        There is no JSBSim, or it has no such aircraft, or cannot load or start it; it is no
-        aeroplane with an engine (`jsbsim_trim.check_aeroplane`), or does not trim on this path.
+    Raises InputError: there is no JSBSim, or it has no such aircraft, or cannot load or start it;
+    it is no aeroplane with an engine (`jsbsim_trim.check_aeroplane`), or does not trim on this
+    path.
     """
 
     def __init__(self, aircraft: Aircraft, path: Path) -> None:

@@ -102,16 +102,10 @@ def heave_derivatives(
     As `lidar_mi.aircraft.heave.linear_heave` takes them, without symmetric ailerons. Least squares
     over the aerodynamic forces of 0.2 s after a force, a moment or the elevator begins to act.
 
-    Parameters
-    ----------
-    again : callable
-        Gives the aircraft in trim.
-    per_command : float
-        Elevator (rad) per normalised command; 0: there is none.
-    small : float
-        Of the commands; of the angle of attack (rad) that the loads make in a second.
-    steps : int
-        Of JSBSim.
+    again: gives the aircraft in trim.
+    per_command: elevator (rad) per normalised command; 0: there is none.
+    small: of the commands; of the angle of attack (rad) that the loads make in a second.
+    steps: of JSBSim.
     """
     causes, effects = [], []
     for disturb in (_lifted, _pitched, _elevated)[: 3 if per_command else 2]:

@@ -82,12 +82,8 @@ def check_aeroplane(name: str, path: Path) -> None:
 def trimmed(name: str, path: Path, flap_settings: Sequence[float]) -> "FGFDMExec":
     """JSBSim on the path, in equilibrium.
 
-    Parameters
-    ----------
-    name : str
-        Of an aircraft of JSBSim.
-    flap_settings : sequence of float
-        0 to 1, in the order in which they are tried; see `LARGEST_INCIDENCE`.
+    name: of an aircraft of JSBSim.
+    flap_settings: 0 to 1, in the order in which they are tried; see `LARGEST_INCIDENCE`.
 
     Raises
     ------

@@ -20,12 +20,9 @@ TRAVEL = np.concatenate(
 def least_travel(now: float, largest: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """What a control can do: deflections d with `TRAVEL` d >= these, shape (4 `KNOTS`,).
 
-    Parameters
-    ----------
-    now : float
-        Deflection now, rad.
-    largest, reach : ndarray, shape (`KNOTS`,)
-        Largest deflection in each interval and change from the one before, rad.
+    now: deflection now, rad.
+    largest, reach (`KNOTS`,): largest deflection in each interval and change from the one before,
+        rad.
     """
     # where limits narrow faster than the control returns, it returns as fast as it can
     largest = np.maximum(largest, abs(now) - np.cumsum(reach))

@@ -23,29 +23,19 @@ Wind = Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
 class AircraftState:
     """Place, attitude and motion of the aircraft in the path frame (x forward, y left, z up).
 
-    Attributes
-    ----------
-    time : float
-        s.
-    x, y, z : float
-        Centre of gravity, m.
-    roll, pitch, yaw : float
-        rad: port wing up, nose up, nose to port.
-    roll_rate, pitch_rate, yaw_rate : float
-        rad/s, about the body's axes, signs as the angles.
-    airspeed : float
-        m/s.
-    departed : bool
-        The flight is lost: the aircraft is upset (rolled beyond `LARGEST_ROLL`), or its equations
-        have no finite solution any more.
-    vertical_speed : float
-        m/s, of the centre of gravity along z.
-    load_factor : float
-        Specific force along the body's z axis at the centre of gravity over g; 1 in level flight.
-        NaN: the model does not rise.
-    port_bending, starboard_bending : float
-        Wing-root bending moments (N m), changes from the trim, positive with the tip up: of air
-        loads less the inertia of the wing. NaN: the model does not rise.
+    time: s.
+    x, y, z: centre of gravity, m.
+    roll, pitch, yaw: rad: port wing up, nose up, nose to port.
+    roll_rate, pitch_rate, yaw_rate: rad/s, about the body's axes, signs as the angles.
+    airspeed: m/s.
+    departed: the flight is lost: the aircraft is upset (rolled beyond `LARGEST_ROLL`), or its
+        equations have no finite solution any more.
+    vertical_speed: m/s, of the centre of gravity along z.
+    load_factor: specific force along the body's z axis at the centre of gravity over g; 1 in level
+        flight. NaN: the model does not rise.
+    port_bending, starboard_bending: wing-root bending moments (N m), changes from the trim,
+        positive with the tip up: of air loads less the inertia of the wing. NaN: the model does not
+        rise.
     """
 
     time: float = 0.0
@@ -91,13 +81,9 @@ class Commands:
 class Limits:
     """Largest deflections (rad) and their rates (rad/s), of aileron, elevator and rudder.
 
-    Attributes
-    ----------
-    deflection, rate : ndarray, shape (3,)
-        0 for a control that the model does not have.
-    symmetric_aileron : float
-        Largest symmetric deflection of the ailerons (rad), of the travel that they share with roll:
-        each stays within deflection[0] and rate[0]. 0: there is none.
+    deflection, rate (3,): 0 for a control that the model does not have.
+    symmetric_aileron: largest symmetric deflection of the ailerons (rad), of the travel that they
+        share with roll: each stays within deflection[0] and rate[0]. 0: there is none.
     """
 
     deflection: np.ndarray
@@ -108,22 +94,13 @@ class Limits:
 class AircraftModel(Protocol):
     """A model of an aircraft.
 
-    Attributes
-    ----------
-    state : AircraftState
-    strips : Strips
-        Of the surfaces on which the wake acts.
-    limits : Limits
-        Of the controls.
-    density : float
-        Of the air at the start, kg m^-3.
-    control_moments : ndarray, shape (3, 3)
-        Moment (row, N m) per deflection (column, rad) at the start; zero columns for controls that
-        the model does not have.
-    roll_damping : float
-        Rolling moment per roll rate at the start, N m per rad/s, negative.
-    roll_inertia : float
-        Moment of inertia about the body's x axis, kg m^2.
+    strips: of the surfaces on which the wake acts.
+    limits: of the controls.
+    density: of the air at the start, kg m^-3.
+    control_moments (3, 3): moment (row, N m) per deflection (column, rad) at the start; zero
+        columns for controls that the model does not have.
+    roll_damping: rolling moment per roll rate at the start, N m per rad/s, negative.
+    roll_inertia: moment of inertia about the body's x axis, kg m^2.
     """
 
     @property
@@ -150,10 +127,7 @@ class AircraftModel(Protocol):
 class RisingAircraft(AircraftModel, Protocol):
     """A model that also rises and pitches, whose loads a controller can plan.
 
-    Attributes
-    ----------
-    heave : Heave
-        Its linear equations about the start.
+    heave: its linear equations about the start.
     """
 
     @property
@@ -165,17 +139,10 @@ def loads_in_wind(
 ) -> Loads:
     """The wake's force and moment on an aircraft in a state, or on its straight course from there.
 
-    Parameters
-    ----------
-    strips : Strips
-    state : AircraftState
-        Place, attitude, time and airspeed.
-    wind : callable
-        Of the path frame: ``wind(x, y, z, time)``.
-    density : float
-        Of the air, kg m^-3.
-    time : array_like, shape (...), optional
-        s, at which attitude, course and speed are still those of the state. Default: now.
+    state: place, attitude, time and airspeed.
+    wind: of the path frame: ``wind(x, y, z, time)``.
+    density: of the air, kg m^-3.
+    time (...): s, at which attitude, course and speed are still those of the state. Default: now.
 
     Returns
     -------

@@ -43,10 +43,7 @@ KUESSNER = Indicial((0.236, 0.513, 0.171), (0.058, 0.364, 2.42))
 class Memory:
     """Unsteady response of strips to their inputs, exact for inputs linear between samples.
 
-    Parameters
-    ----------
-    rate : ndarray, shape (n,)
-        Half chords flown in a second, by strip.
+    rate (n,): half chords flown in a second, by strip.
     """
 
     def __init__(self, indicial: Indicial, rate: np.ndarray) -> None:
@@ -73,14 +70,9 @@ class StripLoads:
 
     With the default keys these are `lidar_mi.aircraft.state.loads_in_wind`.
 
-    Parameters
-    ----------
-    aircraft : AircraftModel
-        At the start, in steady flight.
-    wind : callable
-        Of the path frame.
-    mass : float
-        Of the aircraft, kg: its weight is the steady lift of its wing.
+    aircraft: at the start, in steady flight.
+    wind: of the path frame.
+    mass: of the aircraft, kg: its weight is the steady lift of its wing.
     """
 
     def __init__(

@@ -32,16 +32,11 @@ TAIL_ASPECT_RATIO, FIN_ASPECT_RATIO = 4.0, 1.6
 class Loads:
     """Force and moment in the body frame, about the centre of gravity.
 
-    Attributes
-    ----------
-    force : ndarray, shape (..., 3)
-        N; of one moment or of several.
-    moment : ndarray, shape (..., 3)
-        N m, right-handed about each axis: positive with the port wing up, the nose down, the nose
-        to port.
-    bending : ndarray, shape (..., 2)
-        Bending moments of the port and the starboard wing at the plane of symmetry, N m, positive
-        with the tip up. Default: none are known, 0.
+    force (..., 3): N; of one moment or of several.
+    moment (..., 3): N m, right-handed about each axis: positive with the port wing up, the nose
+        down, the nose to port.
+    bending (..., 2): bending moments of the port and the starboard wing at the plane of symmetry, N
+        m, positive with the tip up. Default: none are known, 0.
     """
 
     force: np.ndarray
@@ -53,18 +48,12 @@ class Loads:
 class Strips:
     """Strips of lifting surfaces.
 
-    Attributes
-    ----------
-    places, normals : ndarray, shape (n, 3)
-        Of the strips' centres of pressure, m, and unit vectors along which they lift.
-    areas : ndarray, shape (n,)
-        m^2.
-    slopes, roll_slopes : ndarray, shape (n,)
-        Lift slope of forces, and of moments about the body's x axis, per rad.
-    bends : ndarray of bool, shape (n,)
-        Strips of the wing: they bend its roots.
-    chords : ndarray, shape (n,)
-        m.
+    places, normals (n, 3): of the strips' centres of pressure, m, and unit vectors along which they
+        lift.
+    areas (n,): m^2.
+    slopes, roll_slopes (n,): lift slope of forces, and of moments about the body's x axis, per rad.
+    bends (n,): strips of the wing: they bend its roots.
+    chords (n,): m.
     """
 
     places: np.ndarray
@@ -81,14 +70,9 @@ def finite_span_slope(section_slope: float, aspect_ratio: float, mode: int = 1) 
 
     Source: Glauert 1926, chapter 11, equations of the monoplane with elliptic chord.
 
-    Parameters
-    ----------
-    section_slope : float
-        a0 of the sections, per rad.
-    aspect_ratio : float
-        A, squared span over area.
-    mode : int
-        1 for lift, 2 for rolling moment.
+    section_slope: a0 of the sections, per rad.
+    aspect_ratio: A, squared span over area.
+    mode: 1 for lift, 2 for rolling moment.
     """
     return section_slope / (1 + mode * section_slope / (np.pi * aspect_ratio))
 
@@ -102,21 +86,12 @@ def wing_strips(
     second kind, whose weight is the elliptic chord: lift and moments are exact for winds that are
     polynomials in y up to the degree 2 n - 1.
 
-    Parameters
-    ----------
-    span, area : float
-        b (m) and S (m^2).
-    lift_slope : float
-        Of the sections, per rad.
-    n : int
-        Number of strips.
-    place : array_like, shape (3,)
-        Middle of the surface in the body frame, m.
+    span, area: b (m) and S (m^2).
+    lift_slope: of the sections, per rad.
+    n: number of strips.
+    place (3,): middle of the surface in the body frame, m.
 
-    Raises
-    ------
-    InputError
-        Span, area, slope or number not positive.
+    Raises InputError: span, area, slope or number not positive.
     """
     angle = _angles(n)
     places = np.tile(np.asarray(place, dtype=float), (n, 1))

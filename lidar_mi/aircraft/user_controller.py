@@ -28,11 +28,9 @@ def name_of(maker: Callable[..., Any]) -> str:
 def user_controller(maker: Callable[..., Any], aircraft: AircraftModel) -> Controller:
     """The controller that a function ``maker`` makes for an aircraft, checked at every call.
 
-    Raises
-    ------
-    InputError
-        It takes other arguments, raises an exception, or returns no controller; the controller
-        itself when it is called: other arguments, an exception, no `Commands` of finite numbers.
+    Raises InputError: it takes other arguments, raises an exception, or returns no controller; the
+    controller itself when it is called: other arguments, an exception, no `Commands` of finite
+    numbers.
     """
     called = f"controller {name_of(maker)}"
     if not _accepts(maker, 1):

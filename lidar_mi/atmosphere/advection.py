@@ -93,28 +93,18 @@ def advect(
     is not meaningful. A field without negative values remains so: the undershoots of the spline at
     sharp edges are set to zero.
 
-    Parameters
-    ----------
-    field : xarray.DataArray
-        Any scalar, dims (y, z) or (x, y, z) in any order, y and z equally spaced, metres.
-    v, w : xarray.DataArray
-        Velocity along y and z, m s^-1, same dims and coordinates as `field`.
-    dt : float
-        s; negative goes back in time.
-    steps : int
-        Trajectory steps in dt, >= 1.
-    u : xarray.DataArray, optional
-        Velocity along x, m s^-1, for a field on (x, y, z) with x equally spaced as well.
+    field: any scalar, dims (y, z) or (x, y, z) in any order, y and z equally spaced, metres.
+    v, w: velocity along y and z, m s^-1, same dims and coordinates as `field`.
+    dt: s; negative goes back in time.
+    steps: trajectory steps in dt, >= 1.
+    u: velocity along x, m s^-1, for a field on (x, y, z) with x equally spaced as well.
+
+    Raises InputError: other dims, unequal grids, uneven axes, values or dt not finite.
 
     Returns
     -------
     xarray.DataArray
         float64, dims, coordinates and attributes of `field`.
-
-    Raises
-    ------
-    InputError
-        Other dims, unequal grids, uneven axes, values or dt not finite.
     """
     _check_step(dt, steps)
     _check_grid(field, v, w, u)  # a fault of the field, or of the velocities
@@ -161,10 +151,7 @@ def advect_to(
     r (omega t)^3/(6 n^2) after n steps. Times (s) ascend, 0 is that of ``field``; the result has
     dims (time, ...) and is float64.
 
-    Raises
-    ------
-    InputError
-        Times not finite or not ascending; else as `advect`.
+    Raises InputError: times not finite or not ascending; else as `advect`.
     """
     times = np.asarray(times, float)
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():

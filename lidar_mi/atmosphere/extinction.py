@@ -94,29 +94,20 @@ def extinction_from_tracer(
     stretching factor of 2.0" and that relative structure is maintained, but no formula: this
     reading of it is ours. Where aerosol > 1, E may pass `maximum` by background*(aerosol - 1).
 
-    Parameters
-    ----------
-    wake : xarray.Dataset
-        Holds the named variables, >= 0; the aerosol relative to its mean.
-    background, maximum : float
-        m^-1, background >= 0 and maximum > background.
-    stretch : float
-        >= 1.
-    tracer, aerosol : str or None
-        Variable names; None leaves that part out (no exhaust; a smooth background).
-    reference : float, optional
-        Tracer value that gets `maximum`; default its largest value here. Give it to put two
+    wake: holds the named variables, >= 0; the aerosol relative to its mean.
+    background, maximum: m^-1, background >= 0 and maximum > background.
+    stretch: >= 1.
+    tracer, aerosol: variable names; None leaves that part out (no exhaust; a smooth background).
+    reference: tracer value that gets `maximum`; default its largest value here. Give it to put two
         times on one scale.
+
+    Raises InputError: numbers out of range, missing or negative variables, a reference below the
+    data.
 
     Returns
     -------
     xarray.DataArray
         m^-1, dims of the wake's variables.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range, missing or negative variables, a reference below the data.
     """
     _check(background, maximum, stretch)
 

@@ -45,11 +45,9 @@ def interpolated(
 ) -> tuple[np.ndarray, float]:
     """Values at other nodes by cubic splines, axis by axis, and how well they are determined.
 
-    Parameters
-    ----------
-    values : (n0, n1, ...) array
-    nodes, targets : sequences of arrays
-        For every axis, ascending. An axis with equal nodes and targets is left as it is.
+    values (n0, n1, ...)
+    nodes, targets (sequences of arrays): for every axis, ascending. An axis with equal nodes and
+        targets is left as it is.
 
     Returns
     -------
@@ -63,7 +61,7 @@ def interpolated(
         if old.size == new.size and np.allclose(old, new, rtol=0, atol=1e-3 * _step(old)):
             continue
         smooth = scipy.interpolate.CubicSpline(old, smooth, axis=axis)(new)
-        straight = _linear(old, straight, new, axis)
+        straight = scipy.interpolate.make_interp_spline(old, straight, k=1, axis=axis)(new)
     return smooth, float(np.sqrt(np.mean((smooth - straight) ** 2)))
 
 
@@ -77,12 +75,3 @@ def statement(errors: Mapping[str, float], units: Mapping[str, str]) -> str:
 
 def _step(nodes: np.ndarray) -> float:
     return float(np.diff(nodes).min()) if nodes.size > 1 else 1.0
-
-
-def _linear(nodes: np.ndarray, values: np.ndarray, targets: np.ndarray, axis: int) -> np.ndarray:
-    index = np.clip(np.searchsorted(nodes, targets) - 1, 0, nodes.size - 2)
-    fraction = (targets - nodes[index]) / (nodes[index + 1] - nodes[index])
-    shape = [-1 if k == axis else 1 for k in range(values.ndim)]
-    fraction = fraction.reshape(shape)
-    before, behind = np.take(values, index, axis), np.take(values, index + 1, axis)
-    return before * (1 - fraction) + behind * fraction

@@ -72,29 +72,19 @@ def corrsin_obukhov(
     0 and s. The factor's own mean and rms therefore scatter only by what the tails do: some
     per cent of the rms in an image of ten outer scales.
 
-    Parameters
-    ----------
-    y, z : array_like
-        Node positions, m, equally spaced, ascending.
-    rms : float
-        Relative, >= 0; 0 gives ones.
-    outer_scale : float
-        m, at least two cells.
-    seed : int
-        >= 0.
-    x : array_like, optional
-        Gives dims (x, y, z); one node is a slice of the two-dimensional field, more a
+    y, z: node positions, m, equally spaced, ascending.
+    rms: relative, >= 0; 0 gives ones.
+    outer_scale: m, at least two cells.
+    seed: >= 0.
+    x: gives dims (x, y, z); one node is a slice of the two-dimensional field, more a
         three-dimensional field.
+
+    Raises InputError: values out of range, uneven axes, a field too large for memory.
 
     Returns
     -------
     xarray.DataArray
         Factor, dimensionless, dims (y, z) or (x, y, z).
-
-    Raises
-    ------
-    InputError
-        Values out of range, uneven axes, a field too large for memory.
     """
     if not (np.isfinite(rms) and rms >= 0):
         raise InputError(f"texture.rms: {rms} is not allowed; it must be >= 0")
@@ -155,12 +145,8 @@ _ORDER = 5  # of the spline through the nodes, as in advection
 class PeriodicTexture:
     """The factor of `corrsin_obukhov` anywhere in space, periodic in all directions, without seams.
 
-    Attributes
-    ----------
-    coefficients : (nx, ny, nz) array
-        Of the periodic quintic B-spline of the logarithm.
-    spacing : (float, float, float)
-        Of its nodes, m.
+    coefficients (nx, ny, nz): of the periodic quintic B-spline of the logarithm.
+    spacing: of its nodes, m.
     """
 
     coefficients: np.ndarray
@@ -196,10 +182,7 @@ def periodic_texture(
 
     Mean and standard deviation of the Gaussian field are set over the period.
 
-    Raises
-    ------
-    InputError
-        An outer scale of less than two cells, a period too large for memory.
+    Raises InputError: an outer scale of less than two cells, a period too large for memory.
     """
     if not outer_scale >= 2 * max(spacing):
         raise InputError(

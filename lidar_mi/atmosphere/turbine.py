@@ -21,28 +21,18 @@ from lidar_mi.errors import InputError
 class TurbineWake:
     """The mean wake at one place downstream of an actuator disc.
 
-    Parameters
-    ----------
-    diameter : float
-        D of the rotor, m.
-    thrust : float
-        Thrust coefficient C_T, above 0 and below 1.
-    tip_speed_ratio : float
-        Speed of the blades' tips over that of the wind; negative: the rotor rotates from +z towards
-        +y, and the wake's swirl from +y towards +z.
-    wind_speed : float
-        U of the undisturbed wind, m s^-1.
-    growth : float
-        k*, by which the wake's width grows with the distance: 0.02 to 0.06, more in turbulent air.
-    downstream : float
-        Distance from the rotor, m.
-    hub_core : float
-        Radius of the swirl's core, m.
+    diameter: D of the rotor, m.
+    thrust: thrust coefficient C_T, above 0 and below 1.
+    tip_speed_ratio: speed of the blades' tips over that of the wind; negative: the rotor rotates
+        from +z towards +y, and the wake's swirl from +y towards +z.
+    wind_speed: U of the undisturbed wind, m s^-1.
+    growth: k*, by which the wake's width grows with the distance: 0.02 to 0.06, more in turbulent
+        air.
+    downstream: distance from the rotor, m.
+    hub_core: radius of the swirl's core, m.
 
-    Raises
-    ------
-    InputError
-        Numbers out of range, or a place so near that the far wake's formula has no value there.
+    Raises InputError: numbers out of range, or a place so near that the far wake's formula has no
+    value there.
 
     Notes
     -----
@@ -172,10 +162,7 @@ def isotropic_turbulence(
     k^4 / (k^2 + k0^2)^(17/6), k0 = 2 pi / ``outer_scale``. Derivatives are central differences:
     the divergence by these is zero, and gusts shorter than four cells are damped.
 
-    Parameters
-    ----------
-    x, y, z : arrays
-        Axes, m, equally spaced, two nodes at least.
+    x, y, z: axes, m, equally spaced, two nodes at least.
     """
     axes = (x, y, z)
     step = [float(axis[1] - axis[0]) for axis in axes]
@@ -223,14 +210,9 @@ def turbine_flow(
     (`added_turbulence`) in its middle, fading outwards as the deficit does. This modulation causes
     a divergence of some per cent of the gusts' gradients.
 
-    Parameters
-    ----------
-    x, y, z : array_like
-        Axes, m, equally spaced.
-    ambient : float
-        Turbulence intensity of the undisturbed wind, rms of u over U; 0: no turbulence at all.
-    outer_scale : float
-        Of the turbulence, m.
+    x, y, z: axes, m, equally spaced.
+    ambient: turbulence intensity of the undisturbed wind, rms of u over U; 0: no turbulence at all.
+    outer_scale: of the turbulence, m.
 
     Returns
     -------

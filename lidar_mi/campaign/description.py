@@ -57,10 +57,7 @@ class Span(Description):
     def ends(self) -> tuple[float, float]:
         """Both ends in `unit`.
 
-        Raises
-        ------
-        ValueError
-            No quantities, or of two units.
+        Raises ValueError: no quantities, or of two units.
         """
         (first, unit), (last, other) = map(split_quantity, self._ends())
         if unit != other:
@@ -247,19 +244,12 @@ def read_campaign(
 ) -> Campaign:
     """Read a campaign file.
 
-    Parameters
-    ----------
-    path : path
-        A campaign file, or an experiment with ``variants``, which are its one dimension.
-    overrides : list of str, optional
-        Texts such as ``"members=4"`` or ``"set.scan.range=200 m"``.
-    quick : bool
-        The coarse version that the file describes.
+    path: a campaign file, or an experiment with ``variants``, which are its one dimension.
+    overrides: texts such as ``"members=4"`` or ``"set.scan.range=200 m"``.
+    quick: the coarse version that the file describes.
 
-    Raises
-    ------
-    InputError
-        Unreadable file, unknown key, a dimension that is none: the first fault is named.
+    Raises InputError: unreadable file, unknown key, a dimension that is none: the first fault is
+    named.
     """
     data = read_yaml(path, "a campaign file")
     if not isinstance(data, dict):

@@ -176,15 +176,9 @@ def connected(
 ) -> Iterator[Client]:
     """A client whose workers are ready.
 
-    Parameters
-    ----------
-    client : Client or str, optional
-        Of a scheduler, its address, or the file that it wrote. Default: processes here.
+    client: of a scheduler, its address, or the file that it wrote. Default: processes here.
 
-    Raises
-    ------
-    InputError
-        A scheduler that does not answer, workers of another version.
+    Raises InputError: a scheduler that does not answer, workers of another version.
     """
     if isinstance(client, Client):
         _make_ready(client, threads, own_cache=True)

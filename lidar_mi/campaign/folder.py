@@ -74,13 +74,7 @@ class CampaignFolder:
 
     @cached_property
     def index(self) -> list[Row]:
-        """A row for each point, by its number.
-
-        Raises
-        ------
-        InputError
-            The file is damaged.
-        """
+        """A row for each point, by its number."""
         path = self.path / INDEX
         rows = []
         for line in read_text(path, "the index of a campaign").splitlines():
@@ -120,13 +114,7 @@ class CampaignFolder:
             (self.path / IMAGES).rmdir()
 
     def claimed(self) -> AbstractContextManager[None]:
-        """Lock the folder for the one process that hands out its points.
-
-        Raises
-        ------
-        InputError
-            Another process does.
-        """
+        """Lock the folder for the one process that hands out its points."""
         return locked(self.path)
 
 
@@ -159,10 +147,7 @@ def write_outcome(place: Path, outcome: Outcome) -> None:
 def read_base(campaign: Campaign, origin: str | Path) -> tuple[dict[str, Any], Path]:
     """Keys of the base experiment and the folder of its file.
 
-    Raises
-    ------
-    InputError
-        No such experiment; one with variants.
+    Raises InputError: no such experiment; one with variants.
     """
     neighbour = Path(origin).parent / campaign.base
     path = neighbour if neighbour.is_file() else experiment_file(campaign.base)
@@ -182,10 +167,8 @@ def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder
 
     Every point's settings are checked before anything is written.
 
-    Raises
-    ------
-    InputError
-        A point that is no experiment, two that are equal, the folder of another campaign.
+    Raises InputError: a point that is no experiment, two that are equal, the folder of another
+    campaign.
     """
     folder = Path(folder)
     record = _record(points)
@@ -210,13 +193,7 @@ def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder
 
 
 def open_folder(folder: str | Path) -> CampaignFolder:
-    """The folder of an existing campaign.
-
-    Raises
-    ------
-    InputError
-        There is no campaign in it.
-    """
+    """The folder of an existing campaign."""
     folder = Path(folder)
     path = folder / RECORD
     if not path.is_file():
@@ -233,10 +210,7 @@ def open_folder(folder: str | Path) -> CampaignFolder:
 def check_version(folder: CampaignFolder) -> None:
     """Refuse to compute points of another version's campaign.
 
-    Raises
-    ------
-    InputError
-        Results of two versions must not be mixed.
+    Raises InputError: results of two versions must not be mixed.
     """
     version = read_yaml(folder.path / RECORD, "the record of a campaign")["version"]
     if version != __version__:

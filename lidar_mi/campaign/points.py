@@ -25,18 +25,11 @@ MEMBER, SAMPLE = "member", "sample"
 class Dimension:
     """One dimension of a campaign's points.
 
-    Attributes
-    ----------
-    name : str
-        A dotted key, a name of its own, or `SAMPLE`.
-    labels : tuple
-        Values as an experiment file has them, or names.
-    changes : tuple of dict
-        Keys that each label changes, dotted.
-    named : bool
-        Whether it has sets of changes by name; else its changes are those of keys.
-    scale : str
-        Either linear or log, of a range; empty where the description does not say.
+    name: a dotted key, a name of its own, or `SAMPLE`.
+    labels: values as an experiment file has them, or names.
+    changes: keys that each label changes, dotted.
+    named: whether it has sets of changes by name; else its changes are those of keys.
+    scale: either linear or log, of a range; empty where the description does not say.
     """
 
     name: str
@@ -49,17 +42,10 @@ class Dimension:
 class Points:
     """All points of a campaign, in the order of the file, members last and fastest.
 
-    Parameters
-    ----------
-    base : dict
-        Keys of the base experiment.
-    search_path : path
-        Folder in which files named by the experiments are searched first.
+    base: keys of the base experiment.
+    search_path: folder in which files named by the experiments are searched first.
 
-    Raises
-    ------
-    InputError
-        Two dimensions that change one key.
+    Raises InputError: two dimensions that change one key.
     """
 
     def __init__(self, campaign: Campaign, base: dict[str, Any], search_path: str | Path) -> None:
@@ -94,10 +80,7 @@ class Points:
     def experiment(self, number: int) -> Experiment:
         """The experiment of a point.
 
-        Raises
-        ------
-        InputError
-            An unknown key, a wrong unit, a value out of range.
+        Raises InputError: an unknown key, a wrong unit, a value out of range.
         """
         *index, member = self.index(number)
         data = self.base

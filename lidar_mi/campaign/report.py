@@ -17,15 +17,9 @@ def campaign_answer(folder: str | Path) -> str:
 def write_report(folder: str | Path, metrics: Sequence[str] | None = None) -> Path:
     """Write ``report.html`` of a campaign; returns its path.
 
-    Parameters
-    ----------
-    metrics : sequence of str, optional
-        Names of those to show. Default: errors, requirements and vortices.
+    metrics: names of those to show. Default: errors, requirements and vortices.
 
-    Raises
-    ------
-    InputError
-        No campaign in the folder, or no such metric.
+    Raises InputError: no campaign in the folder, or no such metric.
     """
     opened = open_folder(folder)
     data = open_campaign(opened.path)

@@ -16,24 +16,16 @@ def slurm_cluster(
 
     Workers end two minutes before their walltime, and their points go to others.
 
-    Parameters
-    ----------
-    memory : str
-        Of each.
-    walltime : str
-        Of each job, HH:MM:SS.
-    queue, account : str, optional
-        Partition and account.
+    memory: of each.
+    walltime: of each job, HH:MM:SS.
+    queue, account: partition and account.
+
+    Raises InputError: dask-jobqueue is missing; a walltime that is none.
 
     Returns
     -------
     dask_jobqueue.SLURMCluster
         ``scale(jobs=40)`` submits 40 of them, ``job_script()`` is one as text.
-
-    Raises
-    ------
-    InputError
-        dask-jobqueue is missing; a walltime that is none.
     """
     try:
         from dask_jobqueue.slurm import SLURMCluster

@@ -38,10 +38,8 @@ def refuse_while_importing() -> None:
 def check_spawning(count: int) -> None:
     """Start a process as ``count`` workers will be started, and wait for its end.
 
-    Raises
-    ------
-    InputError
-        It does not start, or fails as it imports the main module; too few files may be open.
+    Raises InputError: it does not start, or fails as it imports the main module; too few files may
+    be open.
     """
     if not _may_open(_FILES + _FILES_EACH * count):
         raise _refused(_TOO_FEW)

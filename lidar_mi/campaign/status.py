@@ -12,16 +12,11 @@ from lidar_mi.tables import Table, Tabular
 class Status(Tabular):
     """Counts of a campaign's points and images.
 
-    Attributes
-    ----------
-    total, done, failed, running : int
-        Points; ``running`` ones have started and not ended, or were killed.
-    rendered, reused : int
-        Images.
-    seconds : dict of str to float
-        Time in each step, summed over points; 0 where there is none.
-    failures : list of tuple of str
-        A failed point's values, its message, its folder.
+    total, done, failed, running: points; ``running`` ones have started and not ended, or were
+        killed.
+    rendered, reused: images.
+    seconds: time in each step, summed over points; 0 where there is none.
+    failures: a failed point's values, its message, its folder.
     """
 
     name: str
@@ -83,13 +78,7 @@ class Status(Tabular):
 
 
 def campaign_status(folder: str | Path) -> Status:
-    """How far the campaign in a folder is; also while it runs.
-
-    Raises
-    ------
-    InputError
-        No campaign in the folder.
-    """
+    """How far the campaign in a folder is; also while it runs."""
     opened = open_folder(folder)
     status = Status(opened.campaign.name, len(opened.points))
     for number in range(status.total):

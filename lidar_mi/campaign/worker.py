@@ -52,13 +52,9 @@ MOST_ATTEMPTS = 3
 class Prepare(WorkerPlugin):
     """Makes a worker ready: its version, threads, kernel cache.
 
-    Parameters
-    ----------
-    threads : int
-        Of Dr.Jit and of torch.
-    own_cache : bool
-        Kernels are compiled for one machine. A home folder that machines share must not hold their
-        cache: it is then in the machine's folder for temporary files.
+    threads: of Dr.Jit and of torch.
+    own_cache: kernels are compiled for one machine. A home folder that machines share must not hold
+        their cache: it is then in the machine's folder for temporary files.
     """
 
     name = "lidar-mi"
@@ -69,10 +65,7 @@ class Prepare(WorkerPlugin):
     def setup(self, worker: Worker) -> None:
         """Called by the worker when it starts, or when it receives this plugin.
 
-        Raises
-        ------
-        InputError
-            The worker has another version of the package.
+        Raises InputError: the worker has another version of the package.
         """
         # a campaign of two versions would compare what is not comparable
         if self.version != __version__:
@@ -93,16 +86,10 @@ def carry_out(
 ) -> Outcome:
     """Run one point, unless it is done.
 
-    Parameters
-    ----------
-    folder : str
-        Of the campaign.
-    session : str
-        A name for this start of the campaign: workers killed by a point are counted within it.
-    ready : sequence of int
-        Number of images rendered by each `render_shared` that precedes this point.
-    first : sequence of int
-        Indices of those that count as rendered by this point; other points re-use them.
+    folder: of the campaign.
+    session: a name for this start of the campaign: workers killed by a point are counted within it.
+    ready: number of images rendered by each `render_shared` that precedes this point.
+    first: indices of those that count as rendered by this point; other points re-use them.
 
     Returns
     -------

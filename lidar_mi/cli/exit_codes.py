@@ -61,10 +61,7 @@ def exit_by(app: Callable[..., int | None]) -> None:
 def end_without_result(reason: str, flag: "xr.DataArray") -> NoReturn:
     """End a command whose result has no valid value, with the reasons that its flags give.
 
-    Parameters
-    ----------
-    flag : xr.DataArray
-        Flags with the CF attributes ``flag_masks`` and ``flag_meanings``; none is 0.
+    flag: flags with the CF attributes ``flag_masks`` and ``flag_meanings``; none is 0.
     """
     _fail(f"{reason} (flags: {flags_in_words(flag)})", NOTHING_FOUND)
 

@@ -39,12 +39,9 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
 
     An aircraft may take the place of that of the experiment, which has an encounter.
 
-    Raises
-    ------
-    InputError
-        A near gate behind the aircraft, a look-ahead shorter than the latency allows, an aircraft
-        that JSBSim does not have, that is no aeroplane or that does not trim, a wake that is not
-        known along its axis.
+    Raises InputError: a near gate behind the aircraft, a look-ahead shorter than the latency
+    allows, an aircraft that JSBSim does not have, that is no aeroplane or that does not trim, a
+    wake that is not known along its axis.
     """
     encounter, gates = encounter_of(experiment), gates_of(experiment)
     if encounter.control.mode == "feedforward":
@@ -83,17 +80,10 @@ def sections(
 ) -> Iterator[Section]:
     """Titled tables of the flight and of the lidar's first slab; nothing is written.
 
-    Parameters
-    ----------
-    notice : callable
-        Called with the name of the running step.
-    timed : bool
-        With the time of the flight, which takes a probe of about two seconds.
+    notice: called with the name of the running step.
+    timed: with the time of the flight, which takes a probe of about two seconds.
 
-    Raises
-    ------
-    InputError
-        Anything that a flight would refuse before it starts.
+    Raises InputError: anything that a flight would refuse before it starts.
     """
     warnings = geometry(experiment)
     encounter, gates = encounter_of(experiment), gates_of(experiment)

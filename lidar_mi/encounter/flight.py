@@ -67,14 +67,9 @@ OwnController = Callable[[AircraftModel], Controller]
 class FlightData:
     """The data sets of an encounter's flights.
 
-    Attributes
-    ----------
-    series : xr.Dataset, dims (flight, time)
-        States, loads and commands.
-    track : xr.Dataset or None, dims (slab) and (source, slab)
-        Estimates, track and truth; None without a lidar.
-    slabs : xr.Dataset or None, dims (slab, z, y) and (slab, image_z, image_y)
-        Images and wind vectors; None without a lidar.
+    series (flight, time): states, loads and commands.
+    track (slab): estimates, track and truth; None without a lidar.
+    slabs (slab, z, y): images and wind vectors; None without a lidar.
     """
 
     series: xr.Dataset
@@ -94,19 +89,12 @@ def simulate_flights(
 ) -> FlightData:
     """All flights of an experiment's mode of control.
 
-    Parameters
-    ----------
-    notice : callable
-        Called with the name of the flight and its progress.
-    lidar : Lidar, optional
-        Default: `VirtualLidar` of the experiment.
-    aircraft : callable, optional
-        Gives an aircraft at the start; default: that of the experiment.
-    controller : callable, optional
-        Gives the controller of an aircraft, which steers where there is a preview; default:
+    notice: called with the name of the flight and its progress.
+    lidar: default: `VirtualLidar` of the experiment.
+    aircraft: gives an aircraft at the start; default: that of the experiment.
+    controller: gives the controller of an aircraft, which steers where there is a preview; default:
         `feedforward`.
-    processes, scans
-        As `VirtualLidar` takes them.
+    processes, scans: as `VirtualLidar` takes them.
     """
     from lidar_mi.encounter.ahead.arrivals import arrivals_dataset
     from lidar_mi.encounter.ahead.preview import WakeTracker, preview_in
@@ -190,17 +178,11 @@ def simulate_flight(
     Wake and controls act in steps of 10 ms or less, a whole number of them from scan to scan. A
     flight that is lost (upset) keeps the state of that moment to its end: this is its result.
 
-    Parameters
-    ----------
-    aircraft : AircraftModel
-        At the start.
-    observe : callable
-        A scan, if one is due in a state, and what was delivered since the last.
-    preview_at : callable
-        The preview in a state; None: there is none, and the controller gets what
+    aircraft: at the start.
+    observe: a scan, if one is due in a state, and what was delivered since the last.
+    preview_at: the preview in a state; None: there is none, and the controller gets what
         `bumpless_transfer` makes of the last one.
-    integrity : Integrity, optional
-        Withdraws a preview that the measured roll contradicts.
+    integrity: withdraws a preview that the measured roll contradicts.
     """
     from lidar_mi.encounter.series import FlightRecorder
 

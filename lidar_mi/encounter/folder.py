@@ -50,11 +50,8 @@ class EncounterFolder:
     def claimed(self, overwrite: bool) -> Iterator[None]:
         """Lock the folder for this experiment.
 
-        Raises
-        ------
-        InputError
-            Another process uses the folder; it is no folder of flights, or holds those of another
-            experiment or version and ``overwrite`` is not set.
+        Raises InputError: another process uses the folder; it is no folder of flights, or holds
+        those of another experiment or version and ``overwrite`` is not set.
         """
         with held(self.path, "flight's folder"):
             self._start(overwrite)

@@ -36,14 +36,9 @@ class Integrity:
     flies half of its span, the size of the eddies that roll it. Turbulence counts by the mean
     square of the moments that were measured where none are predicted.
 
-    Attributes
-    ----------
-    aircraft : AircraftModel
-        Its roll is that of the linear roll mode.
-    withdrawn : bool
-        Whether the preview is withdrawn.
-    sum : float
-        Of the logarithms of the likelihood ratio.
+    aircraft: its roll is that of the linear roll mode.
+    withdrawn: whether the preview is withdrawn.
+    sum: of the logarithms of the likelihood ratio.
     """
 
     aircraft: AircraftModel

@@ -37,16 +37,10 @@ _FREE = ("name", "encounter.aircraft", "encounter.control")
 class RecordedLidar:
     """Delivers the estimates of a recorded flight; a `lidar_mi.encounter.ahead.preview.Lidar`.
 
-    Attributes
-    ----------
-    track : xr.Dataset, dims (slab, ...)
-        Of the recorded flight.
-    period : float
-        From scan to scan, s.
-    stride : float
-        From slab to slab, m.
-    latency : float or None
-        Of the new flight, s; None: times of delivery as recorded.
+    track (slab, ...): of the recorded flight.
+    period: from scan to scan, s.
+    stride: from slab to slab, m.
+    latency: of the new flight, s; None: times of delivery as recorded.
     """
 
     track: xr.Dataset
@@ -104,18 +98,11 @@ def _pair(one: xr.Dataset) -> VortexPairFit | None:
 def recorded_flight(folder: str | Path, experiment: Experiment) -> FlightData:
     """The data sets of a flight whose estimates an experiment may fly by.
 
-    Parameters
-    ----------
-    folder : path
-        Of the recorded flight.
-    experiment : Experiment
-        Differs from the recorded one in `encounter.aircraft` and `encounter.control` alone.
+    folder: of the recorded flight.
+    experiment: differs from the recorded one in `encounter.aircraft` and `encounter.control` alone.
 
-    Raises
-    ------
-    InputError
-        No flight with a lidar, or one from a version that did not record its estimates; another
-        experiment; a mode of control without the lidar.
+    Raises InputError: no flight with a lidar, or one from a version that did not record its
+    estimates; another experiment; a mode of control without the lidar.
     """
     folder = Path(folder)
     if encounter_of(experiment).control.mode != FEEDFORWARD:

@@ -16,6 +16,7 @@ from lidar_mi.encounter.lidar.vector_record import recorded_vectors
 from lidar_mi.experiment.truth.wake_along_path import vortices_in_plane
 from lidar_mi.retrieval.vortices.model import PARAMETERS
 from lidar_mi.retrieval.vortices.pair import MEANING, VortexPairFit
+from lidar_mi.variables import variable
 
 QUANTITIES = tuple(
     f"{side}_{name}"
@@ -114,14 +115,10 @@ class FlightRecorder:
         time = np.array([row["time"] for row in self._rows])
         return xr.Dataset(
             {
-                name: (
-                    "time",
-                    np.array([row[name] for row in self._rows]),
-                    {"units": units, "long_name": text},
-                )
-                for name, (units, text) in meaning.items()
+                name: variable("time", np.array([row[name] for row in self._rows]), *about)
+                for name, about in meaning.items()
             },
-            coords={"time": ("time", time, {"units": "s", "long_name": "time of flight"})},
+            coords={"time": variable("time", time, "s", "time of flight")},
         )
 
 
@@ -154,8 +151,8 @@ def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
             "source": ("source", list(SOURCES)),
         }
     )
-    for name, (units, text) in _PER_SLAB.items():
-        dataset[name] = ("slab", [row[name] for row in rows], {"units": units, "long_name": text})
+    for name, about in _PER_SLAB.items():
+        dataset[name] = variable("slab", [row[name] for row in rows], *about)
     dataset["flags"] = (
         "slab",
         np.array(["; ".join(s.estimate.flags) for s in slabs], dtype=object),
@@ -164,8 +161,9 @@ def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
         units, text = MEANING[name]
         for suffix in ("", "_stderr"):
             values = np.array([[row[source, name + suffix] for row in rows] for source in SOURCES])
-            about = {"units": units, "long_name": f"standard error of {text}" if suffix else text}
-            dataset[name + suffix] = (("source", "slab"), values.reshape(len(SOURCES), -1), about)
+            words = f"standard error of {text}" if suffix else text
+            values = values.reshape(len(SOURCES), -1)
+            dataset[name + suffix] = variable(("source", "slab"), values, units, words)
     fits = _fits([slab.estimate.pair for slab in slabs])
     vectors = recorded_vectors([slab.estimate for slab in slabs])
     return dataset.merge(fits).merge(vectors).assign_attrs(fits.attrs | vectors.attrs)
@@ -188,14 +186,12 @@ def _fits(pairs: Sequence[VortexPairFit | None]) -> xr.Dataset:
     about = {"long_name": "m2 s-1, log of m, m, m of port and starboard; mean v and w in m s-1"}
     fits = xr.Dataset(
         {
-            "estimated": ("slab", np.array(there, float), {"units": "1", "long_name": "1: a fit"}),
+            "estimated": variable("slab", np.array(there, float), "1", "1: a fit"),
             "estimate_parameters": (("slab", "parameter"), parameters, about),
             "estimate_covariance": (("slab", "parameter", "parameter_2"), covariance, about),
             "estimate_shared": (("slab", "parameter", "parameter_2"), shared, about),
-            "estimate_shared_length": (
-                "slab",
-                lengths,
-                {"units": "m", "long_name": "over which errors by the ambient wind are shared"},
+            "estimate_shared_length": variable(
+                "slab", lengths, "m", "over which errors by the ambient wind are shared"
             ),
             "estimate_reasons": ("slab", np.array(reasons, dtype=object)),
         },

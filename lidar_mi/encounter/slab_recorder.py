@@ -16,10 +16,7 @@ _VECTORS = 24
 class SlabRecorder:
     """Records images and vectors, estimate by estimate.
 
-    Attributes
-    ----------
-    lidar : Lidar
-        Its ``images``, if it has them, are those of the last slab.
+    lidar: its ``images``, if it has them, are those of the last slab.
     """
 
     lidar: Lidar

@@ -30,19 +30,11 @@ def sections(
 ) -> Iterator[Section]:
     """Describe a file, a folder of a run or a study, a named aerosol or the molecules of air.
 
-    Parameters
-    ----------
-    what : str
-        Path of an EXR or NetCDF file, a scattering table, a run folder or a study's; or a name.
-    wavelength : float, optional
-        m, of a named scatterer; default 532 nm.
-    altitude : float, optional
-        m in the standard atmosphere, of molecules; default 0.
+    what: path of an EXR or NetCDF file, a scattering table, a run folder or a study's; or a name.
+    wavelength: m, of a named scatterer; default 532 nm.
+    altitude: m in the standard atmosphere, of molecules; default 0.
 
-    Raises
-    ------
-    InputError
-        Nothing of this name, not readable, or an option that does not apply to it.
+    Raises InputError: nothing of this name, not readable, or an option that does not apply to it.
     """
     path = Path(what)
     # a file with the name of a scatterer comes first

@@ -22,10 +22,7 @@ def on_its_device(experiment: Experiment) -> Experiment:
     Variants keep what follows llvm or cuda. Where rendering alone can be on the GPU, `auto` puts
     retrieval on the processor. It is idempotent.
 
-    Raises
-    ------
-    InputError
-        CUDA is asked for, and one of both does not compute there.
+    Raises InputError: CUDA is asked for, and one of both does not compute there.
     """
     device = experiment.device
     if device is None:

@@ -21,12 +21,8 @@ def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Data
     Places are those of the path frame: x along the path from where the flight starts, y to port, z
     up, m.
 
-    Parameters
-    ----------
-    folder : Path
-        Of a flight.
-    placed : bool
-        The track as points in space, a vortex each; else a row for each slab and source, and
+    folder: of a flight.
+    placed: the track as points in space, a vortex each; else a row for each slab and source, and
         without images.
     """
     files = {name: folder / file for name, file in FLIGHT_FILES.items()}

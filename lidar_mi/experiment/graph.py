@@ -80,18 +80,11 @@ def bundle(description: type[T]) -> type[T]:
 class Parameter(NamedTuple):
     """A parameter of a stage, or a field of one that is a bundle.
 
-    Attributes
-    ----------
-    path : str or None
-        The dotted key of the experiment that it would be, if it is no result.
-    optional : bool
-        Whether it may be None: the stage does without.
-    default : bool
-        Whether it may be omitted.
-    marks : tuple
-        `Only`, `But`, `Guard`.
-    kinds : tuple of type
-        Sections that it may be, if it is one.
+    path: the dotted key of the experiment that it would be, if it is no result.
+    optional: whether it may be None: the stage does without.
+    default: whether it may be omitted.
+    marks: `Only`, `But`, `Guard`.
+    kinds (tuple of type): sections that it may be, if it is one.
     """
 
     name: str
@@ -132,33 +125,21 @@ class Stage:
     It neither reads nor writes the files of a run, nor draws. An experiment has it if it has all
     sections and results that its function cannot do without.
 
-    Attributes
-    ----------
-    name : str
-        Of its result.
-    compute : callable
-        Returns the result, see the module.
-    when : callable
-        ``when(experiment)``: a further condition for the experiment to have this stage.
-    preflight : bool
-        Computed before anything is written: cheap, and needed to foresee later failures.
-    check : callable, optional
-        Parameters as of ``compute``, results of `preflight` stages alone. Raises InputError for
+    name: of its result.
+    compute: returns the result, see the module.
+    when: ``when(experiment)``: a further condition for the experiment to have this stage.
+    preflight: computed before anything is written: cheap, and needed to foresee later failures.
+    check: parameters as of ``compute``, results of `preflight` stages alone. Raises InputError for
         faults that would otherwise appear after hours.
-    remarks : callable, optional
-        Parameters as of ``check``; returns warnings, a line each, of what is allowed and likely
-        wrong.
-    parts : callable, optional
-        Parameters are sections alone; names of the parts of a result that takes long. Then
+    remarks: parameters as of ``check``; returns warnings, a line each, of what is allowed and
+        likely wrong.
+    parts: parameters are sections alone; names of the parts of a result that takes long. Then
         ``compute`` also takes ``missing``, the names of those to be computed, and ``store``, the
         store of unfinished ones, and yields (name, part) one by one: each is saved as soon as it is
         complete. The result is a dictionary of all parts.
-    timing : str, optional
-        Step to which its duration is added.
-    on_demand : bool
-        Computed only where another stage lacks it.
-    figure_only : bool
-        Only the report needs it.
+    timing: step to which its duration is added.
+    on_demand: computed only where another stage lacks it.
+    figure_only: only the report needs it.
     """
 
     name: str
@@ -242,11 +223,8 @@ def _given(experiment: Experiment, parameter: Parameter) -> Any:
 def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
     """A stage's function with its sections from an experiment.
 
-    Parameters
-    ----------
-    **given
-        Its other parameters: results, and what a run provides; by default a silent log, and the
-        experiment's folder.
+    **given: its other parameters: results, and what a run provides; by default a silent log, and
+        the experiment's folder.
     """
     provided = {"log": Log(), "search_path": experiment.folder} | given
     for parameter in parameters(function):
@@ -269,11 +247,8 @@ def _bundled(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[st
 class Graph:
     """The stages, out of those of all experiments, that an experiment has, in their order.
 
-    Raises
-    ------
-    ValueError
-        Two stages of one name, a parameter that is nothing, stages that need each other, a stage
-        of the preflight that needs one that is not.
+    Raises ValueError: two stages of one name, a parameter that is nothing, stages that need each
+    other, a stage of the preflight that needs one that is not.
     """
 
     def __init__(self, stages: Sequence[Stage], experiment: Experiment):

@@ -22,12 +22,8 @@ def silent(text: str, fraction: float | None) -> None:
 class Log:
     """Lines, progress and warnings of a run.
 
-    Attributes
-    ----------
-    path : Path or None
-        File to which lines are appended, if there is one.
-    warnings : list of str
-        Those that matter for the results.
+    path: file to which lines are appended, if there is one.
+    warnings: those that matter for the results.
     """
 
     def __init__(self, notice: Notice = silent, path: Path | None = None):
@@ -35,13 +31,7 @@ class Log:
         self.warnings: list[str] = []
 
     def __call__(self, text: str) -> None:
-        """Show a line, and write it into the file.
-
-        Raises
-        ------
-        InputError
-            It cannot be written.
-        """
+        """Show a line, and write it into the file."""
         self._write(text)
         self.notice(text, None)
 

@@ -59,10 +59,7 @@ _SLIPS = (1e-3, 1e3, 1e-6, 1e6, 1e-9)
 def unusual(experiment: Description) -> Iterator[str]:
     """Keys that an experiment sets to a value outside `USUAL`, a line each, with the likely unit.
 
-    Parameters
-    ----------
-    experiment : Description
-        With the sections that the keys name; those that it lacks are passed over.
+    experiment: with the sections that the keys name; those that it lacks are passed over.
     """
     for key, unit, low, high, examples in USUAL:
         value = _set_value(experiment, key)

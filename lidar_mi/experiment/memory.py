@@ -60,12 +60,8 @@ class Footprint:
     def bytes(self, beams: int, in_states: int = 0) -> float:
         """Memory of the run.
 
-        Parameters
-        ----------
-        beams : int
-            Of the backscatter lidar in an image; 0: there is none.
-        in_states : int
-            Values of all states of moving air in a scan, see `values_of_states`.
+        beams: of the backscatter lidar in an image; 0: there is none.
+        in_states: values of all states of moving air in a scan, see `values_of_states`.
         """
         if not beams:
             return PROGRAM + self._rings()
@@ -75,13 +71,7 @@ class Footprint:
         return PROGRAM + PER_STATE * in_states + images + self._rings()
 
     def check_size(self, columns: int, rows: int) -> None:
-        """Refuse images that would take more memory than a run may, or more layers than files hold.
-
-        Raises
-        ------
-        InputError
-            With what it would take.
-        """
+        """Refuse images that take more memory than a run may, or more layers than files hold."""
         gates, each = self.scan.gate_count, self._layers_per_gate()
         # three layers do not belong to a gate: Y, with noise, and its error
         most = (MOST_LAYERS - 3) // each
@@ -98,13 +88,7 @@ class Footprint:
         )
 
     def check_states(self, beams: int, in_states: int) -> None:
-        """Refuse air in more states than a run may have in memory; parameters as of `bytes`.
-
-        Raises
-        ------
-        InputError
-            With what it would take.
-        """
+        """Refuse air in more states than a run may have in memory; parameters as of `bytes`."""
         check_memory(
             self.bytes(beams, in_states),
             self.render.memory,

@@ -29,15 +29,13 @@ from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
 from lidar_mi.schema.doppler import Doppler
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.reading import load_experiment
+from lidar_mi.variables import variable
 
 
 def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") -> Doppler:
     """The Doppler lidar of an experiment, which messages call ``name``.
 
-    Raises
-    ------
-    InputError
-        An experiment without one.
+    Raises InputError: an experiment without one.
     """
     experiment = instrument if isinstance(instrument, Experiment) else load_experiment(instrument)
     if experiment.fringes is None:
@@ -59,16 +57,10 @@ def read_electrons(
 ) -> np.ndarray:
     """All frames of some files as photoelectrons, (frames, height, width).
 
-    Parameters
-    ----------
-    counts : bool
-        Whether the files hold a digitiser's counts; electrons otherwise.
+    counts: whether the files hold a digitiser's counts; electrons otherwise.
 
-    Raises
-    ------
-    InputError
-        A file that is no image, frames of different sizes, a rendered image: its values are
-        relative energies, from which neither a pulse nor its noise follows.
+    Raises InputError: a file that is no image, frames of different sizes, a rendered image: its
+    values are relative energies, from which neither a pulse nor its noise follows.
     """
     frames: list[np.ndarray] = []
     for path in paths:
@@ -293,8 +285,8 @@ def retrieve_v_los(
             columns[3:, k] = float(fit.chi_square), float(fit.rings)
     return xr.Dataset(
         {
-            name: ("frame", values, {"units": units, "long_name": text})
-            for (name, units, text), values in zip(_VARIABLES, columns, strict=True)
+            name: variable("frame", values, *about)
+            for (name, *about), values in zip(_VARIABLES, columns, strict=True)
         }
         | {"status": ("frame", status, {"long_name": "why a frame has no speed"})},
         attrs={

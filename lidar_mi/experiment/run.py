@@ -93,24 +93,15 @@ def prepare(
 ) -> Run:
     """Run all checks that are possible before anything is rendered or written.
 
-    Parameters
-    ----------
-    experiment, beside, notice
-        As of `run`.
-    known : mapping, optional
-        Results of stages, by name, of an experiment that agrees in the keys that these depend on:
-        they are not computed again.
+    experiment, beside, notice: as of `run`.
+    known: results of stages, by name, of an experiment that agrees in the keys that these depend
+        on: they are not computed again.
 
     Returns
     -------
     Run
         On the device that the experiment asks for, with the truth and the other results of the
         preflight; `complete` runs the rest.
-
-    Raises
-    ------
-    InputError
-        Bad input.
     """
     if experiment.encounter is not None:
         raise InputError(
@@ -180,14 +171,9 @@ def complete(
 def finish(prepared: Run, store: Store | None = None, *, with_figures: bool = True) -> None:
     """Compute the stages that a prepared experiment lacks, and its metrics.
 
-    Parameters
-    ----------
-    prepared : Run
-        From `prepare`; complete afterwards.
-    store : Store, optional
-        Stores the results, and has those of an earlier run.
-    with_figures : bool
-        With what only the report needs.
+    prepared: from `prepare`; complete afterwards.
+    store: stores the results, and has those of an earlier run.
+    with_figures: with what only the report needs.
     """
     from lidar_mi.assessment.report.simulation import simulation_remark
     from lidar_mi.experiment.measure import measure

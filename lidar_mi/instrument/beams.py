@@ -16,16 +16,10 @@ class Beams:
     in the frame of the air, in which the gates are fixed: the telescope is at ``ScanPlan.position``
     at the scan's reference time, and the middle of the gates at ``position + centre``.
 
-    Attributes
-    ----------
-    time : (n,) array
-        s, from the scan's reference time, the middle of its duration.
-    origin, direction : (n, 3) arrays
-        True place of the telescope and true unit vectors.
-    reported_origin, reported_direction : (n, 3) arrays
-        The same, as the retrieval knows them.
-    velocity, reported_velocity : (n, 3) arrays, optional
-        Of the telescope less that of straight flight, m/s.
+    time (n,): s, from the scan's reference time, the middle of its duration.
+    origin, direction (n, 3): true place of the telescope and true unit vectors.
+    reported_origin, reported_direction (n, 3): the same, as the retrieval knows them.
+    velocity, reported_velocity (n, 3): of the telescope less that of straight flight, m/s.
     """
 
     time: np.ndarray
@@ -54,15 +48,11 @@ def _crossings(origin: np.ndarray, direction: np.ndarray, x: float) -> np.ndarra
 class Targets:
     """Where the beams of a scan are to go.
 
-    Attributes
-    ----------
-    time : (n,) array
-        s from the scan's reference time.
-    places : (n, 2) array
-        y and z in the plane at ``distance`` (m) from the telescope at the reference time. Steered
-        beams, as reported, go to these; beams fixed to the body go as if from a telescope at rest.
-    position : float
-        x of the telescope at the reference time, m, in the frame of the air.
+    time (n,): s from the scan's reference time.
+    places (n, 2): y and z in the plane at ``distance`` (m) from the telescope at the reference
+        time. Steered beams, as reported, go to these; beams fixed to the body go as if from a
+        telescope at rest.
+    position: x of the telescope at the reference time, m, in the frame of the air.
     """
 
     time: np.ndarray
@@ -83,19 +73,11 @@ def steered_beams(
 ) -> Beams:
     """The beams of a scanner that is steered by the reported pose, or fixed to the body.
 
-    Parameters
-    ----------
-    speed : float
-        Of straight flight in the frame of the air, m/s.
-    true, reported : Pose
-        Of the telescope at the times.
-    jitter : float
-        Rms of true directions on both axes, rad, by the generator ``random``.
+    speed: of straight flight in the frame of the air, m/s.
+    true, reported: of the telescope at the times.
+    jitter: rms of true directions on both axes, rad, by the generator ``random``.
 
-    Raises
-    ------
-    InputError
-        A pose that takes the telescope beyond the plane or turns beams away from it.
+    Raises InputError: a pose that takes the telescope beyond the plane or turns beams away from it.
     """
     time, position = targets.time, targets.position
     slab = position + targets.distance

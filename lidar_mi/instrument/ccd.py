@@ -184,27 +184,17 @@ def expose(
     subtracted, response and nonlinearity not corrected. Pixels are independent of each other:
     speckles are assumed to be smaller than a pixel.
 
-    Parameters
-    ----------
-    expected : tensor (height, width) or (N, height, width)
-        Mean photons of every pixel; noise is drawn on its device.
-    seed : int
-        Image k of a seed has its own stream of random numbers.
-    images : int or sequence of int, optional
-        Number of images, or the numbers k of the images; default: 1 or N.
-    modes : float or tensor
-        Degrees of freedom M of the speckle in a pixel, above 0; infinite: none.
-    background : float
-        Mean photons of incoherent light per pixel.
+    expected (tensor (height, width) or (N, height, width)): mean photons of every pixel; noise is
+        drawn on its device.
+    seed: image k of a seed has its own stream of random numbers.
+    images: number of images, or the numbers k of the images; default: 1 or N.
+    modes: degrees of freedom M of the speckle in a pixel, above 0; infinite: none.
+    background: mean photons of incoherent light per pixel.
 
     Returns
     -------
     torch.Tensor
         float32, (number of images, height, width).
-
-    Raises
-    ------
-    InputError
     """
     import torch
 

@@ -51,14 +51,9 @@ def noise_terms(
     noise multiplies the Poisson part by F, never the speckle's: the variance of a sum of N gains of
     mean 1 is <N> (F - 1) + var N.
 
-    Parameters
-    ----------
-    signal, background, dark : array
-        Mean photoelectrons of all pulses.
-    modes : array
-        Degrees of freedom of the signal's speckle, in all pulses; infinite: none.
-    pulses : int
-        Each is read out.
+    signal, background, dark: mean photoelectrons of all pulses.
+    modes: degrees of freedom of the signal's speckle, in all pulses; infinite: none.
+    pulses: each is read out.
     """
     factor = detector.excess_noise_factor
     return {
@@ -100,32 +95,21 @@ def detect(
     mean N and variance N (F - 1), and read-out noise is Gaussian. Known means of background and
     dark counts are subtracted, so the estimate is unbiased and may be negative.
 
-    Parameters
-    ----------
-    s0 : array
-        Received energy over emitted pulse energy, without noise.
-    duration : array
-        Time in which the gate is recorded, s.
-    distance : array
-        Range of the gate, m.
-    seed : int or sequence of int
-        Images with independent noise need different ones.
-    polarization : array
-        Degree of polarisation of the received light, 0 to 1.
-    pulses : int
-        Whose counts are added up, each with noise and speckle of its own.
+    s0: received energy over emitted pulse energy, without noise.
+    duration: time in which the gate is recorded, s.
+    distance: range of the gate, m.
+    seed: images with independent noise need different ones.
+    polarization: degree of polarisation of the received light, 0 to 1.
+    pulses: whose counts are added up, each with noise and speckle of its own.
+
+    Raises InputError: S0 negative or not finite, light beyond 10^15 photoelectrons, duration,
+    distance, polarisation or seed out of range.
 
     Returns
     -------
     Detection
         All of one shape. ``s0_std`` is the exact standard deviation of ``s0`` for this mean; from
         measured counts alone, `noise_variance` of the estimated signal is its estimate.
-
-    Raises
-    ------
-    InputError
-        S0 negative or not finite, light beyond 10^15 photoelectrons, duration, distance,
-        polarisation or seed out of range.
     """
     s0 = np.asarray(s0, float)
     _check("S0", s0, s0 >= 0, "finite values, 0 or more")
@@ -179,22 +163,13 @@ def noisy_scan(
     of gates, pixels and scans is independent (the air moves by more than a wavelength from scan
     to scan; between gates that holds for lines wider than 1 / gate duration).
 
-    Parameters
-    ----------
-    scan : xr.Dataset
-        As rendered or read from EXR.
-    seed : int or sequence of int
-        Different ones for the scans of a pair.
-    plan : ScanPlan, optional
-        Where the gates lie; by default as the scan states, in single precision where it was read
+    scan: as rendered or read from EXR.
+    seed: different ones for the scans of a pair.
+    plan: where the gates lie; by default as the scan states, in single precision where it was read
         from a file.
-    pulses : int
-        Averaged in every beam.
+    pulses: averaged in every beam.
 
-    Raises
-    ------
-    InputError
-        The scan does not state its gates; see `detect` for the rest.
+    Raises InputError: the scan does not state its gates; see `detect` for the rest.
     """
     plan = plan or _plan(scan)
     scan = scan.transpose("gate", "z", "y", ...)
@@ -246,10 +221,7 @@ def noise_budget(
     ``speckle_modes`` (not without speckle), and the relative standard deviation of S0 by cause,
     ``noise.shot``, ``.speckle``, ``.background``, ``.dark``, ``.readout``, and ``noise.all``.
 
-    Raises
-    ------
-    InputError
-        The scan does not state its gates, or is dark.
+    Raises InputError: the scan does not state its gates, or is dark.
     """
     plan = _plan(scan)
     scan = scan.transpose("gate", "z", "y", ...)

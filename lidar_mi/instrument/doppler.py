@@ -168,18 +168,11 @@ def solar_background(lidar: DopplerLidar, etalon: Etalon) -> float:
 def coherence_time(etalon: Etalon, line: Line, order: float = 0.0) -> float:
     """Coherence time of the light of a line in one place behind the etalon, s.
 
-    Parameters
-    ----------
-    line : lidar_mi.atmosphere.scattering.line.Line
-        Of air at rest, every Gaussian with a width.
-    order : float
-        Fractional order of the laser's light; 0 is the peak of a fringe, where the spectrum is
+    line: of air at rest, every Gaussian with a width.
+    order: fractional order of the laser's light; 0 is the peak of a fringe, where the spectrum is
         narrowest and the coherence time longest: light of other places has more modes.
 
-    Raises
-    ------
-    InputError
-        A line with a monochromatic part.
+    Raises InputError: a line with a monochromatic part.
     """
     return filtered_coherence_time(line, _behind_etalon(etalon, line, order))
 
@@ -190,17 +183,10 @@ def filtered_coherence_time(line: Line, transmission: Callable[[np.ndarray], np.
     int |g|^2 dt over all times, which by Parseval's theorem is int p^2 dnu, with p the spectrum
     behind the filter, of integral 1 (Goodman 1985, Statistical Optics, section 5.1).
 
-    Parameters
-    ----------
-    line : lidar_mi.atmosphere.scattering.line.Line
-        Of air at rest, every Gaussian with a width.
-    transmission : function
-        Of the frequency less that of the laser (array, Hz).
+    line: of air at rest, every Gaussian with a width.
+    transmission: of the frequency less that of the laser (array, Hz).
 
-    Raises
-    ------
-    InputError
-        A line with a monochromatic part.
+    Raises InputError: a line with a monochromatic part.
     """
     if not line.sigmas.all():
         raise InputError("line.sigmas: 0 Hz is not allowed; expected a line with a width")
@@ -240,12 +226,8 @@ def channel_modes(
     Polarised light is taken, the least that molecules leave; the polarisations of depolarised light
     would add modes.
 
-    Parameters
-    ----------
-    transmission : function
-        Of the channel, of the frequency less that of the laser (array, Hz).
-    channels : int
-        That the light is spread over: pixels of a camera, elements of a line detector.
+    transmission: of the channel, of the frequency less that of the laser (array, Hz).
+    channels: that the light is spread over: pixels of a camera, elements of a line detector.
     """
     # FWHM of the Gaussian line with that coherence time
     width = math.sqrt(2 * math.log(2) / math.pi) / filtered_coherence_time(line, transmission)

@@ -18,6 +18,7 @@ from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.motion import attitude, tilted
 from lidar_mi.instrument.scan import HalfAngle
 from lidar_mi.units import Angle, Speed, Within, quantity
+from lidar_mi.variables import variable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -123,10 +124,7 @@ def sight_volumes(
     exp(-2 alpha r) / r^2: the centroid of 10 m at 56 m is 0.3 m nearer than the middle. Points
     (lines, points, 3) are in m; weights (lines, points) have the sum 1 for every line.
 
-    Raises
-    ------
-    InputError
-        A bin that reaches the telescope.
+    Raises InputError: a bin that reaches the telescope.
     """
     directions, ranges = np.asarray(directions, float), np.asarray(ranges, float)
     bin_nodes, bin_weights = np.polynomial.legendre.leggauss(_BIN)
@@ -166,15 +164,9 @@ def sight_volumes(
 def wind_at(wind: "xr.Dataset", points: np.ndarray) -> np.ndarray:
     """Wind (..., 3) at points (..., 3), by linear interpolation.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        u, v, w (m s^-1) on (z, y), the same for all x, or on (x, y, z); coordinates ascending, m.
+    wind: u, v, w (m s^-1) on (z, y), the same for all x, or on (x, y, z); coordinates ascending, m.
 
-    Raises
-    ------
-    InputError
-        A component or a coordinate is missing, or the points leave the field.
+    Raises InputError: a component or a coordinate is missing, or the points leave the field.
     """
     for name in ("u", "v", "w"):
         if name not in wind:
@@ -206,13 +198,9 @@ def wind_of_lines(
 ) -> np.ndarray:
     """Wind (lines, points, 3) at points (lines, points, 3), each line at its own time.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        As for `wind_at`; or two states of it, dims (time, ...), linear in time between and beyond
+    wind: as for `wind_at`; or two states of it, dims (time, ...), linear in time between and beyond
         them.
-    times : (lines,) array, optional
-        s; 0 for all by default.
+    times (lines,): s; 0 for all by default.
     """
     if "time" not in wind.dims:
         return wind_at(wind, points)
@@ -239,23 +227,17 @@ def scan_wind(
     platform's own, plus normal noise. Photons arrive evenly from all of the volume: extinction and
     backscatter coefficient are homogeneous in it.
 
-    Parameters
-    ----------
-    wind : xr.Dataset or callable
-        As for `wind_of_lines`, in the lidar's frame; or u, v, w (..., 3) in m/s of points (..., 3)
-        in m.
-    v_los_std : float or (lines,) array
-        Standard error of a measured velocity, m/s: what the fringe chain gives for as many pulses
-        as a line has.
-    seed : int
-        Of noise and jitter.
-    speed : float
-        Of the platform along x, as measured on board, m/s.
-    errors : PlatformErrors
-        Errors of the assumed attitude, pointing and speed; by default none.
-    beams : Beams
-        Time and pose of every line, true and reported, from the telescope's place at the reference
-        time; `errors` come on top of them. None: all at once and from there.
+    wind: as for `wind_of_lines`, in the lidar's frame; or u, v, w (..., 3) in m/s of points (...,
+        3) in m.
+    v_los_std (float or (lines,) array): standard error of a measured velocity, m/s: what the fringe
+        chain gives for as many pulses as a line has.
+    seed: of noise and jitter.
+    speed: of the platform along x, as measured on board, m/s.
+    errors: errors of the assumed attitude, pointing and speed; by default none.
+    beams: time and pose of every line, true and reported, from the telescope's place at the
+        reference time; `errors` come on top of them. None: all at once and from there.
+
+    Raises InputError: a field that does not contain the scan; a negative standard error.
 
     Returns
     -------
@@ -263,11 +245,6 @@ def scan_wind(
         `direction` and `range` (m; where the lines are taken to go), `range_bin` (m),
         `v_los`, `v_los_std` and `v_los_true` (m s-1; without noise), `platform_velocity` (m s-1).
         With beams these are as reported, line by line, with `time` (s) and `origin` (m).
-
-    Raises
-    ------
-    InputError
-        A field that does not contain the scan; a negative standard error.
     """
     import xarray as xr
 
@@ -296,12 +273,12 @@ def scan_wind(
     noise = np.random.default_rng(int(noise_seed)).standard_normal(len(true))
     measurement = xr.Dataset(
         {
-            "v_los": _variable("line", true + std * noise, "m s-1", _LOS),
-            "v_los_std": _variable("line", std, "m s-1", "standard error of v_los"),
-            "v_los_true": _variable("line", true, "m s-1", _LOS + ", without noise"),
-            "range": _variable("line", ranges, "m", "distance of the middle of the range bin"),
-            "range_bin": ((), lidar.range_bin, {"units": "m", "long_name": "length of range bin"}),
-            "platform_velocity": _variable(
+            "v_los": variable("line", true + std * noise, "m s-1", _LOS),
+            "v_los_std": variable("line", std, "m s-1", "standard error of v_los"),
+            "v_los_true": variable("line", true, "m s-1", _LOS + ", without noise"),
+            "range": variable("line", ranges, "m", "distance of the middle of the range bin"),
+            "range_bin": variable((), lidar.range_bin, "m", "length of range bin"),
+            "platform_velocity": variable(
                 "axis" if beams is None else ("line", "axis"),
                 reported,
                 "m s-1",
@@ -309,7 +286,7 @@ def scan_wind(
             ),
         },
         coords={
-            "direction": _variable(("line", "axis"), directions, "1", "unit vector"),
+            "direction": variable(("line", "axis"), directions, "1", "unit vector"),
             "axis": ("axis", ["x", "y", "z"]),
         },
         attrs={"Conventions": "CF-1.11", "title": "Line-of-sight velocities", "seed": seed},
@@ -317,20 +294,14 @@ def scan_wind(
     if beams is None:
         return measurement
     return measurement.assign(
-        time=_variable("line", beams.time, "s", "time from the reference time of the scan"),
-        origin=_variable(
+        time=variable("line", beams.time, "s", "time from the reference time of the scan"),
+        origin=variable(
             ("line", "axis"), beams.reported_origin, "m", "place of the telescope, as reported"
         ),
     )
 
 
 _LOS = "velocity toward the instrument along the line of sight"
-
-
-def _variable(
-    dims: str | tuple[str, ...], values: np.ndarray, units: str, long_name: str
-) -> tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]:
-    return dims, values, {"units": units, "long_name": long_name}
 
 
 def _spread(half: float, count: int) -> np.ndarray:

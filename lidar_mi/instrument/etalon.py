@@ -138,11 +138,6 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
     At the angles of a ring image (10 mrad) coatings of quarter waves reflect the same to 2e-5 and
     shift the orders by 2e-5 more, equivalent to 0.03 m/s there (others up to 0.1 m/s), the same in
     every image; `coated_transmission` has it all.
-
-    Raises
-    ------
-    InputError
-        A coating that does not transmit.
     """
     if etalon.coatings is None:
         reflectivity = etalon.reflectivity
@@ -170,14 +165,9 @@ def fractional_order(
 ) -> np.ndarray:
     """Order less the integer part of the order at the centre.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser.
-    cosine : array
-        Of the angle inside the gap.
-    offset : array
-        Frequency less that of the laser, Hz.
+    wavelength: m, in vacuum, of the laser.
+    cosine: of the angle inside the gap.
+    offset: frequency less that of the laser, Hz.
     """
     gap = 2 * etalon.index * etalon.tuned_gap(wavelength) / wavelength
     centre = etalon.order_at_centre(wavelength)
@@ -203,14 +193,9 @@ def harmonics(
     A_n = T^2 / (1 - R^2) R^n of the mirrors, times `plate_defects`, times the line's Fourier
     transform.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser.
-    line : lidar_mi.atmosphere.scattering.line.Line, optional
-        Default: monochromatic light.
-    count : int, optional
-        Highest harmonic; default: beyond it all others together are below 1e-12 of A_0.
+    wavelength: m, in vacuum, of the laser.
+    line: default: monochromatic light.
+    count: highest harmonic; default: beyond it all others together are below 1e-12 of A_0.
     """
     reflectance, transmittance, _ = mirrors(etalon, wavelength)
     if count is None:
@@ -251,14 +236,9 @@ def transmission(
 ) -> np.ndarray:
     """Transmission of the etalon with its plate defects, mean of both polarisations.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser.
-    cosine, offset : array
-        Of the angle inside the gap; frequency less that of the laser, Hz.
-    line : lidar_mi.atmosphere.scattering.line.Line, optional
-        Average over this line, shifted by ``offset``; default: monochromatic light.
+    wavelength: m, in vacuum, of the laser.
+    cosine, offset: of the angle inside the gap; frequency less that of the laser, Hz.
+    line: average over this line, shifted by ``offset``; default: monochromatic light.
     """
     order = fractional_order(etalon, wavelength, cosine, offset)
     return series(harmonics(etalon, wavelength, line), order)
@@ -267,10 +247,7 @@ def transmission(
 def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> float:
     """Free spectral range over the full width of a fringe at half its height above zero.
 
-    Raises
-    ------
-    InputError
-        Fringes so broad that they nowhere fall to half their height.
+    Raises InputError: fringes so broad that they nowhere fall to half their height.
     """
     amplitudes = harmonics(etalon, wavelength, line)
 
@@ -295,13 +272,9 @@ def coated_transmission(
     It has the dispersion of the coatings and their dependence on angle and polarisation, which the
     series neglects.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser, for which the gap is tuned.
-    cosine, offset : array
-        Of the angle inside the gap; frequency less that of the laser, Hz.
-    polarization : {"s", "p"}
+    wavelength: m, in vacuum, of the laser, for which the gap is tuned.
+    cosine, offset: of the angle inside the gap; frequency less that of the laser, Hz.
+    polarization {"s", "p"}
     """
     r, t = _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization)
     round_trip = _round_trip(etalon, wavelength, cosine, offset)

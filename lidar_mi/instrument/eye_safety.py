@@ -21,16 +21,11 @@ Rule = Literal["single pulse", "average", "repeated pulses"]
 class PulseLimit:
     """Permissible exposure of the cornea to one pulse of a train.
 
-    Attributes
-    ----------
-    exposure : float
-        J m^-2, of every pulse.
-    rule : "single pulse", "average" or "repeated pulses"
-        The one of the standard's three rules that decides.
-    pulses : float
-        Number of pulses in the time of exposure.
-    aperture : float
-        Diameter of the circle over which exposure is averaged, m.
+    exposure: J m^-2, of every pulse.
+    rule ("single pulse", "average" or "repeated pulses"): the one of the standard's three rules
+        that decides.
+    pulses: number of pulses in the time of exposure.
+    aperture: diameter of the circle over which exposure is averaged, m.
     """
 
     exposure: float
@@ -60,16 +55,10 @@ class ViewingAid:
 class PulsedBeam:
     """A pulsed Gaussian beam where it leaves the instrument.
 
-    Attributes
-    ----------
-    wavelength : float
-        m.
-    pulse_energy : float
-        J.
-    pulse_duration : float
-        s.
-    beam_radius, divergence_full : float
-        As of `exposure_at`.
+    wavelength: m.
+    pulse_energy: J.
+    pulse_duration: s.
+    beam_radius, divergence_full: as of `exposure_at`.
     """
 
     wavelength: float
@@ -83,15 +72,11 @@ class PulsedBeam:
 class EyeSafety:
     """A pulsed beam's verdict.
 
-    Attributes
-    ----------
-    exposure_at_exit : float
-        J m^-2 a pulse where the beam leaves the instrument; safe from there on if not above
-        ``limit.exposure``.
-    hazard_distance : float
-        Nominal ocular hazard distance, m; 0 if the beam is safe at its exit, inf if it never is.
-    aided_hazard_distance : float
-        The same for a person with binoculars, m.
+    exposure_at_exit: J m^-2 a pulse where the beam leaves the instrument; safe from there on if not
+        above ``limit.exposure``.
+    hazard_distance: nominal ocular hazard distance, m; 0 if the beam is safe at its exit, inf if it
+        never is.
+    aided_hazard_distance: the same for a person with binoculars, m.
     """
 
     limit: PulseLimit
@@ -103,17 +88,8 @@ class EyeSafety:
 def permissible_exposure(wavelength: float, duration: float) -> float:
     """Maximum permissible exposure (MPE) of the cornea, J m^-2, by light that lasts ``duration``.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, 180 nm to 1 mm.
-    duration : float
-        s, 1e-13 to 3e4. For a steady beam: the duration of exposure.
-
-    Raises
-    ------
-    InputError
-        Outside these limits.
+    wavelength: m, 180 nm to 1 mm.
+    duration: s, 1e-13 to 3e4. For a steady beam: the duration of exposure.
 
     Notes
     -----
@@ -144,22 +120,16 @@ def permissible_pulse(
     is 1 for pulses longer than T_i (5 us; 13 us from 1050 nm) and in exposures up to 0.25 s. Pulses
     within T_i of each other count as one.
 
-    Parameters
-    ----------
-    wavelength, pulse_duration : float
-        m, s.
-    repetition_rate : float
-        Pulses per second *that enter the same eye*, Hz; of a scan, those of one direction and of
-        neighbours that overlap with it. 0: a single pulse. Of bursts the mean of all time.
-    exposure_duration : float
-        s, see `time_base`.
-    burst : (pulses, rate)
-        Pulses that follow each other at a rate (Hz) above the mean, as those of one beam do.
+    wavelength, pulse_duration: m, s.
+    repetition_rate: pulses per second *that enter the same eye*, Hz; of a scan, those of one
+        direction and of neighbours that overlap with it. 0: a single pulse. Of bursts the mean of
+        all time.
+    exposure_duration: s, see `time_base`.
+    burst (pulses, rate): pulses that follow each other at a rate (Hz) above the mean, as those of
+        one beam do.
 
-    Raises
-    ------
-    InputError
-        A wavelength or time out of the standard's limits, a negative rate, pulses that overlap.
+    Raises InputError: a wavelength or time out of the standard's limits, a negative rate, pulses
+    that overlap.
     """
     single = permissible_exposure(wavelength, pulse_duration)
     total = _duration("exposure_duration", exposure_duration)
@@ -217,23 +187,15 @@ def exposure_at(
 ) -> float:
     """Radiant exposure on the axis of a Gaussian beam, averaged over an aperture, J m^-2.
 
-    Parameters
-    ----------
-    distance : float
-        m, from where the beam leaves.
-    energy : float
-        J, of a pulse.
-    beam_radius, divergence_full : float
-        1/e^2 radius at the exit, m, and full angle, rad. The squares of both add up, as in a waist
-        at the exit. A beam cut at c has an axis brighter by 1 / (1 - exp(-2 c^2 / beam_radius^2)):
-        give the radius of the Gaussian with its variance (`BackscatterLidar.radius_at` (0)), which
-        is brighter still.
-    aperture : float
-        Diameter, m, see `limiting_aperture`.
-    extinction : float
-        Of the air, m^-1.
-    aid : ViewingAid, optional
-        Gathers the light of its objective, or of ``aperture`` times its magnification if that is
+    distance: m, from where the beam leaves.
+    energy: J, of a pulse.
+    beam_radius, divergence_full: 1/e^2 radius at the exit, m, and full angle, rad. The squares of
+        both add up, as in a waist at the exit. A beam cut at c has an axis brighter by 1 / (1 -
+        exp(-2 c^2 / beam_radius^2)): give the radius of the Gaussian with its variance
+        (`BackscatterLidar.radius_at` (0)), which is brighter still.
+    aperture: diameter, m, see `limiting_aperture`.
+    extinction: of the air, m^-1.
+    aid: gathers the light of its objective, or of ``aperture`` times its magnification if that is
         less, into ``aperture``.
     """
     aid = aid or ViewingAid(1.0, aperture)
@@ -302,19 +264,11 @@ def scan_hazard_distance(
     distance r receives the light of n pulses in every scan, n = (pi w^2 / 2) / (spacing r)^2 for
     the 1/e^2 radius w, between 1 and ``beams``, each taken as strong as the one that points at it.
 
-    Parameters
-    ----------
-    scan_rate : float
-        Scans per second, Hz.
-    exposure_duration : float
-        s.
-    burst : (pulses, rate)
-        Pulses of each beam in a scan, and their rate while they are sent, Hz.
+    scan_rate: scans per second, Hz.
+    exposure_duration: s.
+    burst (pulses, rate): pulses of each beam in a scan, and their rate while they are sent, Hz.
 
-    Raises
-    ------
-    InputError
-        As `permissible_pulse`; a spacing or number of beams that is not positive.
+    Raises InputError: as `permissible_pulse`; a spacing or number of beams that is not positive.
 
     Notes
     -----

@@ -117,10 +117,7 @@ class FringeCamera(Description):
         with e_x and e_y its axes, and the ideal image in f P / P_z. Areas grow by
         (e_x x e_y)_z (f / P_z)^3.
 
-        Parameters
-        ----------
-        shift : (float, float)
-            x, y; pixels from the middle of each pixel.
+        shift: x, y; pixels from the middle of each pixel.
 
         Returns
         -------
@@ -190,30 +187,20 @@ def fringe_values(
     The width of the line is that at the centre of the rings: too large by 1 - cos(theta), 1e-4 in
     the corners. Its shift is exact.
 
-    Parameters
-    ----------
-    line : lidar_mi.atmosphere.scattering.line.Line
-        Of air at rest; it is shifted here.
-    v_los : float or array (N,)
-        Speed along the line of sight, m/s; positive when the air approaches.
-    photons : float
-        Photons of an image.
-    counted : {"detected", "before_etalon"}
-        Place of the count: ``photons`` is the sum over the image, or the sum without an etalon,
-        whose mean transmission is then the ratio of the image to it.
-    subsamples : {1, 2}
-        Points per pixel in its average, along each axis. With 1 the rings are sampled in the middle
-        of the pixels, which makes the contrast up to 0.3 % too large in the corners of the default
-        camera.
+    line: of air at rest; it is shifted here.
+    v_los (N,): speed along the line of sight, m/s; positive when the air approaches.
+    photons: photons of an image.
+    counted {"detected", "before_etalon"}: place of the count: ``photons`` is the sum over the
+        image, or the sum without an etalon, whose mean transmission is then the ratio of the image
+        to it.
+    subsamples {1, 2}: points per pixel in its average, along each axis. With 1 the rings are
+        sampled in the middle of the pixels, which makes the contrast up to 0.3 % too large in the
+        corners of the default camera.
 
     Returns
     -------
     np.ndarray
         float64, (height, width), or (N, height, width) for an array of speeds.
-
-    Raises
-    ------
-    InputError
     """
     speeds = np.asarray(v_los, float)
     _check("v_los", speeds, abs(speeds) < 1e5, "finite speeds below 1e5 m/s")
@@ -228,12 +215,8 @@ def fringe_values(
 def doppler_shift(v_los: ArrayLike, wavelength: float) -> np.ndarray:
     """Frequency shift 2 v_LOS / wavelength of backscattered light, Hz.
 
-    Parameters
-    ----------
-    v_los : array
-        Speed along the line of sight, m/s; positive when the scatterer approaches.
-    wavelength : float
-        m, in vacuum.
+    v_los: speed along the line of sight, m/s; positive when the scatterer approaches.
+    wavelength: m, in vacuum.
     """
     return 2 * np.asarray(v_los, float) / wavelength
 

@@ -22,10 +22,6 @@ def fused_silica_index(wavelength: float) -> float:
     """Refractive index of fused silica at 20 C (Malitson 1965, J. Opt. Soc. Am. 55, 1205).
 
     The wavelength (m) is 0.21 to 3.71 um.
-
-    Raises
-    ------
-    InputError
     """
     if not 0.21e-6 <= wavelength <= 3.71e-6:
         raise InputError(f"wavelength: {wavelength:g} m is not allowed; expected 0.21 to 3.71 um")
@@ -38,16 +34,10 @@ def fused_silica_index(wavelength: float) -> float:
 def singlet(focal_length: float, wavelength: float, stop_radius: float, field: float) -> np.ndarray:
     """An aspheric singlet without spherical aberration, coma and distortion.
 
-    Parameters
-    ----------
-    focal_length : float
-        m.
-    wavelength : float
-        m.
-    stop_radius : float
-        Of the light, m; at most 0.1 focal lengths.
-    field : float
-        Half angle of the corrected image, rad; at most 0.05.
+    focal_length: m.
+    wavelength: m.
+    stop_radius: of the light, m; at most 0.1 focal lengths.
+    field: half angle of the corrected image, rad; at most 0.05.
 
     Returns
     -------
@@ -60,11 +50,6 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
     For 300 mm, 5 mm and the corners of the default camera (15 mrad) the middle of the light stays
     within 0.002 pixels of f tan(theta); its rms width grows with the square of the angle to 0.16
     pixels (0.14 radially, 0.07 across) in the corners. The width is proportional to the stop.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
     """
     for name, value, most in (
         ("focal_length", focal_length, np.inf),
@@ -115,12 +100,9 @@ def trace(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions on the CCD of light through points of the stop, by Snell's law at every surface.
 
-    Parameters
-    ----------
-    lens : array (N, 4)
-        As `singlet` returns it.
-    across, along : array
-        Positions on the stop; the light arrives at ``angle`` (rad) in the plane of the first.
+    lens (N, 4): as `singlet` returns it.
+    across, along: positions on the stop; the light arrives at ``angle`` (rad) in the plane of the
+        first.
 
     Returns
     -------

@@ -107,16 +107,10 @@ class Pose:
 class Trajectory:
     """A flight, as a file has it: linear between its times, attitudes along great circles.
 
-    Attributes
-    ----------
-    time : (n,) array
-        s since the first scan, ascending.
-    place : (n, 3) array
-        m in the lidar's frame; the first scan is made near 0.
-    attitude : Rotation
-        Of n.
-    source : str
-        Its file, for messages.
+    time (n,): s since the first scan, ascending.
+    place (n, 3): m in the lidar's frame; the first scan is made near 0.
+    attitude: of n.
+    source: its file, for messages.
     """
 
     time: np.ndarray
@@ -127,10 +121,7 @@ class Trajectory:
     def at(self, time: np.ndarray, speed: float) -> Pose:
         """Departure from straight flight at a speed (m/s) along x.
 
-        Raises
-        ------
-        InputError
-            Times outside of the trajectory.
+        Raises InputError: times outside of the trajectory.
         """
         first, last = self.time[0], self.time[-1]
         # rounding of times in a file
@@ -220,13 +211,7 @@ def random_process(
 def true_pose(
     motion: Motion, time: np.ndarray, speed: float, seed: int, path: Trajectory | None = None
 ) -> Pose:
-    """The true pose at times (s) since the first scan, at a speed (m/s) or along a path.
-
-    Raises
-    ------
-    InputError
-        See `Trajectory.at`.
-    """
+    """The true pose at times (s) since the first scan, at a speed (m/s) or along a path."""
     time = np.asarray(time, float)
     recorded = path.at(time, speed) if path else None
     offset = {axis: np.zeros(len(time)) for axis in (*PLACES, *ANGLES)}

@@ -29,13 +29,9 @@ def depolarization_stderr(
 ) -> np.ndarray:
     """Standard error of `linear_depolarization` by linear error propagation.
 
-    Parameters
-    ----------
-    s0_stderr, s1_stderr : array
-        Standard errors of S0 and S1.
-    correlation : array
-        Correlation coefficient of the estimates of S0 and S1. It is near +-1, as both come from
-        the same samples; with 0 the error would be many times too large.
+    s0_stderr, s1_stderr: standard errors of S0 and S1.
+    correlation: correlation coefficient of the estimates of S0 and S1. It is near +-1, as both come
+        from the same samples; with 0 the error would be many times too large.
     """
     s0, s1 = np.asarray(s0, float), np.asarray(s1, float)
     first, second = s1 * np.asarray(s0_stderr), s0 * np.asarray(s1_stderr)
@@ -64,10 +60,7 @@ def depolarization_stderr_bound(
     depolarisation. In single scattering, where all samples of a beam are nearly equal, the error is
     orders of magnitude smaller.
 
-    Parameters
-    ----------
-    samples : int
-        Number n of independent samples of a pixel and gate.
+    samples: number n of independent samples of a pixel and gate.
     """
     s0 = np.asarray(s0, float)
     ratio = linear_depolarization(s0, s1)
@@ -82,10 +75,8 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
     scan has them; from ``S0_stderr`` alone it is `depolarization_stderr_bound`, an upper bound.
     See the attribute ``stderr_is_bound`` of ``depolarization_stderr``.
 
-    Raises
-    ------
-    InputError
-        The scan was rendered without polarisation, or its light was not emitted along e_h.
+    Raises InputError: the scan was rendered without polarisation, or its light was not emitted
+    along e_h.
     """
     if not _emitted_along_e_h(scan):
         raise InputError(
@@ -137,14 +128,9 @@ def multiple_scattering_fraction(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fraction of the received light that was scattered more than once, and its standard error.
 
-    Parameters
-    ----------
-    single, multiple : array
-        S0 of scattering order one, and of all orders above it together.
-    single_stderr, multiple_stderr : array
-        Their standard errors.
-    correlation : array
-        Correlation coefficient of the two estimates; 0 when the orders were sampled
+    single, multiple: S0 of scattering order one, and of all orders above it together.
+    single_stderr, multiple_stderr: their standard errors.
+    correlation: correlation coefficient of the two estimates; 0 when the orders were sampled
         independently, -1 for an upper bound of the error.
 
     Returns
@@ -173,10 +159,7 @@ def multiple_scattering_image(scan: xr.Dataset) -> xr.Dataset:
     not contribute less to another (attribute ``stderr_is_bound``). Where few samples contribute all
     of the multiple scattering, S0_stderr itself is too small for most pixels, and so is the bound.
 
-    Raises
-    ------
-    InputError
-        The scan has no orders above one.
+    Raises InputError: the scan has no orders above one.
     """
     orders = sorted(str(name) for name in scan.data_vars if _ORDER.fullmatch(str(name)))
     if len(orders) < 2 or "order1.S0" not in orders:

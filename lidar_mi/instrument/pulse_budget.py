@@ -12,19 +12,12 @@ from lidar_mi.errors import InputError
 class PulseBudget:
     """Pulses, power and photons of a scan.
 
-    Attributes
-    ----------
-    pulses_per_second : float
-        Of all directions together, while they are sent, Hz.
-    average_power : float
-        Emitted light, W.
-    echo_time : float
-        From a pulse's emission to its echo's arrival from the farthest range, s.
-    beams : int
-        Directions that must be measured simultaneously, as a receiver handles one echo at a time:
-        1 if pulses can follow each other.
-    photons_per_direction : float
-        Received from one range bin, of all pulses of a direction in one slab.
+    pulses_per_second: of all directions together, while they are sent, Hz.
+    average_power: emitted light, W.
+    echo_time: from a pulse's emission to its echo's arrival from the farthest range, s.
+    beams: directions that must be measured simultaneously, as a receiver handles one echo at a
+        time: 1 if pulses can follow each other.
+    photons_per_direction: received from one range bin, of all pulses of a direction in one slab.
     """
 
     pulses_per_second: float
@@ -45,28 +38,15 @@ def pulse_budget(
 ) -> PulseBudget:
     """Pulses, power and beams for a scan.
 
-    Parameters
-    ----------
-    directions : int
-        Of one slab.
-    slabs_per_second : float
-        Hz.
-    pulses_per_direction : int
-        Averaged in one direction of one slab, see `pulses_for_error`.
-    pulse_energy : float
-        J.
-    farthest : float
-        End of the farthest range bin, m.
-    photons_per_pulse : float
-        Received from one range bin, see `lidar_mi.instrument.doppler.photons`; NaN: not known.
-    sending : float
-        Time in which the pulses of a slab are sent, without turns of the scanner, s. Default: all
-        the time until the next slab.
-
-    Raises
-    ------
-    InputError
-        A number that is not positive.
+    directions: of one slab.
+    slabs_per_second: Hz.
+    pulses_per_direction: averaged in one direction of one slab, see `pulses_for_error`.
+    pulse_energy: J.
+    farthest: end of the farthest range bin, m.
+    photons_per_pulse: received from one range bin, see `lidar_mi.instrument.doppler.photons`; NaN:
+        not known.
+    sending: time in which the pulses of a slab are sent, without turns of the scanner, s. Default:
+        all the time until the next slab.
     """
     for name, value in (
         ("directions", directions),
@@ -96,11 +76,6 @@ def pulses_for_error(error_of_one: float, required: float) -> int:
     """Pulses to average for a standard error, if those of single pulses are independent.
 
     (error of one / required)^2, rounded up: a bias does not average out.
-
-    Raises
-    ------
-    InputError
-        A standard error that is not positive.
     """
     for name, value in (("error_of_one", error_of_one), ("required", required)):
         if not (value > 0 and math.isfinite(value)):

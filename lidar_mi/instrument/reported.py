@@ -85,18 +85,11 @@ def reported_pose(
 ) -> Pose:
     """The pose that is reported at times since the first scan.
 
-    Parameters
-    ----------
-    pose_at : callable
-        The true pose at times, (n,), s.
-    time : (n,) array
-        s.
-    speed : float
-        Of straight flight, m/s.
-    seed : int
-        Of the experiment.
-    scan : int
-        Number of the scan, which has a random error of its own unless noise has a bandwidth.
+    pose_at: the true pose at times, (n,), s.
+    time (n,): s.
+    speed: of straight flight, m/s.
+    seed: of the experiment.
+    scan: number of the scan, which has a random error of its own unless noise has a bandwidth.
     """
     late = pose_at(time - reported.latency)
     error = {}

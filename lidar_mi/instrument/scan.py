@@ -100,21 +100,15 @@ class Scan(Description):
 class ScanPlan:
     """One scan, ready to be rendered. All lengths in m, in the lidar's frame.
 
-    Attributes
-    ----------
-    y, z : (columns,), (rows,) arrays
-        Where the beams hit the plane in the middle of the gates, ascending.
-    gate_start, gate_stop : float
-        The gates together: distances along x (planar) or ranges (spherical).
-    gate_kind : "planar" or "spherical"
-    position : float
-        Distance of the telescope along x from the first scan, in the frame of the air, in which the
-        gates are fixed.
-    beams : Beams, optional
-        Time and pose of every beam. None: all at once, from one place, to the nodes (y, z).
-    aside : (float, float)
-        y and z of the telescope where there are no `beams`: of a scan about another direction than
-        straight ahead, whose nodes are about its own middle.
+    y, z (columns,), (rows,) arrays: where the beams hit the plane in the middle of the gates,
+        ascending.
+    gate_start, gate_stop: the gates together: distances along x (planar) or ranges (spherical).
+    gate_kind ("planar" or "spherical")
+    position: distance of the telescope along x from the first scan, in the frame of the air, in
+        which the gates are fixed.
+    beams: time and pose of every beam. None: all at once, from one place, to the nodes (y, z).
+    aside: y and z of the telescope where there are no `beams`: of a scan about another direction
+        than straight ahead, whose nodes are about its own middle.
     """
 
     y: np.ndarray
@@ -179,18 +173,11 @@ def plan_scans(
 ) -> list[ScanPlan]:
     """The scans of one slab of air from a moving telescope.
 
-    Parameters
-    ----------
-    y, z : arrays
-        Nodes of the wake's grid (used with ``aim: grid``), m, ascending.
-    travelled : sequence of float
-        Distance of the telescope along x at each scan, m, in the frame of the air. The gates are
-        fixed in that frame, so they are nearer by as much. Negative: the air moves away.
+    y, z: nodes of the wake's grid (used with ``aim: grid``), m, ascending.
+    travelled: distance of the telescope along x at each scan, m, in the frame of the air. The gates
+        are fixed in that frame, so they are nearer by as much. Negative: the air moves away.
 
-    Raises
-    ------
-    InputError
-        The telescope would reach the slab, or a distance is not finite.
+    Raises InputError: the telescope would reach the slab, or a distance is not finite.
     """
     plans = []
     for index, position in enumerate(travelled):

@@ -28,14 +28,10 @@ _Cycles = Annotated[int, Within(-1000000, 1000000, "one beam a cycle in the larg
 class Directions:
     """A scanner's own table of directions.
 
-    Attributes
-    ----------
-    time : (n,) array
-        s, ascending, from any zero.
-    azimuth, elevation : (n,) arrays
-        rad, positive to port and upwards; the direction is (1, tan azimuth, tan elevation).
-    source : str
-        Its file, for messages.
+    time (n,): s, ascending, from any zero.
+    azimuth, elevation (n,): rad, positive to port and upwards; the direction is (1, tan azimuth,
+        tan elevation).
+    source: its file, for messages.
     """
 
     time: np.ndarray
@@ -55,16 +51,10 @@ class Load(NamedTuple):
 class Schedule:
     """Beams of a scan in film order.
 
-    Attributes
-    ----------
-    time : (n,) array
-        Middle of each beam's dwell, s, from the middle of the scan.
-    places : (n, 2) array
-        y and z where it nominally crosses the plane at the scan's distance, m.
-    duration : float
-        s, from the begin of the first beam to the end of the last.
-    beam_rate : float
-        Beams a second between turns, Hz; infinite if all are sent at once.
+    time (n,): middle of each beam's dwell, s, from the middle of the scan.
+    places (n, 2): y and z where it nominally crosses the plane at the scan's distance, m.
+    duration: s, from the begin of the first beam to the end of the last.
+    beam_rate: beams a second between turns, Hz; infinite if all are sent at once.
     """
 
     time: np.ndarray
@@ -181,22 +171,14 @@ class ScanTiming(Description):
     ) -> Schedule:
         """Times and places of all beams of one scan.
 
-        Parameters
-        ----------
-        y, z : (columns,), (rows,) arrays
-            Nodes of the image in the plane at ``distance``, m, ascending.
-        distance : float
-            m.
-        by_angle : bool
-            Whether a curve is even in angles rather than in places.
-        table : Directions
-            With pattern ``table``.
+        y, z (columns,), (rows,) arrays: nodes of the image in the plane at ``distance``, m,
+            ascending.
+        distance: m.
+        by_angle: whether a curve is even in angles rather than in places.
+        table: with pattern ``table``.
 
-        Raises
-        ------
-        InputError
-            Turns longer than the duration, a table of another number of beams, a scanner beyond
-            its limits: then with the smallest duration that is within them.
+        Raises InputError: turns longer than the duration, a table of another number of beams, a
+        scanner beyond its limits: then with the smallest duration that is within them.
         """
         if self.pattern in _ROWS:
             schedule = self._rows(y, z, distance)

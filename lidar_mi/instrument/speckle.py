@@ -73,19 +73,11 @@ def speckle_modes(
     times comes from a wider spot, so M is a lower bound there. ``detector.speckle_modes`` replaces
     all of it; without ``detector.speckle`` M is infinite.
 
-    Parameters
-    ----------
-    duration : array
-        Time in which the gate is recorded, s.
-    distance : array
-        Range of the gate, m.
-    polarization : array
-        Degree of polarisation of the received light, 0 to 1.
+    duration: time in which the gate is recorded, s.
+    distance: range of the gate, m.
+    polarization: degree of polarisation of the received light, 0 to 1.
 
-    Raises
-    ------
-    InputError
-        The line is narrower than a pulse of ``lidar.pulse_duration`` can have.
+    Raises InputError: the line is narrower than a pulse of ``lidar.pulse_duration`` can have.
     """
     if not detector.speckle:
         return np.inf

@@ -18,14 +18,9 @@ class Layers:
     in single scattering; below 1 it stands for scattered light that stays in the field of view
     (Platt 1981, J. Atmos. Sci. 38, 156).
 
-    Parameters
-    ----------
-    nodes : (nodes,) array
-        x of the extinction's values, equally spaced, m.
-    edges : (gates + 1,) array
-        Ranges of the gates along a beam, m.
-    cosines : (beams,) array
-        Between the beams and x.
+    nodes (nodes,): x of the extinction's values, equally spaced, m.
+    edges (gates + 1,): ranges of the gates along a beam, m.
+    cosines (beams,): between the beams and x.
     """
 
     def __init__(self, nodes: np.ndarray, edges: np.ndarray, cosines: np.ndarray) -> None:

@@ -18,16 +18,11 @@ LEAST_WALK = 1e-6
 class Known:
     """What is known in addition to the counts.
 
-    Attributes
-    ----------
-    background : float
-        Mean counts of a gate without signal.
-    calibration_error : float
-        Relative standard error of the counts per signal, common to all gates.
-    reference : (nodes,) array
-        Weights, of sum 1, of the logarithms whose mean is known.
-    reference_log, reference_error : float
-        That mean and its standard error; an infinite error: it is not known.
+    background: mean counts of a gate without signal.
+    calibration_error: relative standard error of the counts per signal, common to all gates.
+    reference (nodes,): weights, of sum 1, of the logarithms whose mean is known.
+    reference_log, reference_error: that mean and its standard error; an infinite error: it is not
+        known.
     """
 
     background: float
@@ -40,16 +35,10 @@ class Known:
 class Fit(NamedTuple):
     """A profile and how well it is known.
 
-    Attributes
-    ----------
-    extinction : (nodes,) array
-        m^-1.
-    covariance : (nodes, nodes) array
-        Of its logarithms.
-    walk_step : float
-        Standard deviation of the prior's step.
-    monte_carlo_fraction : float
-        Variance of the renderer over that of the counts, mean of the gates.
+    extinction (nodes,): m^-1.
+    covariance (nodes, nodes): of its logarithms.
+    walk_step: standard deviation of the prior's step.
+    monte_carlo_fraction: variance of the renderer over that of the counts, mean of the gates.
     """
 
     extinction: np.ndarray

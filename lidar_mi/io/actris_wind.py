@@ -8,10 +8,7 @@ _NAMES = {"u": ("uwind", "zonal wind"), "v": ("vwind", "meridional wind")}
 def in_actris_layout(winds: xr.Dataset) -> xr.Dataset:
     """Winds under the names of doppy (github.com/actris-cloudnet/doppy).
 
-    Parameters
-    ----------
-    winds : xr.Dataset
-        As of `fit_winds_to_lines`.
+    winds: as of `fit_winds_to_lines`.
 
     Returns
     -------

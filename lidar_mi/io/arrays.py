@@ -22,10 +22,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
     """The contents of a file by `write_arrays`, exactly; checksums within the file are checked.
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read or is damaged.
+    Raises InputError: a file that cannot be read or is damaged.
     """
     try:
         with np.load(path, allow_pickle=False) as file:

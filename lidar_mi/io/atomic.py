@@ -25,18 +25,11 @@ def write_atomically(
     function returns, the file survives a loss of power. Temporary files of killed processes in the
     same folder are removed.
 
-    Parameters
-    ----------
-    path : str or Path
-    content : bytes
-        Of the whole file.
-    first : callable, optional
-        Called when the content is on the disk, before the file is renamed.
+    content: of the whole file.
+    first: called when the content is on the disk, before the file is renamed.
 
-    Raises
-    ------
-    InputError
-        The file cannot be written there, or the path is not that of an ordinary file.
+    Raises InputError: the file cannot be written there, or the path is not that of an ordinary
+    file.
     """
     path = Path(path)
     try:

@@ -17,11 +17,6 @@ def write_csv(path: str | Path, data: xr.Dataset) -> None:
     are repeated in every row. ``y_vector`` and ``z_vector`` are there only where they differ from
     ``y`` and ``z``. After a column of flags, ``flag in words`` has the reasons,
     or ``valid``. Missing numbers are ``NaN``.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     rows = data.expand_dims("row") if not data.dims else data
     table = rows.to_dataframe(dim_order=[str(dim) for dim in rows.dims]).reset_index()

@@ -99,10 +99,7 @@ def write_fringes(path: str | Path, image: "xr.Dataset") -> None:
 def read_fringes(path: str | Path) -> "xr.Dataset":
     """Read an image written by `write_fringes`; the round trip is exact in float32.
 
-    Raises
-    ------
-    InputError
-        Not an EXR file, or one without our layers.
+    Raises InputError: not an EXR file, or one without our layers.
     """
     header, layers = read_layers(path)
     if not {*QUANTITIES, "Y"} <= set(layers):
@@ -162,10 +159,7 @@ def read_header(path: str | Path) -> dict[str, Any]:
 def read_layers(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header attributes and all layers of any EXR file, rows from the top.
 
-    Raises
-    ------
-    InputError
-        There is no such file, or it is no readable EXR.
+    Raises InputError: there is no such file, or it is no readable EXR.
     """
     return _read(path)
 
@@ -212,10 +206,7 @@ def _layers(parts: Sequence[Any]) -> dict[str, np.ndarray]:
 def axis_of(header: dict[str, Any], name: str, size: int, path: str | Path) -> np.ndarray:
     """A header's axis of an image, ascending, m.
 
-    Raises
-    ------
-    InputError
-        Not as many finite, ascending numbers as the image has pixels.
+    Raises InputError: not as many finite, ascending numbers as the image has pixels.
     """
     try:
         values = np.asarray(header[name], float)

@@ -13,10 +13,8 @@ _BYTES = {0: 4, 1: 2, 2: 4}
 def declared(path: Path) -> tuple[int, int]:
     """Bytes of all pixels of all parts, and the number of parts.
 
-    Raises
-    ------
-    ValueError
-        Not the header of an OpenEXR image of flat, fully sampled channels; with the reason.
+    Raises ValueError: not the header of an OpenEXR image of flat, fully sampled channels; with the
+    reason.
     """
     with path.open("rb") as file:
         content = file.read(min(_LONGEST, path.stat().st_size))

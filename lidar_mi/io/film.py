@@ -35,10 +35,7 @@ def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) ->
 
     Each is shown for so many seconds; GIF knows hundredths.
 
-    Raises
-    ------
-    InputError
-        No frames, frames of several sizes, or as of `write_atomically`.
+    Raises InputError: no frames, frames of several sizes, or as of `write_atomically`.
     """
     from PIL import Image
 
@@ -69,17 +66,10 @@ def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) ->
 def as_mp4(frames: Sequence[np.ndarray], seconds: float) -> bytes | None:
     """Frames as an MP4 file (H.264), which browsers and presentations play; None without PyAV.
 
-    Parameters
-    ----------
-    frames : sequence of ndarray, shape (height, width, 3)
-        8 bit, of one size, with even numbers of rows and columns.
-    seconds : float
-        For which each is shown.
+    frames (height, width, 3): 8 bit, of one size, with even numbers of rows and columns.
+    seconds: for which each is shown.
 
-    Raises
-    ------
-    InputError
-        No frames, frames of several sizes or of odd ones.
+    Raises InputError: no frames, frames of several sizes or of odd ones.
     """
     shapes = {frame.shape for frame in frames}
     if len(shapes) != 1 or any(n % 2 for shape in shapes for n in shape[:2]):

@@ -17,11 +17,6 @@ def write_flo(path: str | Path, wind: xr.Dataset, pixel: tuple[float, float]) ->
     Standard errors, places, times and the reasons of flags are lost. Vectors that are flagged or
     missing are unknown, 1e10. ``displacement_y`` and ``displacement_z`` are in m, as are the pixels
     along z and y.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     # y is to the left and z up, both ascend
     down, right = (

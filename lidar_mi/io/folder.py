@@ -23,13 +23,7 @@ def is_free(folder: str | Path) -> bool:
 
 
 def make_folder(folder: str | Path) -> None:
-    """Create a folder and its parents, where they are missing.
-
-    Raises
-    ------
-    InputError
-        It cannot be created.
-    """
+    """Create a folder and its parents, where they are missing."""
     folder = Path(folder)
     try:
         if not folder.is_dir():
@@ -50,10 +44,8 @@ def locked(folder: str | Path) -> Iterator[None]:
     process ends in any way. The file is removed at the end; one left by a killed process has no
     effect.
 
-    Raises
-    ------
-    InputError
-        Another process or thread has locked the folder; or no file can be locked in it.
+    Raises InputError: another process or thread has locked the folder; or no file can be locked in
+    it.
     """
     path = Path(folder) / _LOCK
     try:

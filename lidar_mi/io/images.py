@@ -28,20 +28,13 @@ def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = 
     averaged in float64, unweighted: where red, green and blue are equal, the value is theirs.
     Transparency is ignored. A FITS image is read as stored, first row first.
 
-    Parameters
-    ----------
-    layer : str, optional
-        Of an EXR file; the name of an array in an npz, mat or HDF5 file, of a part of a FITS file.
-        Default: of EXR Y_noisy (what a detector delivered), else Y, or the mean of R, G and B; of
-        any file the only one.
-    frame : int, optional
-        Number of the image, from 0; needed where the file has several.
+    layer: of an EXR file; the name of an array in an npz, mat or HDF5 file, of a part of a FITS
+        file. Default: of EXR Y_noisy (what a detector delivered), else Y, or the mean of R, G and
+        B; of any file the only one.
+    frame: number of the image, from 0; needed where the file has several.
 
-    Raises
-    ------
-    InputError
-        No such file, one that cannot be read, or no such layer or frame; several frames, and none
-        named; values that float64 does not hold exactly.
+    Raises InputError: no such file, one that cannot be read, or no such layer or frame; several
+    frames, and none named; values that float64 does not hold exactly.
     """
     path = Path(path)
     frames = _frames(path, layer)
@@ -61,17 +54,10 @@ def read_frames(
     The pages of a TIFF file, the planes of a FITS cube or of an array; one for other files. Colours
     as of `read_pixels`.
 
-    Parameters
-    ----------
-    layer : str, optional
-        As of `read_pixels`.
-    numbers : sequence of int, optional
-        Which images, from 0. Default: all, which must not be channels of one moment.
+    layer: as of `read_pixels`.
+    numbers: which images, from 0. Default: all, which must not be channels of one moment.
 
-    Raises
-    ------
-    InputError
-        As `read_pixels`; pages of different size, channels.
+    Raises InputError: as `read_pixels`; pages of different size, channels.
     """
     path = Path(path)
     frames = _frames(path, layer)
@@ -86,13 +72,7 @@ def read_frames(
 
 
 def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
-    """How many images a file has, and whether they are channels of one moment.
-
-    Raises
-    ------
-    InputError
-        As `read_pixels`.
-    """
+    """How many images a file has, and whether they are channels of one moment."""
     if kind_of(Path(path)) in _SINGLE_IMAGE:
         return 1, False
     frames = _frames(Path(path), layer)
@@ -155,10 +135,7 @@ def default_layer(path: str | Path) -> str | None:
     What a detector delivered, ``Y_noisy``, comes before ``Y``, which is free of its noise; of any
     other file it is the only layer.
 
-    Raises
-    ------
-    InputError
-        One that cannot be read, or several layers of which one has to be named.
+    Raises InputError: one that cannot be read, or several layers of which one has to be named.
     """
     if not _is_exr(path):
         return None
@@ -323,11 +300,6 @@ def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | N
         `beam_time` (s) and, where the pixels are beams that miss the nodes, `y_reported` and
         `z_reported` (m). The attribute `frozen_air` is 1 if all beams saw the air of the scan's
         reference time, as simulated ones may. None if the file does not state times.
-
-    Raises
-    ------
-    InputError
-        As `read_image`.
     """
     if not _is_exr(path):
         return None
@@ -340,13 +312,7 @@ def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | N
 
 
 def as_webp(path: str | Path) -> bytes:
-    """An image file in colours as lossless WebP, two thirds of its PNG.
-
-    Raises
-    ------
-    InputError
-        No readable image.
-    """
+    """An image file in colours as lossless WebP, two thirds of its PNG."""
     from PIL import Image
 
     content = BytesIO()
@@ -372,11 +338,6 @@ def panel_cuts(path: str | Path) -> list[float]:
 
     A figure of n equal columns has white gaps of its full height near k / n; the smallest n up to 4
     is taken. Empty: one column, or an element that spans several.
-
-    Raises
-    ------
-    InputError
-        No readable image.
     """
     from PIL import Image
 

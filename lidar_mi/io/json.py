@@ -11,16 +11,9 @@ from lidar_mi.io.text import read_text, write_text
 def read_json(path: str | Path, expected: str) -> Any:
     """Content of a JSON file.
 
-    Parameters
-    ----------
-    path : str or Path
-    expected : str
-        Kind of file expected, for the message: "a file of vortex pairs".
+    expected: kind of file expected, for the message: "a file of vortex pairs".
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read or is not JSON.
+    Raises InputError: a file that cannot be read or is not JSON.
     """
     text = read_text(path, expected)
     try:

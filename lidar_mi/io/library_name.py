@@ -13,10 +13,7 @@ def library_name(path: str | Path) -> Iterator[str]:
     The absolute name of the file, as libraries interpret a leading ``~`` or ``-``; if it is not
     UTF-8, that of an open descriptor.
 
-    Raises
-    ------
-    OSError
-        A file whose name is not UTF-8 cannot be opened.
+    Raises OSError: a file whose name is not UTF-8 cannot be opened.
     """
     name = os.path.abspath(path)
     if is_text(name):

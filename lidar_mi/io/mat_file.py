@@ -17,11 +17,6 @@ def write_mat(path: str | Path, data: xr.Dataset) -> None:
     The structures ``units``, ``long_name`` and ``dims`` (names of the dimensions, in their order)
     have a field for each variable, ``flag_meanings`` one for each variable of flags: the reason
     that bit 1, 2, ... stands for. A dot in a name becomes an underscore.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     about: dict[str, dict[str, Any]] = {"units": {}, "long_name": {}, "dims": {}}
     values: dict[str, Any] = {}

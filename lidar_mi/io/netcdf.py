@@ -53,11 +53,8 @@ def open_netcdf(path: str | Path, group: str | None = None) -> xr.Dataset:
     without ``_FillValue``, what the library writes into cells that were never written. The limits
     ``valid_min``, ``valid_max`` and ``valid_range`` hold in `load_variable`.
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read, is no NetCDF, or NetCDF of a kind that is not read; is damaged,
-        or declares axes or chunks that are out of proportion to it.
+    Raises InputError: a file that cannot be read, is no NetCDF, or NetCDF of a kind that is not
+    read; is damaged, or declares axes or chunks that are out of proportion to it.
     """
     with warnings.catch_warnings():
         # several values may stand for missing ones
@@ -230,11 +227,8 @@ def read_netcdf(path: str | Path) -> xr.Dataset:
 def load_variable(variable: xr.DataArray, path: str | Path) -> xr.DataArray:
     """A variable of an open file, its values in memory, NaN where they are not valid.
 
-    Raises
-    ------
-    InputError
-        The file is damaged at the values, declares more than it can hold, or has limits of valid
-        values that are no numbers.
+    Raises InputError: the file is damaged at the values, declares more than it can hold, or has
+    limits of valid values that are no numbers.
     """
     check_size(path, variable.nbytes, str(variable.name))
     try:
@@ -252,10 +246,7 @@ def valid_range(variable: xr.DataArray, path: str | Path) -> tuple[float, float]
     Limits of packed data are packed, too (CF 8.1); those of a wider floating-point type than the
     packed data are of the unpacked (NetCDF Users Guide, attribute conventions).
 
-    Raises
-    ------
-    InputError
-        Limits that are no numbers.
+    Raises InputError: limits that are no numbers.
     """
     limits = [-np.inf, np.inf]
     for name, ends in (("valid_min", [0]), ("valid_max", [1]), ("valid_range", [0, 1])):
@@ -296,11 +287,6 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     """Write a data set as compressed NetCDF-4, whole or not at all.
 
     The file is composed in memory, as HDF5 crashes if the disk is full.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     import dask
 

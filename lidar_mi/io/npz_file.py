@@ -15,11 +15,6 @@ def write_npz(path: str | Path, data: xr.Dataset) -> None:
     """Write all variables under their names, which ``numpy.load`` reads without pickles.
 
     The text ``about`` is JSON: for each variable its ``dims``, ``units`` and ``long_name``.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     values: dict[str, Any] = {}
     about: dict[str, Any] = {}

@@ -20,10 +20,7 @@ def write_openfast(path: str | Path, lines: xr.Dataset) -> None:
     for air that approaches: the wind along the horizontal direction of the beam, as if there were
     none across it. Gates with a flag are NaN.
 
-    Raises
-    ------
-    InputError
-        Lines of several directions, or upwards; as of `write_text`.
+    Raises InputError: lines of several directions, or upwards; as of `write_text`.
     """
     angles = [np.unwrap(np.deg2rad(lines[name].values)) for name in ("azimuth", "elevation")]
     if max(float(np.ptp(angle)) for angle in angles) > 1e-3:

@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 def write_png(figure: "Figure", path: str | Path, *, cropped: bool = False) -> None:
     """Write a figure, 110 dots per inch, whole or not at all.
 
-    Parameters
-    ----------
-    path : str or Path
-    cropped : bool
-        Without the space around the panels except 0.1 inch, which is large with equal scales.
+    cropped: without the space around the panels except 0.1 inch, which is large with equal scales.
     """
     room: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.1} if cropped else {}
     write_atomically(path, _png(figure, dpi=110, **room))

@@ -56,10 +56,7 @@ def write_table(table: ScatteringTable, path: str | Path) -> None:
 def read_table(path: str | Path) -> ScatteringTable:
     """Read a table written by `write_table`.
 
-    Raises
-    ------
-    InputError
-        No such file, a missing or wrong header line, or a matrix that fails `check`.
+    Raises InputError: no such file, a missing or wrong header line, or a matrix that fails `check`.
     """
     text = read_text(path, "a scattering-matrix table")
     rows = [line for line in text.splitlines() if line.partition("#")[0].strip()]
@@ -116,10 +113,8 @@ def aerosol_table(
 ) -> ScatteringTable:
     """The table of one of `AEROSOLS` at a wavelength (m): the shipped one, or one of `make_table`.
 
-    Raises
-    ------
-    InputError
-        As `make_table`; ``scatrs`` is needed only where no table ships (all do at 532 nm).
+    Raises InputError: as `make_table`; ``scatrs`` is needed only where no table ships (all do at
+    532 nm).
     """
     file = f"aerosol_{aerosol(name).name}_{wavelength * 1e9:.0f}nm.txt"
     shipped = Path(str(files("lidar_mi.scenes") / file))

@@ -20,17 +20,10 @@ def check_size(path: str | Path, size: int, what: str = "it") -> None:
 
     A few hundred bytes can declare an array of gigabytes, all of it zero or missing.
 
-    Parameters
-    ----------
-    size : int
-        Bytes, unpacked.
-    what : str
-        Part of the file that has this size, for the message.
+    size: bytes, unpacked.
+    what: part of the file that has this size, for the message.
 
-    Raises
-    ------
-    InputError
-        More than 256 MiB and more than 200 times the file.
+    Raises InputError: more than 256 MiB and more than 200 times the file.
     """
     if not fits(path, size):
         stored = Path(path).stat().st_size

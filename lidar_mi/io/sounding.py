@@ -27,11 +27,8 @@ def read_sounding(path: str | Path) -> Sounding:
     columns, such as humidity, are ignored: water vapour changes the scattering of air by less than
     1 %.
 
-    Raises
-    ------
-    InputError
-        As of `read_timed_table`; a column that is missing, a pressure or temperature that is not
-        above 0.
+    Raises InputError: as of `read_timed_table`; a column that is missing, a pressure or temperature
+    that is not above 0.
     """
     table = read_timed_table(path, _UNITS, axis="altitude")
     missing = [name for name in _UNITS if name not in table]

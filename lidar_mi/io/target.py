@@ -23,20 +23,13 @@ def check_target(
 ) -> None:
     """Refuse an output path that must not be written, before any work is done.
 
-    Parameters
-    ----------
-    inputs : iterable of path
-        Input files, which are never replaced, under any name.
-    overwrite : bool
-        Replace a file that does not say that lidar-mi wrote it, as tables (.csv) do not.
-    suffixes : sequence of str
-        Of the formats that the command writes; none: whatever the name, the format is one.
+    inputs: input files, which are never replaced, under any name.
+    overwrite: replace a file that does not say that lidar-mi wrote it, as tables (.csv) do not.
+    suffixes: of the formats that the command writes; none: whatever the name, the format is one.
 
-    Raises
-    ------
-    InputError
-        There is no such folder; the path is that of an input or of no ordinary file; or it is a
-        foreign file, and ``overwrite`` is not set; or no format of the command has its suffix.
+    Raises InputError: there is no such folder; the path is that of an input or of no ordinary file;
+    or it is a foreign file, and ``overwrite`` is not set; or no format of the command has its
+    suffix.
     """
     path = Path(path)
     if not path.parent.is_dir():

@@ -18,18 +18,10 @@ LONGEST = 64 << 20
 def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
     """Text of a file, UTF-8, without the mark that some editors set before it.
 
-    Parameters
-    ----------
-    path : str or Path
-    expected : str
-        Kind of file expected, for the message: "an experiment file".
-    longest : int
-        Bytes; longer files are not read, nor devices and pipes, which have no end.
+    expected: kind of file expected, for the message: "an experiment file".
+    longest: bytes; longer files are not read, nor devices and pipes, which have no end.
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read, is too long or is not text.
+    Raises InputError: a file that cannot be read, is too long or is not text.
     """
     path = Path(path)
     try:
@@ -72,13 +64,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def append_line(path: str | Path, line: str) -> None:
-    """Append a line to a text file, which is created if it is missing.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
+    """Append a line to a text file, which is created if it is missing."""
     try:
         with open(path, "ab") as file:
             file.write(encoded(f"{line}\n"))

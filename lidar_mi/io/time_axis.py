@@ -25,10 +25,7 @@ def count_unit(text: str, where: str) -> str:
     The date and the calendar do not matter to a count of seconds, minutes, hours or days, which all
     calendars have of one length. ``where`` names file and variable, for the message.
 
-    Raises
-    ------
-    InputError
-        Months or years, whose length depends on the date.
+    Raises InputError: months or years, whose length depends on the date.
     """
     match = _SINCE.fullmatch(str(text))
     unit = match[1] if match else str(text).strip()
@@ -71,19 +68,11 @@ def _shortest(time: float, tolerance: float) -> str:
 def state_at(time: float, times: np.ndarray, rounding: np.ndarray, where: str) -> int:
     """Index of the state of a time.
 
-    Parameters
-    ----------
-    time : float
-        s.
-    times, rounding : (n,) arrays
-        Of the states, and to which they are rounded in the file, s.
-    where : str
-        File, for the message.
+    time: s.
+    times, rounding (n,): of the states, and to which they are rounded in the file, s.
+    where: file, for the message.
 
-    Raises
-    ------
-    InputError
-        No state, or more than one, has this time.
+    Raises InputError: no state, or more than one, has this time.
     """
     tolerance = tolerances(times, rounding)
     fits = np.flatnonzero(np.abs(times - time) <= tolerance)

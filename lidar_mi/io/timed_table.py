@@ -31,25 +31,19 @@ def read_timed_table(
     are comments; a NetCDF file has variables of one dimension with the attribute ``units``. Without
     a unit, times and lengths are SI; angles and pressures must have one.
 
-    Parameters
-    ----------
-    path : path
-        NetCDF by its suffix (.nc, .nc4, .cdf), else CSV.
-    units : mapping of str to str
-        Names of columns and their SI units. Those of the file that are not asked for are ignored.
-    axis : str
-        The column that increases: the time, or one of ``units``.
+    path: NetCDF by its suffix (.nc, .nc4, .cdf), else CSV.
+    units: names of columns and their SI units. Those of the file that are not asked for are
+        ignored.
+    axis: the column that increases: the time, or one of ``units``.
+
+    Raises InputError: a file that cannot be read, no axis, none of the columns, fewer than two
+    rows, a unit that does not convert, a value that is no finite number, an axis that does not
+    increase.
 
     Returns
     -------
     dict of str to (n,) array
         The axis and what of the columns there is.
-
-    Raises
-    ------
-    InputError
-        A file that cannot be read, no axis, none of the columns, fewer than two rows, a unit that
-        does not convert, a value that is no finite number, an axis that does not increase.
     """
     path = Path(path)
     expected = {TIME: "s", **units} if axis == TIME else dict(units)

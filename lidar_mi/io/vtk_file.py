@@ -38,18 +38,11 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
     there is no u. Numbers without dimensions are repeated at every point of a list, and omitted
     on grids. Units are part of an array's name: ``v [m s-1]``.
 
-    Parameters
-    ----------
-    path : str or Path
-        With the suffix that `suffix` gives: XML. Or ``.vtk``, the legacy format, of uniform axes.
-    data : xr.Dataset
-        With the coordinates x, y, z in m, each a number, an axis, or a value of every node; one
+    path: with the suffix that `suffix` gives: XML. Or ``.vtk``, the legacy format, of uniform axes.
+    data: with the coordinates x, y, z in m, each a number, an axis, or a value of every node; one
         dimension of another name: points.
 
-    Raises
-    ------
-    InputError
-        As of `write_atomically`; uneven axes in the legacy format.
+    Raises InputError: as of `write_atomically`; uneven axes in the legacy format.
     """
     kind, shape = suffix(data), data[[*AXES]].sizes
     dims = tuple(map(str, shape)) if kind in (".vts", ".vtu") else AXES

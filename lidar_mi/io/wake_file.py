@@ -130,13 +130,7 @@ def _times(data: xr.Dataset, name: str, path: Path) -> tuple[np.ndarray, np.ndar
 
 
 def wake_times(path: str | Path, names: Mapping[str, str] | None = None) -> np.ndarray:
-    """Times (s) of the states of a file that `read_wake` reads; none: it has no time.
-
-    Raises
-    ------
-    InputError
-        As of `read_wake`.
-    """
+    """Times (s) of the states of a file that `read_wake` reads; none: it has no time."""
     path = Path(path)
     name = _file_names(names, path)[0]["time"]
     with open_netcdf(path) as data:
@@ -261,22 +255,19 @@ def read_wake(
     nodes (the ground). Stretched axes and staggered variables are interpolated to even nodes, see
     `lidar_mi.atmosphere.regrid`; the attribute ``interpolated`` then states with which error.
 
-    Parameters
-    ----------
-    path : str or Path
-        NetCDF-4 or NetCDF-3 classic.
-    time : float, optional
-        s; the file must hold it to 1e-3 of the step to the next state and to 1 ms. May be omitted
+    path: NetCDF-4 or NetCDF-3 classic.
+    time: s; the file must hold it to 1e-3 of the step to the next state and to 1 ms. May be omitted
         where there is one time only. In "seconds since ..." axes the count is meant.
-    names : mapping, optional
-        Our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:
+    names: our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:
         {"v": "V_wind", "y": "lateral"}. A variable named here must exist. A minus sign before the
-        file's name changes the sign, of a file whose y points to starboard for instance:
-        {"y": "-y", "v": "-V"}.
-    x : float, optional
-        m; keeps the one plane nearest to it. Default: all planes.
-    require : iterable of str
-        Variables that must be present in addition to v and w: u, tracer, aerosol.
+        file's name changes the sign, of a file whose y points to starboard for instance: {"y":
+        "-y", "v": "-V"}.
+    x: m; keeps the one plane nearest to it. Default: all planes.
+    require: variables that must be present in addition to v and w: u, tracer, aerosol.
+
+    Raises InputError: naming file and variable: unreadable, missing, wrong dims or units, values
+    that are not finite, a tracer or aerosol that is asked for and negative somewhere, axes that are
+    not monotonic, a time or plane that is not there.
 
     Returns
     -------
@@ -284,13 +275,6 @@ def read_wake(
         float64 on dims (x, y, z), ascending, metres: u, v, w in m s^-1, the tracer in the file's
         unit, aerosol dimensionless, as far as the file has them. Scalar coordinate `time` in s if
         known.
-
-    Raises
-    ------
-    InputError
-        Naming file and variable: unreadable, missing, wrong dims or units, values that are not
-        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not
-        monotonic, a time or plane that is not there.
     """
     path = Path(path)
     table, opposite = _file_names(names, path)

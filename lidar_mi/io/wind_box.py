@@ -25,15 +25,12 @@ def read_bts(path: str | Path) -> xr.Dataset:
     A grid of the field at the time t is the plane x = -U t, with U the mean wind at the hub
     (Jonkman, TurbSim user's guide v2.00, annex D). Points of the tower below the grid are omitted.
 
+    Raises InputError: not in this format, cut short, or without mean wind.
+
     Returns
     -------
     xarray.Dataset
         u, v, w (m/s) on (x, y, z), m, ascending; z above the ground. The mean wind is in u.
-
-    Raises
-    ------
-    InputError
-        Not in this format, cut short, or without mean wind.
     """
     path = Path(path)
     data = _content(path)
@@ -71,26 +68,17 @@ def read_mann(
     The axes are those of the generator (Mann, Prob. Eng. Mech. 13, 1998): right-handed, x along the
     wind and ascending, z up. HAWC2 itself turns y and z to the right and down.
 
-    Parameters
-    ----------
-    path : str or Path
-        File of u; its name ends with u before the suffix, those of v and w with v and w.
-    shape : (int, int, int)
-        Nodes along x, y and z.
-    spacing : (float, float, float)
-        m.
-    base : float
-        Height of the lowest nodes above the ground, m.
+    path: file of u; its name ends with u before the suffix, those of v and w with v and w.
+    shape: nodes along x, y and z.
+    spacing: m.
+    base: height of the lowest nodes above the ground, m.
+
+    Raises InputError: a file is missing, or its size is not that of the shape.
 
     Returns
     -------
     xarray.Dataset
         u, v, w (m/s) on (x, y, z), m; without mean wind.
-
-    Raises
-    ------
-    InputError
-        A file is missing, or its size is not that of the shape.
     """
     components = []
     for component in mann_files(path):
@@ -108,10 +96,7 @@ def read_mann(
 def mann_files(path: str | Path) -> list[Path]:
     """The files of u, v and w of a Mann box, by that of u.
 
-    Raises
-    ------
-    InputError
-        Its name does not end with u.
+    Raises InputError: its name does not end with u.
     """
     path = Path(path)
     if not path.stem.endswith("u"):

@@ -20,24 +20,14 @@ SUFFIXES = (*SERIES, ".vtk", ".vti", ".flo")
 def write_wind(path: str | Path, wind: xr.Dataset, pixel: tuple[float, float]) -> str:
     """Write a wind as NetCDF, CSV, MATLAB, VTK (legacy or XML) or Middlebury flow, by the suffix.
 
-    Parameters
-    ----------
-    path : str or Path
-        With one of `SUFFIXES`.
-    wind : xr.Dataset
-        As of `retrieve_wind`; with one of `SERIES` also as of `retrieve_winds`.
-    pixel : (float, float)
-        Size of the images' pixels along z and y, m.
+    path: with one of `SUFFIXES`.
+    wind: as of `retrieve_wind`; with one of `SERIES` also as of `retrieve_winds`.
+    pixel: size of the images' pixels along z and y, m.
 
     Returns
     -------
     str
         What the format loses; empty: nothing.
-
-    Raises
-    ------
-    InputError
-        As of `write_atomically`.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".nc":

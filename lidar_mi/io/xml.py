@@ -15,10 +15,7 @@ def check_scene_file(path: str | Path) -> None:
 
     Included files are checked, too.
 
-    Raises
-    ------
-    InputError
-        No XML, or tags nested deeper than `DEEPEST`.
+    Raises InputError: no XML, or tags nested deeper than `DEEPEST`.
     """
     pending, checked = [Path(path)], set()
     while pending:

@@ -85,16 +85,10 @@ def _fault(problem: str, mark: yaml.Mark) -> yaml.constructor.ConstructorError:
 def parse_yaml(text: str, origin: str) -> Any:
     """Content of YAML text: dict, list, str, number, bool, date or None.
 
-    Parameters
-    ----------
-    origin : str
-        Where it comes from, for the message: a path.
+    origin: where it comes from, for the message: a path.
 
-    Raises
-    ------
-    InputError
-        Not YAML, larger or deeper than allowed, a value that is not of its type, or a key that is
-        there twice; with the line.
+    Raises InputError: not YAML, larger or deeper than allowed, a value that is not of its type, or
+    a key that is there twice; with the line.
     """
     if len(text) > LONGEST:
         raise InputError(f"{origin}: {len(text)} characters; expected at most {LONGEST}")

@@ -33,18 +33,11 @@ def extrude(
     the gate's planes and the outermost nodes. The plane is extended by that much (the outermost
     values repeated), so that the whole gate is filled with it.
 
-    Parameters
-    ----------
-    plane : (z, y) or (time, z, y) array
-    plan : ScanPlan
-        The scan from farthest away.
-    scans : sequence of ScanPlan
-        All scans that have beams of their own: these may be more oblique, or miss the plane.
+    plane (z, y) or (time, z, y) array
+    plan: the scan from farthest away.
+    scans: all scans that have beams of their own: these may be more oblique, or miss the plane.
 
-    Raises
-    ------
-    InputError
-        Beams so wide that the extended plane would not fit into the memory.
+    Raises InputError: beams so wide that the extended plane would not fit into the memory.
     """
     radius = beam_reach(lidar, plan.gate_stop)
     slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre
@@ -102,20 +95,15 @@ def render_scans(
 ) -> Iterator[xr.Dataset]:
     """Render one scan after the other in one scene; only the first compiles anything.
 
-    Parameters
-    ----------
-    extinctions : sequence of (x, y, z) arrays
-        Extinction coefficient (m^-1) at cell centres, x from the telescope's place at the first
-        scan, all on one grid; a single x plane has its depth in ``x.attrs["cell_width"]``. With a
-        first dimension ``time`` (s, equally spaced, from the scan's reference time) every beam
-        meets the air of its own time, linear between these states.
-    air : ScatteringAir
-        Around the slab and up to it; its molecules are part of all ``extinctions``.
-    seed : int
-        Scan k uses `RenderSettings.scan_seed`: seed + k * 2^16, well separated for neighbouring
+    extinctions (sequence of (x, y, z) arrays): extinction coefficient (m^-1) at cell centres, x
+        from the telescope's place at the first scan, all on one grid; a single x plane has its
+        depth in ``x.attrs["cell_width"]``. With a first dimension ``time`` (s, equally spaced, from
+        the scan's reference time) every beam meets the air of its own time, linear between these
+        states.
+    air: around the slab and up to it; its molecules are part of all ``extinctions``.
+    seed: scan k uses `RenderSettings.scan_seed`: seed + k * 2^16, well separated for neighbouring
         experiments, or with common random numbers the same seed.
-    series : Series
-        Which of the scans to render.
+    series: which of the scans to render.
 
     Yields
     ------
@@ -141,14 +129,9 @@ def render_scans(
 class ScanRenderer:
     """A scene that is reused from scan to scan; only the first scan compiles anything.
 
-    Parameters
-    ----------
-    extinction : (x, y, z) array
-        Of the first scan; those of all others are on its grid.
-    plan : ScanPlan
-        Of the first scan; all others have as many beams and gates.
-    lidar, air, settings
-        As `render_scans` takes them.
+    extinction (x, y, z): of the first scan; those of all others are on its grid.
+    plan: of the first scan; all others have as many beams and gates.
+    lidar, air, settings: as `render_scans` takes them.
     """
 
     def __init__(
@@ -175,14 +158,9 @@ class ScanRenderer:
     ) -> xr.Dataset:
         """One scan, as `render_scans` yields it.
 
-        Parameters
-        ----------
-        seed : int
-            The header of an image holds 31 bits of it.
-        progress : callable, optional
-            Called with (samples done, samples in all).
-        batches : Batches, optional
-            Store of the samples while they are rendered.
+        seed: the header of an image holds 31 bits of it.
+        progress: called with (samples done, samples in all).
+        batches: store of the samples while they are rendered.
         """
         import drjit as dr
         import mitsuba as mi

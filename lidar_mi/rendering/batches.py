@@ -19,17 +19,9 @@ class Batches:
     The integrators of the plugins read the `stored` passes at their start, and call `store` after
     every pass.
 
-    Parameters
-    ----------
-    load : callable
-        Returns the arrays stored by an earlier run, or None.
-    save : callable
-        Stores arrays.
-
-    Attributes
-    ----------
-    seconds : float
-        Time spent by earlier runs on the stored passes.
+    load: returns the arrays stored by an earlier run, or None.
+    save: stores arrays.
+    seconds: time spent by earlier runs on the stored passes.
     """
 
     def __init__(self, load: Callable[[], Arrays | None], save: Callable[[Arrays], None]) -> None:
@@ -62,14 +54,9 @@ class Batches:
 class Series:
     """Which images of a series are rendered, and who follows it; all by their number.
 
-    Attributes
-    ----------
-    wanted : sequence of int, optional
-        Default: all.
-    progress : callable, optional
-        Called with (image, samples done, samples in all).
-    batches : callable, optional
-        Gives the store of an image's samples while it is rendered.
+    wanted: default: all.
+    progress: called with (image, samples done, samples in all).
+    batches: gives the store of an image's samples while it is rendered.
     """
 
     wanted: Sequence[int] | None = None

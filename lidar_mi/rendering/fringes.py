@@ -40,27 +40,19 @@ def render_fringes(
 
     In Mitsuba's variant in force.
 
-    Parameters
-    ----------
-    line : lidar_mi.atmosphere.scattering.line.Line
-        Of air at rest.
-    v_los : sequence of float
-        m/s; positive when the air approaches.
-    seed : int
-        Image k uses seed + k * 2^16.
-    series : Series
-        Which of the velocities to render; its samples are paths.
+    line: of air at rest.
+    v_los: m/s; positive when the air approaches.
+    seed: image k uses seed + k * 2^16.
+    series: which of the velocities to render; its samples are paths.
+
+    Raises InputError: a velocity that is not finite, or a lens that is too fast or has too wide a
+    field.
 
     Yields
     ------
     xr.Dataset
         S0 ... S3 and S0_stderr, dims (y, x) from the top left, received energy over the energy the
         source sends through the stop; one image at a time, as soon as it is rendered.
-
-    Raises
-    ------
-    InputError
-        A velocity that is not finite, or a lens that is too fast or has too wide a field.
     """
     import mitsuba as mi
 
@@ -172,10 +164,7 @@ def lens_surfaces(
 ) -> np.ndarray | None:
     """Surfaces of a real lens as the plugin `ccd` takes them; None: it is ideal.
 
-    Raises
-    ------
-    InputError
-        A lens that is too fast or has too wide a field.
+    Raises InputError: a lens that is too fast or has too wide a field.
     """
     if settings.lens == "ideal":
         return None
@@ -194,10 +183,7 @@ def _field(camera: FringeCamera) -> float:
 def render_image(scene: Any, samples: int = 0, seed: int = 0) -> xr.Dataset:
     """Render a loaded scene of a `ccd` with the `fringes` integrator and describe the image.
 
-    Parameters
-    ----------
-    samples : int
-        Light paths per pixel; 0: as in the scene.
+    samples: light paths per pixel; 0: as in the scene.
     """
     import mitsuba as mi
 

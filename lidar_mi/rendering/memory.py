@@ -29,14 +29,9 @@ def samples_at_once(samples_per_pass: int | None, memory: float | None, variant:
 
     Images do not depend on it but for rounding.
 
-    Parameters
-    ----------
-    samples_per_pass : int, optional
-        Default: `MOST_AT_ONCE`.
-    memory : float, optional
-        Of the machine, that a run may take, bytes; of a GPU, what is free counts.
-    variant : str
-        Of Mitsuba.
+    samples_per_pass: default: `MOST_AT_ONCE`.
+    memory: of the machine, that a run may take, bytes; of a GPU, what is free counts.
+    variant: of Mitsuba.
     """
     backend = backend_of(variant)
     most = MOST_AT_ONCE[backend] if samples_per_pass is None else samples_per_pass
@@ -60,10 +55,7 @@ def backend_of(variant: str) -> str:
 def image_bytes(beams: int, gates: int, quantities: int) -> float:
     """Bytes of an image while it is rendered, copied once, and written.
 
-    Parameters
-    ----------
-    quantities : int
-        Of every beam and gate: Stokes components, errors, orders.
+    quantities: of every beam and gate: Stokes components, errors, orders.
     """
     return 4.0 * beams * gates * quantities * 4
 
@@ -73,10 +65,7 @@ def check_memory(
 ) -> None:
     """Refuse to exceed the limit of the memory.
 
-    Raises
-    ------
-    InputError
-        The memory needed is above the limit.
+    Raises InputError: the memory needed is above the limit.
     """
     allowed = ceiling(memory)
     if needed > allowed:

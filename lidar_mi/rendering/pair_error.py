@@ -32,15 +32,11 @@ def unshared_fraction(
     1 for independent errors, 0 for errors that move with the air. An interpolation between pixels
     adds to it where errors change from pixel to pixel.
 
-    Parameters
-    ----------
-    first, second : (z, y) array
-        A realisation of the Monte Carlo error of each image, of the same random numbers; NaN where
-        there is none.
-    stderr : (z, y) array
-        Standard error of the first image, same unit.
-    rows, columns : (z, y) array
-        Where the air of the first image's pixels is in the second one, px; NaN where not known.
+    first, second (z, y): a realisation of the Monte Carlo error of each image, of the same random
+        numbers; NaN where there is none.
+    stderr (z, y): standard error of the first image, same unit.
+    rows, columns (z, y): where the air of the first image's pixels is in the second one, px; NaN
+        where not known.
     """
     known, at = np.isfinite(second), np.nan_to_num([rows, columns], nan=-1.0)
     moved = scipy.ndimage.map_coordinates(np.where(known, second, 0.0), at, order=3, mode="nearest")

@@ -19,10 +19,7 @@ def within_memory(integrator: Any, render: Callable[[], T]) -> T:
     The integrator keeps the smaller passes, for the images that follow. Images do not depend on
     them but for rounding.
 
-    Raises
-    ------
-    InputError
-        Memory is full with the smallest passes, too.
+    Raises InputError: memory is full with the smallest passes, too.
     """
     import drjit as dr
 

@@ -37,14 +37,10 @@ class Molecules(NamedTuple):
 class ScatteringAir(NamedTuple):
     """Of what a scene is full: the surroundings of a slab, and how both scatter.
 
-    Attributes
-    ----------
-    extinction : float
-        Of the surroundings, m^-1.
-    phase, albedo
-        As of `Scatterer`, of slab and surroundings; ``phase`` also with a table as an array.
-    molecules : Molecules, optional
-        Part of the extinction, here and in the slab, with a phase function of its own.
+    extinction: of the surroundings, m^-1.
+    phase, albedo: as of `Scatterer`, of slab and surroundings; ``phase`` also with a table as an
+        array.
+    molecules: part of the extinction, here and in the slab, with a phase function of its own.
     """
 
     extinction: float
@@ -73,22 +69,13 @@ def scatterer(
 ) -> Scatterer:
     """Phase function and albedo of an experiment's air.
 
-    Parameters
-    ----------
-    scattering : lidar_mi.schema.scattering.Scattering
-        Its own albedo, if given, replaces that of the scatterers.
-    folder : path
-        Of the tables.
-    wavelength : float
-        Of the laser, m; aerosols and molecules scatter accordingly.
-    notice : callable, optional
-        Called with the progress of a table that must be computed first.
+    scattering: its own albedo, if given, replaces that of the scatterers.
+    folder: of the tables.
+    wavelength: of the laser, m; aerosols and molecules scatter accordingly.
+    notice: called with the progress of a table that must be computed first.
 
-    Raises
-    ------
-    InputError
-        A table that does not exist, that cannot be read or is for another wavelength; an aerosol
-        without a table at this one.
+    Raises InputError: a table that does not exist, that cannot be read or is for another
+    wavelength; an aerosol without a table at this one.
     """
     albedo = 1.0
     match scattering.phase:
@@ -151,10 +138,7 @@ def table_files(scattering: Keys, folder: str | Path = ".") -> dict[str, Path]:
 
     They are searched in the folder, then among those of the package.
 
-    Raises
-    ------
-    InputError
-        One of them does not exist.
+    Raises InputError: one of them does not exist.
     """
     named = {f"scattering.parts.{k}.table": part for k, part in enumerate(scattering.parts or ())}
     files = {}

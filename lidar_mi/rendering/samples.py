@@ -28,13 +28,10 @@ _PILOT_PART = 1 / 16
 class Samples(NamedTuple):
     """A chosen number of Monte Carlo samples per beam.
 
-    Attributes
-    ----------
-    needed : int
-        With which the fraction asked for is reached; above ``number`` where it is too many.
-    fraction, median, upper : float
-        Variance of the simulation's noise over that of the detector's with ``number`` samples, as
-        expected: mean, median and 90 % quantile over the beams, of the gate with the largest mean.
+    needed: with which the fraction asked for is reached; above ``number`` where it is too many.
+    fraction, median, upper: variance of the simulation's noise over that of the detector's with
+        ``number`` samples, as expected: mean, median and 90 % quantile over the beams, of the gate
+        with the largest mean.
     """
 
     number: int
@@ -52,10 +49,7 @@ class Samples(NamedTuple):
 def noise_ratio(scan: xr.Dataset) -> np.ndarray:
     """Variance of the simulation's noise over that of the detector's, (gate, z, y).
 
-    Parameters
-    ----------
-    scan : xr.Dataset
-        With ``S0_stderr``, of common random numbers ``S0_pair_stderr``, which counts then, and
+    scan: with ``S0_stderr``, of common random numbers ``S0_pair_stderr``, which counts then, and
         ``S0_noise_std``. NaN where the detector has no noise.
     """
     simulated, detected = (
@@ -87,16 +81,10 @@ def choose_samples(
 ) -> Samples:
     """The number of samples that make the simulation's noise small compared with the detector's.
 
-    Parameters
-    ----------
-    pilot : xr.Dataset
-        A scan with the detector's noise.
-    samples : int
-        Per beam, of which it was rendered.
-    settings : RenderSettings
-        With ``monte_carlo_fraction``, and ``max_samples`` that bounds the time.
-    least : int
-        Samples per beam that an image must have whatever its noise.
+    pilot: a scan with the detector's noise.
+    samples: per beam, of which it was rendered.
+    settings: with ``monte_carlo_fraction``, and ``max_samples`` that bounds the time.
+    least: samples per beam that an image must have whatever its noise.
     """
     gates, beams = pilot.sizes["gate"], pilot.sizes["z"] * pilot.sizes["y"]
     of_one = samples * _of_the_worst_gate(noise_ratio(pilot))

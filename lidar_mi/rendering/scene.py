@@ -44,18 +44,11 @@ def render_file(
     the transmittance not corrected: a scene does not state which of its media are "the
     environment".
 
-    Parameters
-    ----------
-    samples : int
-        Monte Carlo samples per beam or pixel; 0: as in the scene.
-    definitions : dict
-        Values for ``$name`` in the scene.
+    samples: Monte Carlo samples per beam or pixel; 0: as in the scene.
+    definitions: values for ``$name`` in the scene.
 
-    Raises
-    ------
-    InputError
-        Missing or broken scene, or one without a `scanning_lidar` and a `gated_volpath`, or a `ccd`
-        and `fringes`.
+    Raises InputError: missing or broken scene, or one without a `scanning_lidar` and a
+    `gated_volpath`, or a `ccd` and `fringes`.
     """
     scene_path, out = Path(scene_path), Path(out)
     if not scene_path.is_file():
@@ -135,10 +128,7 @@ def _check_names(scene_path: Path, definitions: dict[str, str]) -> None:
 def files_of(scene_path: str | Path, definitions: dict[str, str]) -> list[Path]:
     """A scene file and the existing files that it names.
 
-    Parameters
-    ----------
-    definitions : dict
-        Values for ``$name`` in the scene, which may be names of files.
+    definitions: values for ``$name`` in the scene, which may be names of files.
     """
     scene_path = Path(scene_path)
     if not scene_path.is_file():

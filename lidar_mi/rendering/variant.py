@@ -73,13 +73,7 @@ def has_cuda() -> bool:
 
 
 def check_variant(name: str) -> None:
-    """Refuse a variant as `use_variant` does; Mitsuba is loaded for CUDA alone.
-
-    Raises
-    ------
-    InputError
-        As of `use_variant`.
-    """
+    """Refuse a variant as `use_variant` does; Mitsuba is loaded for CUDA alone."""
     if name.startswith("cuda"):
         use_variant(name)
         return

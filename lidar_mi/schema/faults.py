@@ -18,11 +18,8 @@ A_NAME = "at most 100 letters, digits, _, . and -, a letter or digit first"
 def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     """The key of the first fault in a description, its value and what is allowed, as one line.
 
-    Parameters
-    ----------
-    error : ValidationError
-    model : type of BaseModel
-        Of the description: it says units, limits and the keys of every section.
+    model (type of BaseModel): of the description: it says units, limits and the keys of every
+        section.
     """
     faults = error.errors()
     # a misspelt key also leaves one missing: report the misspelt one

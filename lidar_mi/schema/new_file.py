@@ -24,16 +24,10 @@ _HEAD = """\
 def new_file(name: str, shipped: str, path: Path, command: str) -> str:
     """Text of an experiment file with the keys of a shipped experiment, its base's included.
 
-    Parameters
-    ----------
-    name : str
-        Of the new experiment.
-    shipped : str
-        Name of the shipped experiment.
-    path : Path
-        Its file.
-    command : str
-        That runs it: run or fly.
+    name: of the new experiment.
+    shipped: name of the shipped experiment.
+    path: its file.
+    command: that runs it: run or fly.
 
     Returns
     -------

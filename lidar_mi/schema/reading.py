@@ -88,11 +88,8 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
 def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
     """Read an experiment file; ``overrides`` are texts such as ``"wake.texture.rms=0.2"``.
 
-    Raises
-    ------
-    InputError
-        Unreadable file, unknown key, wrong unit, value out of range: the first fault is named. A
-        file of several variants: `load_variants` reads it.
+    Raises InputError: unreadable file, unknown key, wrong unit, value out of range: the first fault
+    is named. A file of several variants: `load_variants` reads it.
     """
     data = read_keys(path)
     for override in overrides or []:
@@ -111,10 +108,7 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
     all variants and over what these say, but those of ``variants.NAME.KEY`` for one. A variant's
     experiment is called NAME-OF-ALL.NAME.
 
-    Raises
-    ------
-    InputError
-        As `load`, with the variant's name; no variants, or one that is no section.
+    Raises InputError: as `load`, with the variant's name; no variants, or one that is no section.
     """
     data = read_keys(path)
     of_variants = [text for text in overrides or [] if text.strip().startswith("variants.")]

@@ -59,10 +59,7 @@ def question_and_needs(name: str) -> tuple[str, str]:
 
     They are the first two lines of its file, ``# QUESTION`` and ``# Needs NEEDS.``.
 
-    Raises
-    ------
-    InputError
-        There is none of this name.
+    Raises InputError: there is none of this name.
     """
     path = _shipped_of(name, [_EXPERIMENT, _CAMPAIGN])
     question, needs = read_text(path, "an experiment file").splitlines()[:2]
@@ -77,10 +74,7 @@ def instruments() -> list[str]:
 def instrument_file(name: str) -> Path:
     """The experiment file of a published instrument, in which each number has its source.
 
-    Raises
-    ------
-    InputError
-        There is none of this name; the message lists them.
+    Raises InputError: there is none of this name; the message lists them.
     """
     return _shipped_of(name, [_INSTRUMENT])
 
@@ -88,10 +82,7 @@ def instrument_file(name: str) -> Path:
 def shipped_file(name: str) -> Path:
     """The file of a shipped experiment, whatever the working folder holds.
 
-    Raises
-    ------
-    InputError
-        There is none of this name; the message lists them.
+    Raises InputError: there is none of this name; the message lists them.
     """
     return _shipped_of(name, [_EXPERIMENT])
 
@@ -119,23 +110,14 @@ def experiment_file(name: str | Path) -> Path:
 
     A file of that name in the working folder comes first.
 
-    Raises
-    ------
-    InputError
-        Neither a file nor a shipped experiment.
+    Raises InputError: neither a file nor a shipped experiment.
     """
     return _file_of(name, [_EXPERIMENT])
 
 
 @checked_arguments
 def campaign_file(name: str | Path) -> Path:
-    """As `experiment_file`, for a campaign, or for an experiment with variants.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
+    """As `experiment_file`, for a campaign, or for an experiment with variants."""
     return _file_of(name, [_CAMPAIGN, _EXPERIMENT])
 
 

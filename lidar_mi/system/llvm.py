@@ -151,11 +151,8 @@ def check_llvm(
 def require_llvm() -> None:
     """Raise unless an ``llvm_*`` variant can run; call it before setting one.
 
-    Raises
-    ------
-    InputError
-        No LLVM >= 17, a bad ``DRJIT_LIBLLVM_PATH``, or Dr.Jit imported first with an older LLVM.
-        The message says what to install or set.
+    Raises InputError: no LLVM >= 17, a bad ``DRJIT_LIBLLVM_PATH``, or Dr.Jit imported first with an
+    older LLVM. The message says what to install or set.
     """
     # Imported here because as a script this file runs before the package is installed.
     from lidar_mi.errors import InputError

@@ -50,14 +50,9 @@ class ObservedAir(Protocol):
 class Scale:
     """Common settings of all wind maps of a run.
 
-    Attributes
-    ----------
-    limit : float
-        Speed at the end of the colours, m/s.
-    length : float
-        Of its arrow, in distances between arrows.
-    y, z : array
-        Axes of the plane, m.
+    limit: speed at the end of the colours, m/s.
+    length: of its arrow, in distances between arrows.
+    y, z: axes of the plane, m.
     """
 
     limit: float
@@ -72,6 +67,23 @@ def _scale(truth: ObservedAir) -> Scale:
     limit = float(speed.quantile(0.999)) or 1.0
     length = arrow_length(speed.values, limit)
     return Scale(limit, length, truth.wind["y"].values, truth.wind["z"].values)
+
+
+_PRODUCTS = {
+    "depolarization": (
+        "fig14_depolarization",
+        "Linear depolarisation ratio",
+        "linear depolarisation ratio",
+        "Linear depolarisation ratio of the first image, cross- over co-polarised light.",
+    ),
+    "multiple_scattering_fraction": (
+        "fig15_multiple_scattering",
+        "Multiple scattering",
+        "fraction of multiple scattering",
+        "Fraction of the light of the first image that was scattered more than once.",
+    ),
+}
+"""File, title, label and caption of the figure of a product."""
 
 
 def draw_all(
@@ -92,7 +104,7 @@ def draw_all(
     # with measured images alone there are no winds from extinction to compare with
     compared = Source.EXTINCTION in sources
     ideal, lidar = (Source.EXTINCTION, Source.BACKSCATTER) if compared else (sources[-1],) * 2
-    figures: tuple[tuple[str, str, Captioned | None], ...] = (
+    figures: list[tuple[str, str, Captioned | None]] = [
         ("fig00_overview", "Image and retrieved wind", overview(truth, scans, winds, cores)),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         (
@@ -116,44 +128,20 @@ def draw_all(
             "Wind from the backscatter pair",
             _retrieved(winds, lidar, cores, scale),
         ),
-    )
+    ]
     if compared:
-        figures += (
-            (
-                "fig11_deviation_from_extinction_winds",
-                "Change of the winds by the instrument",
-                _deviation_maps(winds, lidar, ideal),
-            ),
-        )
-    figures += (("fig12_error_by_texture", "Error and texture", error_by_texture(winds, sweep)),)
-    figures += (("fig12b_error_and_bound", "Errors and Cramer-Rao bound", error_and_bound(winds)),)
-    if "depolarization" in scans[0]:
-        figures += (
-            (
-                "fig14_depolarization",
-                "Linear depolarisation ratio",
-                _product(
-                    scans[0],
-                    "depolarization",
-                    "linear depolarisation ratio",
-                    "Linear depolarisation ratio of the first image, cross- over co-polarised "
-                    "light.",
-                ),
-            ),
-        )
-    if "multiple_scattering_fraction" in scans[0]:
-        figures += (
-            (
-                "fig15_multiple_scattering",
-                "Multiple scattering",
-                _product(
-                    scans[0],
-                    "multiple_scattering_fraction",
-                    "fraction of multiple scattering",
-                    "Fraction of the light of the first image that was scattered more than once.",
-                ),
-            ),
-        )
+        changes = _deviation_maps(winds, lidar, ideal)
+        title = "Change of the winds by the instrument"
+        figures.append(("fig11_deviation_from_extinction_winds", title, changes))
+    figures += [
+        ("fig12_error_by_texture", "Error and texture", error_by_texture(winds, sweep)),
+        ("fig12b_error_and_bound", "Errors and Cramer-Rao bound", error_and_bound(winds)),
+        *(
+            (file, title, _product(scans[0], name, label, caption))
+            for name, (file, title, label, caption) in _PRODUCTS.items()
+            if name in scans[0]
+        ),
+    ]
     drawn = [(name, title, fig) for name, title, fig in figures if fig is not None]
     return save_all(folder, drawn, log)
 
@@ -245,21 +233,19 @@ def _crosses(cores: Sequence[Core]) -> str:
     return ", red crosses mark the true cores" if cores else ""
 
 
-def _extinction(truth: ObservedAir) -> Captioned:
+def _at_both_times(
+    fields: Sequence[xr.DataArray], label: str, extend: str, norm: Normalize, colours: str
+) -> Figure:
     figure, axes = sheet(1, 2)
-    fields = [truth.image(k) * 1e3 for k in (0, 1)]
-    norm = _bright(fields)
     for k, field in enumerate(fields):
-        image_panel(
-            axes[0, k],
-            field,
-            f"$t_{k + 1}$",
-            "extinction / km$^{-1}$",
-            "max",
-            norm=norm,
-            cmap="cividis",
-        )
-    return figure, (
+        image_panel(axes[0, k], field, f"$t_{k + 1}$", label, extend, norm=norm, cmap=colours)
+    return figure
+
+
+def _extinction(truth: ObservedAir) -> Captioned:
+    fields = [truth.image(k) * 1e3 for k in (0, 1)]
+    label = "extinction / km$^{-1}$"
+    return _at_both_times(fields, label, "max", _bright(fields), "cividis"), (
         "Extinction coefficient of the slab at t1 and t2, averaged over the gate's depth. "
         "The change in dt is hardly visible, but is detected by the retrieval."
     )
@@ -330,29 +316,17 @@ def _deviation_maps(winds: xr.Dataset, source: str, reference: str | None) -> Ca
         # flagged vectors do not characterise the method
         error = deviations(wind, compared).where((wind["flag"] == 0) & (compared["flag"] == 0))
         limit = _upper(abs(error["speed"]), 0.99) or 1.0
-        for axis in row:
-            # visible where there is no vector
-            axis.set_facecolor("0.7")
-        image_panel(
-            row[0],
-            error["speed"],
-            f"{METHOD_NAMES[method]}: speed",
-            "speed / m s$^{-1}$",
-            extend="both",
-            norm=TwoSlopeNorm(0, -limit, limit),
-            cmap="RdBu_r",
-        )
         # directions differ by half a turn at most
         largest = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
-        image_panel(
-            row[1],
-            error["direction"],
-            f"{METHOD_NAMES[method]}: direction",
-            "direction / rad",
-            extend="both",
-            norm=TwoSlopeNorm(0, -largest, largest),
-            cmap="PuOr_r",
-        )
+        for axis, name, unit, end, colours in (
+            (row[0], "speed", "m s$^{-1}$", limit, "RdBu_r"),
+            (row[1], "direction", "rad", largest, "PuOr_r"),
+        ):
+            # visible where there is no vector
+            axis.set_facecolor("0.7")
+            title, norm = f"{METHOD_NAMES[method]}: {name}", TwoSlopeNorm(0, -end, end)
+            label = f"{name} / {unit}"
+            image_panel(axis, error[name], title, label, "both", norm=norm, cmap=colours)
     against = "the true wind" if reference is None else f"winds from {reference}"
     return figure, (
         f"Deviations of winds from {source} against {against}: speed (left) and direction "
@@ -377,19 +351,8 @@ def _upper(field: xr.DataArray, fraction: float) -> float:
 
 
 def _backscatter(scans: Sequence[xr.Dataset]) -> Captioned:
-    figure, axes = sheet(1, 2)
-    norm = _bright([scan["Y"] * 1e6 for scan in scans])
-    for k, scan in enumerate(scans):
-        image_panel(
-            axes[0, k],
-            scan["Y"] * 1e6,
-            f"$t_{k + 1}$",
-            extend="max",
-            label=BACKSCATTER,
-            norm=norm,
-            cmap="cividis",
-        )
-    return figure, (
+    fields = [scan["Y"] * 1e6 for scan in scans]
+    return _at_both_times(fields, BACKSCATTER, "max", _bright(fields), "cividis"), (
         "Rendered backscatter, normalised for range, gate length and the environment's "
         "transmittance; without the noise of a detector."
     )
@@ -421,24 +384,14 @@ def _span(field: xr.DataArray) -> Normalize:
 
 
 def _image_differences(truth: ObservedAir, scans: Sequence[xr.Dataset]) -> Captioned:
-    figure, axes = sheet(1, 2)
     differences = []
     for k, scan in enumerate(scans):
         field = truth.image(k).interp(y=scan["y"], z=scan["z"])
         # over their means, as units and gain differ
         differences.append(scan["Y"] / scan["Y"].mean() - field / field.mean())
     limit = max(float(abs(d).quantile(0.999)) for d in differences)
-    for k, difference in enumerate(differences):
-        image_panel(
-            axes[0, k],
-            difference,
-            f"$t_{k + 1}$",
-            "difference of relative values",
-            "both",
-            norm=TwoSlopeNorm(0, -limit, limit),
-            cmap="RdBu_r",
-        )
-    return figure, (
+    norm, label = TwoSlopeNorm(0, -limit, limit), "difference of relative values"
+    return _at_both_times(differences, label, "both", norm, "RdBu_r"), (
         "Backscatter over its mean minus extinction over its mean: the beam's width smooths "
         "sharp structure, Monte Carlo noise adds grain, and a pulse longer than the slab's depth "
         "adds light from the air before and behind it."

@@ -32,12 +32,8 @@ COLOURS = ("#1f5fa8", "#c2571a", "#2c7a3f", "#8a3a8f", "#7a6200", "#4a4a4a", "#b
 class Points(NamedTuple):
     """What every point is, over the dimensions of the sweep or the sample.
 
-    Attributes
-    ----------
-    number : xr.DataArray
-        0, 1, ...
-    failed : xr.DataArray
-        Whether no member of it is done.
+    number: 0, 1, ...
+    failed: whether no member of it is done.
     """
 
     number: xr.DataArray

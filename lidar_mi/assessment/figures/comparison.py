@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.alt_text import TRUE_CORE
-from lidar_mi.assessment.figures.panels import Drawn, Progress, save_all
+from lidar_mi.assessment.figures.panels import Drawn, Progress, coloured, save_all
 from lidar_mi.assessment.labels import BACKSCATTER
 
 _SPEED = "m s$^{-1}$"
@@ -21,11 +22,8 @@ def draw_comparison(
 ) -> list[Drawn]:
     """One row per variant: its first image, the w retrieved from the pair, and its error.
 
-    Parameters
-    ----------
-    rows : mapping of variant to (image, winds, cores)
-        Attenuated backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag;
-        positions (y, z) of the true cores, m.
+    ``rows`` are (image, winds, cores) by variant: attenuated backscatter (m^-1 sr^-1) and winds on
+    (z, y), these with w_true and flag; positions (y, z) of the true cores, m.
     """
     figure = Figure(figsize=(19, 4.0 * len(rows)), layout="compressed")
     axes = figure.subplots(len(rows), 3, squeeze=False)
@@ -46,7 +44,7 @@ def draw_comparison(
             wind["flag"] == 0,
             {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"},
         )
-        columns = (
+        columns: tuple[tuple[xr.DataArray, dict[str, Any], str, str], ...] = (
             (
                 1e6 * image.sel(place),
                 {"cmap": "cividis", "vmin": low, "vmax": high},
@@ -61,9 +59,7 @@ def draw_comparison(
                 panel.remove()
                 continue
             y, z = field["y"].values, field["z"].values
-            mesh = panel.pcolormesh(
-                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
-            )
+            mesh = coloured(panel, field, **style)
             panel.set(title=title, aspect="equal", xlim=(y.max(), y.min()), ylim=(z.min(), z.max()))
             for core in cores:
                 panel.plot(*core, "k+", ms=8, label=f"_{TRUE_CORE}")

@@ -59,14 +59,9 @@ def draw_all(
 ) -> list[Drawn]:
     """Draw every figure of a Doppler run as PNG into ``folder``.
 
-    Parameters
-    ----------
-    exposure : lidar_mi.experiment.stages.ring_images.Exposure
-        Images of the laser and of the air at the first speed, without and with noise.
-    samples : xr.Dataset or None
-        Image of the laser's light, traced path by path.
-    velocities, metrics
-        From `lidar_mi.experiment.stages.ring_velocities.velocities`,
+    exposure: images of the laser and of the air at the first speed, without and with noise.
+    samples: image of the laser's light, traced path by path.
+    velocities, metrics: from `lidar_mi.experiment.stages.ring_velocities.velocities`,
         `lidar_mi.assessment.metrics.velocities`.
     """
     figures = [

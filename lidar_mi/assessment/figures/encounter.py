@@ -10,7 +10,15 @@ from matplotlib.patches import Circle
 
 from lidar_mi.assessment.figures.alt_text import TRUE_CORE
 from lidar_mi.assessment.figures.encounter_loads import load_factor
-from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, arrow_scale, save_all
+from lidar_mi.assessment.figures.panels import (
+    Captioned,
+    Drawn,
+    Progress,
+    arrow_scale,
+    coloured,
+    pilots_view,
+    save_all,
+)
 from lidar_mi.assessment.metrics.encounter import CONTROLLER, MET, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
@@ -232,20 +240,8 @@ def draw_image(axes: Axes, view: xr.Dataset, limits: tuple[float, float] | None 
     if "image" not in view:
         return
     low, high = limits or np.nanquantile(view["image"], (0.01, 0.995))
-    axes.pcolormesh(
-        view["image_y"],
-        view["image_z"],
-        view["image"].values,
-        cmap="gray",
-        vmin=low,
-        vmax=high,
-        shading="nearest",
-        rasterized=True,
-    )
-    axes.set(aspect="equal")
-    # the pilot's view: port, of positive y, is left
-    axes.set_xlim(float(view["image_y"].max()), float(view["image_y"].min()))
-    axes.set_ylim(float(view["image_z"].min()), float(view["image_z"].max()))
+    coloured(axes, view["image"], "image_y", "image_z", cmap="gray", vmin=low, vmax=high)
+    pilots_view(axes, view["image_y"], view["image_z"])
 
 
 def draw_vectors(axes: Axes, view: xr.Dataset) -> None:

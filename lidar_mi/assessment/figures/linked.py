@@ -18,14 +18,9 @@ from lidar_mi.assessment.figures.alt_text import alt_text
 class Mark(NamedTuple):
     """A point of a figure: a dot at the middle, or a cell.
 
-    Attributes
-    ----------
-    point : int
-        Number of the point, for what the page says of it.
-    x, y : tuple of float
-        Ends of the cell, in data; equal ends: a dot.
-    text : str
-        What it shows, as text.
+    point: number of the point, for what the page says of it.
+    x, y: ends of the cell, in data; equal ends: a dot.
+    text: what it shows, as text.
     """
 
     point: int

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
@@ -88,6 +89,11 @@ def frame(
     """The pilot's view: port on the left, up at the top, metres true to scale."""
     # on the left, as the scale of arrows is on the right
     axes.set_title(title, loc="left")
+    pilots_view(axes, y, z)
+
+
+def pilots_view(axes: Axes, y: np.ndarray | xr.DataArray, z: np.ndarray | xr.DataArray) -> None:
+    """Axes and limits of a plane (m): port, of positive y, is left."""
     axes.set(xlabel="y / m (port is left)", ylabel="z / m", aspect="equal")
     axes.set_xlim(float(y.max()), float(y.min()))
     axes.set_ylim(float(z.min()), float(z.max()))
@@ -108,15 +114,22 @@ def mark_cores(axes: Axes, cores: Sequence[Core], colour: str, size: float = 9) 
         axes.plot(core.y, core.z, "+", color=colour, ms=size, ls="none", label=f"_{TRUE_CORE}")
 
 
+def coloured(
+    axes: Axes, field: xr.DataArray, across: str = "y", up: str = "z", **style: Any
+) -> QuadMesh:
+    """A field in colours, a cell about each of its nodes."""
+    values = field.transpose(up, across).values
+    return axes.pcolormesh(
+        field[across], field[up], values, shading="nearest", rasterized=True, **style
+    )
+
+
 def image_panel(
     axes: Axes, field: xr.DataArray, title: str, label: str, extend: str = "neither", **style: Any
 ) -> None:
     """A field (z, y) in colours, with its bar."""
-    y, z = field["y"], field["z"]
-    mesh = axes.pcolormesh(
-        y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
-    )
-    frame(axes, y, z, title)
+    mesh = coloured(axes, field, **style)
+    frame(axes, field["y"], field["z"], title)
     low, high = mesh.get_clim()
     uniform = high - low <= UNIFORM * max(abs(low), abs(high))
     bar = axes.figure.colorbar(

@@ -12,7 +12,14 @@ from lidar_mi.assessment.figures.normalised_errors import (
     draw_normal_density,
     draw_normalised_errors,
 )
-from lidar_mi.assessment.figures.panels import Captioned, Drawn, Progress, mark_cores, save_all
+from lidar_mi.assessment.figures.panels import (
+    Captioned,
+    Drawn,
+    Progress,
+    coloured,
+    mark_cores,
+    save_all,
+)
 from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.retrieval.combined.vectors import COMPONENTS, line_places
 
@@ -103,14 +110,7 @@ def _maps(wind: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core]) -> Caption
             (error, _colours(error.values), f"{name}, error"),
         )
         for panel, (field, colours, title) in zip(row, columns, strict=True):
-            mesh = panel.pcolormesh(
-                y,
-                z,
-                field.transpose("z", "y").values,
-                shading="nearest",
-                rasterized=True,
-                **colours,
-            )
+            mesh = coloured(panel, field, **colours)
             panel.set(title=title, aspect="equal")
             figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
             mark_cores(panel, cores, "k", 8)
@@ -138,21 +138,13 @@ def _uncertainty(wind: xr.Dataset) -> Captioned:
     figure = Figure(figsize=(17, 4.3), layout="compressed")
     axes = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 1))
     valid = (wind["flag"] == 0).transpose("z", "y").values
-    y, z = wind["y"], wind["z"]
+    y = wind["y"]
     for panel, name in zip(axes[:2], ("u", "w"), strict=True):
-        stderr = wind[f"{name}_stderr"].transpose("z", "y").values
+        stderr = wind[f"{name}_stderr"].transpose("z", "y")
         # few large values must not determine the colours
-        top = float(np.quantile(stderr[valid], 0.99)) if valid.any() else 1.0
-        mesh = panel.pcolormesh(
-            y,
-            z,
-            np.where(valid, stderr, np.nan),
-            shading="nearest",
-            rasterized=True,
-            cmap="viridis",
-            vmin=0,
-            vmax=top,
-        )
+        top = float(np.quantile(stderr.values[valid], 0.99)) if valid.any() else 1.0
+        shown = stderr.where(wind["flag"] == 0)
+        mesh = coloured(panel, shown, cmap="viridis", vmin=0, vmax=top)
         panel.set(
             title=f"standard error of {name}",
             aspect="equal",

@@ -19,6 +19,7 @@ from lidar_mi.assessment.figures.panels import (
     Drawn,
     Progress,
     by_factors,
+    coloured,
     mark_cores,
     save_all,
 )
@@ -130,16 +131,7 @@ def _row(
 def _map(
     panel: Axes, field: xr.DataArray, across: str, up: str, colours: str, low: float, high: float
 ) -> QuadMesh:
-    mesh = panel.pcolormesh(
-        field[across],
-        field[up],
-        field.transpose(up, across).values,
-        shading="nearest",
-        rasterized=True,
-        cmap=colours,
-        vmin=low,
-        vmax=high,
-    )
+    mesh = coloured(panel, field, across, up, cmap=colours, vmin=low, vmax=high)
     half = float(field[across][1] - field[across][0]) / 2
     panel.set(aspect="equal", xlabel=f"{across} / m (port is left)", ylabel=f"{up} / m")
     panel.set_xlim(float(field[across].max()) + half, float(field[across].min()) - half)

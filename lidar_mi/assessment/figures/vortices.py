@@ -16,6 +16,8 @@ from lidar_mi.assessment.figures.panels import (
     Drawn,
     Progress,
     arrow_scale,
+    coloured,
+    pilots_view,
     save_all,
     speed_of,
 )
@@ -65,16 +67,7 @@ def _pair(
 
     field = image.transpose("z", "y")
     top = float(np.nanquantile(field, 0.999))
-    first.pcolormesh(
-        field["y"],
-        field["z"],
-        field.values,
-        cmap="gray",
-        vmin=0,
-        vmax=top or 1.0,
-        shading="nearest",
-        rasterized=True,
-    )
+    coloured(first, field, cmap="gray", vmin=0, vmax=top or 1.0)
     first.set_title("first image, fitted pairs")
     limit = float(np.quantile(np.hypot(true["v"], true["w"]), 0.999)) or 1.0
     _arrows(fitted, y, z, model, limit)
@@ -94,9 +87,7 @@ def _pair(
         axes.set_title(title)
     for axes in (first, fitted, wrong, uncertain):
         _mark(axes, fits if axes is first else {best: fits[best]}, cores)
-        axes.set(aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
-        axes.set_xlim(y.max(), y.min())
-        axes.set_ylim(z.min(), z.max())
+        pilots_view(axes, y, z)
     first.legend(loc="lower center", ncols=3, fontsize=8)
     _along(cut, vectors, truth, fits, best)
     return figure, (
@@ -134,27 +125,12 @@ def _mark(axes: Axes, fits: Mapping[str, VortexPairFit], cores: Sequence[Core]) 
         colour, style = _STYLE[name]
         for k, vortex in enumerate((fit.port, fit.starboard)):
             label = f"from the {ORIGIN_NAMES[name]}" if k == 0 else None
-            axes.add_patch(
-                Circle(
-                    (vortex.y, vortex.z),
-                    vortex.core_radius,
-                    fill=False,
-                    ls=style,
-                    ec=colour,
-                    lw=1.8,
-                    label=label,
-                )
-            )
+            shown = {"ls": style, "ec": colour, "lw": 1.8, "label": label}
+            place = vortex.y, vortex.z
+            axes.add_patch(Circle(place, vortex.core_radius, fill=False, **shown))
     for k, core in enumerate(cores):
-        axes.plot(
-            core.y,
-            core.z,
-            "+",
-            color="crimson",
-            ms=10,
-            label=f"_{TRUE_CORE}" if k else "true cores",
-            ls="none",
-        )
+        label = f"_{TRUE_CORE}" if k else "true cores"
+        axes.plot(core.y, core.z, "+", color="crimson", ms=10, label=label, ls="none")
 
 
 def _along(

@@ -6,6 +6,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from lidar_mi.assessment.figures.panels import coloured
+
 _MOST_CURVES = 6
 
 
@@ -76,13 +78,7 @@ def _maps(figure: Figure, valid: xr.Dataset) -> None:
         ),
         strict=True,
     ):
-        drawn = axes.pcolormesh(
-            valid["time"].values,
-            valid["height"].values,
-            valid[name].transpose("height", "time").values,
-            shading="nearest",
-            **options,
-        )
+        drawn = coloured(axes, valid[name], "time", "height", **options)
         figure.colorbar(drawn, ax=axes, label=label)
         axes.set_ylabel("height / m")
     panels[-1].set_xlabel("time (UTC)")

@@ -75,13 +75,7 @@ def metrics_of(dataset: xr.Dataset) -> dict[str, xr.DataArray]:
 
 
 def chosen(metrics: Mapping[str, xr.DataArray], names: Sequence[str] | None) -> list[str]:
-    """The metrics to show: those asked for, or errors, stated errors, vortices and pulses.
-
-    Raises
-    ------
-    InputError
-        A metric that the campaign does not have.
-    """
+    """The metrics to show: those asked for, or errors, stated errors, vortices and pulses."""
     for key in names or ():
         if key not in metrics:
             near = ", ".join(difflib.get_close_matches(key, metrics, 3, 0.5))
@@ -198,13 +192,9 @@ def undecided(margin: Interval) -> xr.DataArray:
 class Boundary:
     """A value of a knob at which a requirement begins or ceases to be met.
 
-    Attributes
-    ----------
-    value, low, high : float
-        The knob, and its interval from that of the mean over members; NaN: not known, infinite:
-        beyond the sweep.
-    above : bool
-        Whether the requirement is met above the value.
+    value, low, high: the knob, and its interval from that of the mean over members; NaN: not known,
+        infinite: beyond the sweep.
+    above: whether the requirement is met above the value.
     """
 
     value: float
@@ -216,10 +206,7 @@ class Boundary:
 def boundaries(margin: Interval, logarithmic: bool) -> list[Boundary]:
     """Where a margin along one knob changes its sign, between points linear in the knob's scale.
 
-    Parameters
-    ----------
-    margin : Interval
-        On one dimension with a coordinate in ascending or descending order.
+    margin: on one dimension with a coordinate in ascending or descending order.
     """
     (knob,) = margin.mean.dims
     order = np.argsort(margin.mean[knob].values)

@@ -94,12 +94,8 @@ def fraction_added(
 ) -> np.ndarray:
     """What the lidar removes beyond the autopilot over what perfect preview removes beyond it.
 
-    Parameters
-    ----------
-    autopilot, lidar, perfect : array_like
-        Largest roll, say, of the flights.
-    least : float
-        NaN where perfect preview removes less: there is nothing that a lidar could add.
+    autopilot, lidar, perfect: largest roll, say, of the flights.
+    least: NaN where perfect preview removes less: there is nothing that a lidar could add.
     """
     before, ours, best = (np.asarray(peak, dtype=float) for peak in (autopilot, lidar, perfect))
     room = before - best

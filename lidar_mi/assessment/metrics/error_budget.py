@@ -79,18 +79,12 @@ def images_without(
     transport beyond the blur (multiple scattering, extinction within the slab: 0.5 % of the signal
     in the paper's case, nearly uniform) is part of the simulation's noise.
 
-    Parameters
-    ----------
-    measured : two xr.DataArray, dims (z, y)
-        Images with all noise.
-    blurred, sharp : pair
-        The air averaged over the beams' width without noise, and without blur; unit of `measured`.
-    rendered : pair, optional
-        Without the noise of a detector; absent if there is none.
-    advected : pair, optional
-        As `blurred`, of air advected by the slab's mean wind only.
-    timed : mapping of pair, optional
-        As `blurred`, by cause, with beams that lack it: `scan_time`, `motion`, `scanner_jitter`,
+    measured (z, y): images with all noise.
+    blurred, sharp: the air averaged over the beams' width without noise, and without blur; unit of
+        `measured`.
+    rendered: without the noise of a detector; absent if there is none.
+    advected: as `blurred`, of air advected by the slab's mean wind only.
+    timed: as `blurred`, by cause, with beams that lack it: `scan_time`, `motion`, `scanner_jitter`,
         `navigation`.
 
     Returns
@@ -125,16 +119,11 @@ def chord_wind(
     The displacement between two images is the chord of a curved path. In a solid rotation at the
     rate a the mean wind is that at the chord's middle times tan(a dt / 2) / (a dt / 2).
 
-    Parameters
-    ----------
-    truth : xr.Dataset
-        v, w (m s^-1) on (z, y); the flow is steady over dt. Beyond the field its edge is repeated.
-    y, z : arrays
-        Middles between the positions of the air in both images, m.
-    dt : float
-        s.
-    steps : int
-        Runge-Kutta steps (4th order) in dt / 2.
+    truth: v, w (m s^-1) on (z, y); the flow is steady over dt. Beyond the field its edge is
+        repeated.
+    y, z: middles between the positions of the air in both images, m.
+    dt: s.
+    steps: Runge-Kutta steps (4th order) in dt / 2.
 
     Returns
     -------
@@ -183,15 +172,10 @@ def chord_wind(
 def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | None:
     """The true wind averaged over a method's windows; None for a method without windows.
 
-    Parameters
-    ----------
-    truth : xr.Dataset
-        v, w on (z, y), with the images' spacing.
-    template : int
-        Size of a window, px.
-    method : str
-        "cc", "ws": the mean over the template. "multipass": a Gaussian of a third of the template
-        (the value of a weighted affine fit in its middle).
+    truth: v, w on (z, y), with the images' spacing.
+    template: size of a window, px.
+    method: "cc", "ws": the mean over the template. "multipass": a Gaussian of a third of the
+        template (the value of a weighted affine fit in its middle).
     """
     if method == ImageMethod.MULTIPASS:
         smooth = {
@@ -227,16 +211,11 @@ def moved_rigidly(
     second image is the blurred air of the first, advected by the mean wind over the template, plus
     the difference of the second measured image to its own blurred air.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        From `retrieve_wind`, with the attributes method, template, search, stride and dt.
-    measured, blurred : pair
-        See `images_without`.
-    truth : xr.Dataset
-        v, w on (z, y).
-    retrieve : callable
-        Retrieves the wind from a pair by the method of `wind`, with windows so many pixels apart.
+    wind: from `retrieve_wind`, with the attributes method, template, search, stride and dt.
+    measured, blurred: see `images_without`.
+    truth: v, w on (z, y).
+    retrieve: retrieves the wind from a pair by the method of `wind`, with windows so many pixels
+        apart.
 
     Returns
     -------
@@ -300,22 +279,14 @@ def error_budget(
     not add up to 1: causes interact, and one may even reduce errors (methods that adapt to noise
     smooth more), which makes its fraction negative.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        From `lidar_mi.retrieval.wind.pair.retrieve_wind`; with the attributes
-        method, template and dt.
-    without : mapping of xr.Dataset
-        The same from `images_without`, by cause, and from `moved_rigidly` as `shear`.
-    truth : xr.Dataset
-        v, w on (z, y).
-    cores : sequence of Core
-        Of the true vortices; without any there are no keys `outside_cores.*`.
-    perfect : xr.Dataset, optional
-        The same from the air without noise or blur: the cause `method` is its deviation from the
-        truth.
-    flagged : bool
-        Include every vector with a displacement, flagged or not.
+    wind: from `lidar_mi.retrieval.wind.pair.retrieve_wind`; with the attributes method, template
+        and dt.
+    without: the same from `images_without`, by cause, and from `moved_rigidly` as `shear`.
+    truth: v, w on (z, y).
+    cores: of the true vortices; without any there are no keys `outside_cores.*`.
+    perfect: the same from the air without noise or blur: the cause `method` is its deviation from
+        the truth.
+    flagged: include every vector with a displacement, flagged or not.
 
     Returns
     -------

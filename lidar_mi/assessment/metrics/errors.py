@@ -14,12 +14,8 @@ from lidar_mi.flags import masks_of
 def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
     """The true wind at the position and time of each retrieved vector, NaN without a position.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        From `lidar_mi.retrieval.wind.pair.retrieve_wind`: coordinates y_vector, z_vector.
-    truth : xr.Dataset
-        v, w (m s^-1) on (z, y); the flow is taken to be steady over dt. Cubic interpolation.
+    wind: from `lidar_mi.retrieval.wind.pair.retrieve_wind`: coordinates y_vector, z_vector.
+    truth: v, w (m s^-1) on (z, y); the flow is taken to be steady over dt. Cubic interpolation.
     """
     axes = {name: truth[name].values for name in ("z", "y")}
     places = {name: wind[f"{name}_vector"].values for name in axes}
@@ -62,15 +58,10 @@ def error_statistics(
 ) -> dict[str, float]:
     """Statistics of errors, and their consistency with the standard errors.
 
-    Parameters
-    ----------
-    error : array
-        Estimate less truth; NaN where there is no estimate.
-    stderr : array, optional
-        Standard errors as stated, of the same shape and unit. Errors without a positive, finite one
-        are included in ``rmse`` and ``bias`` only.
-    where : array of bool, optional
-        Which errors are included.
+    error: estimate less truth; NaN where there is no estimate.
+    stderr: standard errors as stated, of the same shape and unit. Errors without a positive, finite
+        one are included in ``rmse`` and ``bias`` only.
+    where: which errors are included.
 
     Returns
     -------

@@ -15,10 +15,7 @@ def noise_metrics(scan: xr.Dataset) -> dict[str, float]:
 def light_metrics(scan: xr.Dataset) -> dict[str, float]:
     """Noise, fraction of multiple scattering and depolarisation of a scan's first gate.
 
-    Parameters
-    ----------
-    scan : xr.Dataset
-        As rendered; metrics of missing variables are absent.
+    scan: as rendered; metrics of missing variables are absent.
     """
     first = scan.isel(gate=0)
     metrics = noise_metrics(first)

@@ -13,10 +13,7 @@ INCREMENTS = ("largest_load_increment", "largest_bending_increment")
 def load_increments(flight: xr.Dataset) -> dict[str, float]:
     """`INCREMENTS` of a flight; NaN for an aircraft that does not rise, nothing without loads.
 
-    Parameters
-    ----------
-    flight : xr.Dataset, dims (time)
-        A flight from its trim; the bending of the larger of both wings counts.
+    flight (time): a flight from its trim; the bending of the larger of both wings counts.
     """
     if "load_factor" not in flight:
         return {}

@@ -14,17 +14,10 @@ def pareto_front(objectives: ArrayLike, maximised: Sequence[bool] = ()) -> NDArr
     A point is dominated by another that is at least as good in every objective and better in one.
     Of equal points all are on the front.
 
-    Parameters
-    ----------
-    objectives : array (point, objective)
-        NaN: the point is not on the front and dominates none.
-    maximised : sequence of bool
-        Whether larger is better, for each objective; by default smaller is.
+    objectives (point, objective): NaN: the point is not on the front and dominates none.
+    maximised: whether larger is better, for each objective; by default smaller is.
 
-    Raises
-    ------
-    InputError
-        Not one value of ``maximised`` per objective.
+    Raises InputError: not one value of ``maximised`` per objective.
     """
     values = np.array(objectives, dtype=float)
     if values.ndim != 2 or (len(maximised) and len(maximised) != values.shape[1]):

@@ -10,18 +10,11 @@ import numpy as np
 class ScanPointing:
     """Times and places of the beams of two scans, in the plane in the middle of their gates.
 
-    Attributes
-    ----------
-    y, z : (columns,), (rows,) arrays
-        Nodes of the image, ascending, m.
-    dt : float
-        Time between the scans, s.
-    time : (2, n) array
-        Of each beam from its scan's reference time, s, in film order.
-    places : (2, n, 2) array
-        y and z as reported, m.
-    errors : (2, n, 2) array
-        True less reported, m.
+    y, z (columns,), (rows,) arrays: nodes of the image, ascending, m.
+    dt: time between the scans, s.
+    time (2, n): of each beam from its scan's reference time, s, in film order.
+    places (2, n, 2): y and z as reported, m.
+    errors (2, n, 2): true less reported, m.
     """
 
     y: np.ndarray

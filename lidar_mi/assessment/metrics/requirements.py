@@ -64,21 +64,14 @@ class RequirementTable:
 class Finding:
     """One row, judged.
 
-    Attributes
-    ----------
-    quantity : str
-        A key of `QUANTITIES`.
-    minimum, maximum : float
-        Required limits at the measured range; NaN if they depend on a range and there is none.
-    measured : float
-        NaN: not known.
-    passed : bool or None
-        None: not judged.
-    margin : float
-        Distance from the nearer limit as a fraction of it: 0.2 is 20 % better than required, -0.2
-        20 % worse; NaN where not judged.
-    reason : str
-        Why it is not judged; empty where it is.
+    quantity: a key of `QUANTITIES`.
+    minimum, maximum: required limits at the measured range; NaN if they depend on a range and there
+        is none.
+    measured: NaN: not known.
+    passed: none: not judged.
+    margin: distance from the nearer limit as a fraction of it: 0.2 is 20 % better than required,
+        -0.2 20 % worse; NaN where not judged.
+    reason: why it is not judged; empty where it is.
     """
 
     quantity: str
@@ -95,10 +88,8 @@ def read_requirements(
 ) -> dict[tuple[str, str], RequirementTable]:
     """Requirement tables by (application, phase of flight), from a YAML file like the shipped one.
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read, a row or a limit that is not known, a value with a wrong unit.
+    Raises InputError: a file that cannot be read, a row or a limit that is not known, a value with
+    a wrong unit.
     """
     data = read_yaml(str(path), "a requirement table")
     tables = {}
@@ -119,18 +110,9 @@ def judge(
 ) -> list[Finding]:
     """A sensor against a table, row by row.
 
-    Parameters
-    ----------
-    measured : mapping
-        The sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known. Names
-        without a row in the table are ignored.
-    not_judged : mapping
-        Reasons why rows are not judged, by names of `QUANTITIES`, whatever was measured.
-
-    Raises
-    ------
-    InputError
-        An unknown name, or an impossible value.
+    measured: the sensor's values, SI, by names of `QUANTITIES`; None, NaN or absent: not known.
+        Names without a row in the table are ignored.
+    not_judged: reasons why rows are not judged, by names of `QUANTITIES`, whatever was measured.
     """
     for name, value in measured.items():
         _check_name(name, "measured")
@@ -157,13 +139,7 @@ def fulfilled(findings: Sequence[Finding]) -> bool | None:
 
 
 def look_ahead(distance: float, speed: float) -> float:
-    """Time until the aircraft reaches the measured air, s: range over air speed; inf at rest.
-
-    Raises
-    ------
-    InputError
-        A negative distance or speed.
-    """
+    """Time until the aircraft reaches the measured air, s: range over air speed; inf at rest."""
     for name, value, unit in (("range", distance, "m"), ("speed", speed, "m/s")):
         if not value >= 0:
             raise InputError(f"{name}: {value} {unit} is not allowed; expected >= 0 {unit}")

@@ -11,30 +11,21 @@ from lidar_mi.assessment.metrics.names import bound_key, reference_key
 class RingBudget:
     """Light, line and etalon of a Doppler lidar, and limits of its velocities.
 
-    Attributes
-    ----------
-    photons, background_photons, signal : float
-        Of a pulse on the whole image: of the laser, of the sun; photoelectrons of the laser's.
-    line_width, free_spectral_range : float
-        Hz.
-    velocity_range : float
-        Unambiguous range of line-of-sight velocities, m s^-1.
-    speckle_modes : float
-        Degrees of freedom of the speckle in a pixel; inf: no speckle.
-    bound : mapping of str to (float, float)
-        Cramer-Rao bounds of the standard deviation of one image's velocity and of that of its frame
-        of the laser, m s^-1, by whether the centre is "free" or "known"; of averages by the roots
-        of their numbers.
-    relative_error : float
-        Monte Carlo standard error of a rendered image's pixel over its signal, median.
-    largest_error : float
-        Of velocities retrieved from the rendered images without noise, m s^-1.
-    reference_every : int
-        Pulses from one frame of the laser to the next.
-    reference_errors : mapping of str to float
-        Standard errors that no image shows, m s^-1, by cause; of drifts those of a single pulse.
-    scrambling_needed : float
-        Fraction of the light to be scrambled for an error of 0.5 m/s by plates and pupil.
+    photons, background_photons, signal: of a pulse on the whole image: of the laser, of the sun;
+        photoelectrons of the laser's.
+    line_width, free_spectral_range: Hz.
+    velocity_range: unambiguous range of line-of-sight velocities, m s^-1.
+    speckle_modes: degrees of freedom of the speckle in a pixel; inf: no speckle.
+    bound (mapping of str to (float, float)): Cramer-Rao bounds of the standard deviation of one
+        image's velocity and of that of its frame of the laser, m s^-1, by whether the centre is
+        "free" or "known"; of averages by the roots of their numbers.
+    relative_error: Monte Carlo standard error of a rendered image's pixel over its signal, median.
+    largest_error: of velocities retrieved from the rendered images without noise, m s^-1.
+    reference_every: pulses from one frame of the laser to the next.
+    reference_errors: standard errors that no image shows, m s^-1, by cause; of drifts those of a
+        single pulse.
+    scrambling_needed: fraction of the light to be scrambled for an error of 0.5 m/s by plates and
+        pupil.
     """
 
     photons: float

@@ -9,16 +9,10 @@ import numpy as np
 class ScanSafety:
     """Eye safety of the backscatter lidar's beams.
 
-    Attributes
-    ----------
-    permissible_exposure : float
-        Of each pulse, J m^-2.
-    hazard_distance, aided_hazard_distance : float
-        Of one beam, unaided and with binoculars, m.
-    scan_hazard_distance : float
-        Of the whole scan, unaided, m.
-    scan_power : float
-        Average power of all beams, W.
+    permissible_exposure: of each pulse, J m^-2.
+    hazard_distance, aided_hazard_distance: of one beam, unaided and with binoculars, m.
+    scan_hazard_distance: of the whole scan, unaided, m.
+    scan_power: average power of all beams, W.
     """
 
     permissible_exposure: float

@@ -32,24 +32,15 @@ _RESOLUTION, _MISSED = 0.01, 0.25
 class SobolIndices:
     """Fractions of a metric's variance over a design space, by knob.
 
-    Attributes
-    ----------
-    knobs : tuple of str
-    first, total : array (knob,)
-        First-order and total indices, of the part of the metric that is a function of the knobs;
-        NaN where they are undetermined.
-    first_interval, total_interval : array (knob, 2)
-        95 % confidence intervals.
-    explained : float
-        Q2: fraction of the variance over the points that is predicted by the others
+    first, total (knob,): first-order and total indices, of the part of the metric that is a
+        function of the knobs; NaN where they are undetermined.
+    first_interval, total_interval (knob, 2): 95 % confidence intervals.
+    explained: Q2: fraction of the variance over the points that is predicted by the others
         (leave-one-out). The remainder is random, or a dependence too sharp for so few points.
-    between_members : float
-        Fraction of the variance of single members that is between members of the same point; NaN
-        without members.
-    points : int
-        With a value.
-    reason : str
-        Why the indices are undetermined; empty if they are not.
+    between_members: fraction of the variance of single members that is between members of the same
+        point; NaN without members.
+    points: with a value.
+    reason: why the indices are undetermined; empty if they are not.
     """
 
     knobs: tuple[str, ...]
@@ -71,11 +62,8 @@ class SobolIndices:
 def unit_cube(knobs: Mapping[str, ArrayLike], logarithmic: Sequence[str] = ()) -> Array:
     """Knobs mapped to 0 ... 1 by their range in the sample, (point, knob).
 
-    Raises
-    ------
-    InputError
-        Knobs of different lengths, a value that is not finite, a logarithmic knob with a value
-        that is not positive, a knob that does not vary.
+    Raises InputError: knobs of different lengths, a value that is not finite, a logarithmic knob
+    with a value that is not positive, a knob that does not vary.
     """
     columns = []
     for name, samples in knobs.items():
@@ -103,18 +91,12 @@ def sobol_indices(
     The knobs are independent and uniform (or uniform in their logarithm) between the smallest and
     the largest of the sample.
 
-    Parameters
-    ----------
-    knobs : mapping of str to array (point,)
-    values : array (point,) or (point, member)
-        The metric. NaN: no value. The mean over the members of a point is analysed.
-    logarithmic : sequence of str
-        Knobs that were sampled in their logarithm.
+    knobs (point,)
+    values (array (point,) or (point, member)): the metric. NaN: no value. The mean over the members
+        of a point is analysed.
+    logarithmic: knobs that were sampled in their logarithm.
 
-    Raises
-    ------
-    InputError
-        See `unit_cube`; also values of another number of points.
+    Raises InputError: see `unit_cube`; also values of another number of points.
 
     Notes
     -----

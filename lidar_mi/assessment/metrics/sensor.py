@@ -18,16 +18,10 @@ COMPONENTS = ("u", "v", "w")
 class LidarCost:
     """Cost of a lidar's scan, and distances from which eyes are safe.
 
-    Attributes
-    ----------
-    average_power : float
-        W.
-    beams : int
-        Directions that must be measured simultaneously, because of the time of flight.
-    permissible_exposure : float, optional
-        J m^-2, of each pulse; None: its pulses have no duration, hence no limit.
-    hazard_distance, aided_hazard_distance : float, optional
-        m, unaided and with binoculars; None: none, or infinite.
+    average_power: W.
+    beams: directions that must be measured simultaneously, because of the time of flight.
+    permissible_exposure: J m^-2, of each pulse; None: its pulses have no duration, hence no limit.
+    hazard_distance, aided_hazard_distance: m, unaided and with binoculars; None: none, or infinite.
     """
 
     pulses_per_second: float
@@ -46,10 +40,7 @@ def vector_metrics(wind: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, 
     ``coverage_95_*``; ``outside_cores.rmse_*`` beyond two core radii, and ``outside_cores.rms_*``
     of the true wind there; ``spanned_fraction`` of all vectors, between lines of sight.
 
-    Parameters
-    ----------
-    wind : xr.Dataset or None
-        From `combined.combine.combine`, with u_true, v_true, w_true; None: there is no wind.
+    wind: from `combined.combine.combine`, with u_true, v_true, w_true; None: there is no wind.
     """
     if wind is None:
         return {"sensor.valid_fraction": 0.0, "sensor.vectors": 0}
@@ -103,10 +94,7 @@ def without_skill(metrics: Mapping[str, float]) -> list[str]:
 def line_metrics(lines: xr.Dataset) -> dict[str, float]:
     """Number of lines of sight with a velocity, and their errors; m/s.
 
-    Parameters
-    ----------
-    lines : xr.Dataset, dim (line)
-        ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN without a velocity.
+    lines (line): ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN without a velocity.
     """
     error = (lines["v_los"] - lines["v_los_true"]).values
     metrics: dict[str, float] = {
@@ -123,12 +111,8 @@ def line_metrics(lines: xr.Dataset) -> dict[str, float]:
 def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) -> dict[str, float]:
     """Errors of the Doppler lidar's vectors alone, ``sensor.triples.rmse_u`` and so on, m/s.
 
-    Parameters
-    ----------
-    winds : mapping of str to xr.Dataset
-        By combination of lines of sight: u, v, w, flag at z, y.
-    truth : xr.Dataset
-        u, v, w on (z, y).
+    winds: by combination of lines of sight: u, v, w, flag at z, y.
+    truth: u, v, w on (z, y).
     """
     metrics = {}
     for key, wind in winds.items():
@@ -144,11 +128,8 @@ def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) ->
 def limit_metrics(mean_squares: Mapping[str, float]) -> dict[str, float]:
     """Error budget of u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.fraction_u``.
 
-    Parameters
-    ----------
-    mean_squares : mapping of str to float
-        Mean square error of u (m^2 s^-2): with all causes as "", without each of them, and
-        "sampling", the remainder without all. Empty: not known.
+    mean_squares: mean square error of u (m^2 s^-2): with all causes as "", without each of them,
+        and "sampling", the remainder without all. Empty: not known.
     """
     if not mean_squares:
         return {}

@@ -41,14 +41,10 @@ def simulation_metrics(
 ) -> dict[str, float]:
     """Standard deviation of the wind by the simulation's noise, for each method.
 
-    Parameters
-    ----------
-    changes : xr.Dataset, dims (algorithm, z, y)
-        v, w (m s^-1) from `lidar_mi.experiment.stages.simulation_noise.simulation_noise`.
-    winds : xr.Dataset, dims (source, algorithm, z, y)
-        The winds; the last source is that of the changes.
-    cores : sequence of Core
-        True vortices.
+    changes (algorithm, z, y): v, w (m s^-1) from
+        `lidar_mi.experiment.stages.simulation_noise.simulation_noise`.
+    winds (source, algorithm, z, y): the winds; the last source is that of the changes.
+    cores: true vortices.
 
     Returns
     -------
@@ -75,12 +71,8 @@ def simulation_metrics(
 class SimulationPart(NamedTuple):
     """A method's error of v and w together, beyond two core radii where there are cores.
 
-    Attributes
-    ----------
-    fraction : float
-        Of the mean square error that is noise of the simulation, 1 at most.
-    place : str
-        `OUTSIDE_CORES` or nothing.
+    fraction: of the mean square error that is noise of the simulation, 1 at most.
+    place: `OUTSIDE_CORES` or nothing.
     """
 
     method: str
@@ -116,10 +108,7 @@ def largest_parts(metrics: Mapping[str, xr.DataArray]) -> xr.DataArray | None:
 def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> list[SimulationPart]:
     """The parts in winds from the most complete images, by every method with known errors.
 
-    Parameters
-    ----------
-    metrics : mapping of str to float
-        Of a run, with those of `simulation_metrics`; empty without them.
+    metrics: of a run, with those of `simulation_metrics`; empty without them.
     """
     place = far_from_cores(metrics, "true_wind.", "rms_")
     parts = []

@@ -25,14 +25,10 @@ _FEATURES = 512
 class Process:
     """A Gaussian process with fixed hyperparameters, given values at points.
 
-    Attributes
-    ----------
-    points : array (point, variable)
-        In the unit cube.
-    values : array (point,)
-        Of mean 0 and variance 1.
-    logs : array (variable + 1,)
-        Natural logarithms of the correlation lengths and of the ratio of noise to function.
+    points (point, variable): in the unit cube.
+    values (point,): of mean 0 and variance 1.
+    logs (variable + 1,): natural logarithms of the correlation lengths and of the ratio of noise to
+        function.
     """
 
     points: Array

@@ -45,11 +45,9 @@ def velocity_metrics(velocities: "xr.Dataset") -> dict[str, float]:
 
     Undetermined measures are absent.
 
-    Parameters
-    ----------
-    velocities : xr.Dataset
-        ``v`` and ``v_std`` with dims (algorithm, centre, averaged, v_los, image), NaN where there
-        is none, ``v_systematic`` likewise, and ``tried`` (algorithm), the images of every case.
+    velocities: ``v`` and ``v_std`` with dims (algorithm, centre, averaged, v_los, image), NaN where
+        there is none, ``v_systematic`` likewise, and ``tried`` (algorithm), the images of every
+        case.
     """
     metrics = {}
     for algorithm in velocities["algorithm"].values:

@@ -21,10 +21,7 @@ def volume_metrics(winds: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]
     radii, ``all.rmse_u`` over every vector, ``true_wind.rms_u`` of the wind itself at the same
     places.
 
-    Parameters
-    ----------
-    winds : xr.Dataset, dims (source, algorithm, x, z, y)
-        u, v, w, their ``_true`` and ``_stderr`` (m s^-1), flag.
+    winds (source, algorithm, x, z, y): u, v, w, their ``_true`` and ``_stderr`` (m s^-1), flag.
     """
     true = winds[[f"{name}_true" for name in COMPONENTS]]
     true = true.rename({f"{name}_true": name for name in COMPONENTS})

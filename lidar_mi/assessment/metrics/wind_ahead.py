@@ -7,10 +7,8 @@ import xarray as xr
 def wind_ahead_metrics(track: xr.Dataset) -> dict[str, float]:
     """Rms errors (m/s) of v and w, rms of both, and fractions within one and two stated errors.
 
-    Parameters
-    ----------
-    track : xr.Dataset
-        With the wind expected at arrivals, dims (arrival, place); without it there are no metrics.
+    track: with the wind expected at arrivals, dims (arrival, place); without it there are no
+        metrics.
     """
     if "arrival_v" not in track:
         return {}

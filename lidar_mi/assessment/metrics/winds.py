@@ -96,10 +96,7 @@ def true_wind_metrics(
 ) -> dict[str, float]:
     """Rms of the true wind, m/s: a retrieval with errors as large has no skill.
 
-    Parameters
-    ----------
-    wind : xr.Dataset, dims (..., z, y)
-        The true wind at the positions of the vectors.
+    wind (..., z, y): the true wind at the positions of the vectors.
     """
     far = outside_cores(wind["y"].values, wind["z"].values[:, None], list(cores))
     metrics: dict[str, float] = {}
@@ -115,11 +112,8 @@ def true_wind_metrics(
 def sweep_metrics(sweep: xr.Dataset) -> dict[str, float]:
     """Errors by sub-grid texture, ``texture_sweep.10_percent.rmse_v`` and so on.
 
-    Parameters
-    ----------
-    sweep : xr.Dataset, dim (texture)
-        ``rmse_v``, ``rmse_w`` (m s^-1), ``valid_fraction``; NaN, where nothing was retrieved, is
-        omitted.
+    sweep (texture): ``rmse_v``, ``rmse_w`` (m s^-1), ``valid_fraction``; NaN, where nothing was
+        retrieved, is omitted.
     """
     metrics: dict[str, float] = {}
     for rms in sweep["texture"].values:

@@ -40,12 +40,9 @@ _LEAST_DEPARTURE = 3.0
 def answer(experiment: Experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
     """The results of a run in sentences, on the terminal, in the report and in `summary.txt`.
 
-    Parameters
-    ----------
-    metrics : mapping of str to float
-        Of a run.
-    judged : sequence of (RequirementTable, list of Finding)
-        From `lidar_mi.experiment.measure.judged`.
+    metrics: of a run.
+    judged (sequence of (RequirementTable, list of Finding)): from
+        `lidar_mi.experiment.measure.judged`.
 
     Returns
     -------

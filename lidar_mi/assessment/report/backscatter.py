@@ -42,14 +42,10 @@ def backscatter_chapter(
 ) -> Chapter:
     """Images and cross-flow winds of the backscatter lidar.
 
-    Parameters
-    ----------
-    metrics : mapping
-        From `lidar_mi.experiment.measure.measure`.
-    judged : sequence of (RequirementTable, list of Finding)
-        Of this lidar alone; empty: no requirements, or it is one of two.
-    vectors : dict, optional
-        From `vector_map.map_data`.
+    metrics: from `lidar_mi.experiment.measure.measure`.
+    judged (sequence of (RequirementTable, list of Finding)): of this lidar alone; empty: no
+        requirements, or it is one of two.
+    vectors: from `vector_map.map_data`.
     """
     lead = ["A backscatter lidar scans a wake twice; cross-flow winds follow from the two images."]
     if experiment.wake and experiment.wake.turbine:

@@ -34,21 +34,11 @@ _DONE, _FAILED = 0, 1
 def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = None) -> str:
     """The report as HTML; all text of the user is escaped.
 
-    Parameters
-    ----------
-    dataset : xr.Dataset
-        The campaign's data set, as `lidar_mi.assessment.metrics.campaign` describes it, with
+    dataset: the campaign's data set, as `lidar_mi.assessment.metrics.campaign` describes it, with
         ``status``, ``message`` and ``folder`` of every point. Links are relative to the folder of
         the campaign, where the page belongs.
-    resolved : str
-        The campaign with all defaults, as YAML.
-    metrics : sequence of str, optional
-        Names of metrics to show. Default: errors, coverage, vortices, pulses needed.
-
-    Raises
-    ------
-    InputError
-        A metric that the campaign does not have.
+    resolved: the campaign with all defaults, as YAML.
+    metrics: names of metrics to show. Default: errors, coverage, vortices, pulses needed.
     """
     flown = list(encounter_blocks(numbers.metrics_of(dataset)))
     dataset = _in_usual_units(dataset)

@@ -130,16 +130,11 @@ def encounter_chapter(
 ) -> "Chapter":
     """Answer, figures and numbers of a flight.
 
-    Parameters
-    ----------
-    metrics : mapping
-        From `lidar_mi.assessment.metrics.encounter.encounter_metrics`.
-    judged : sequence of (RequirementTable, findings)
-        What was measured in flight against the requirements of flight control.
-    controller : str
-        Name of a controller of one's own.
-    met : {"wake", "air"}
-        What the flights meet.
+    metrics: from `lidar_mi.assessment.metrics.encounter.encounter_metrics`.
+    judged (sequence of (RequirementTable, findings)): what was measured in flight against the
+        requirements of flight control.
+    controller: name of a controller of one's own.
+    met {"wake", "air"}: what the flights meet.
     """
     from lidar_mi.assessment.report.page import Chapter, Tables
 

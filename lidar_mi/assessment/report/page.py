@@ -42,16 +42,11 @@ class Tables(NamedTuple):
 class Film(NamedTuple):
     """A video, or frames with a slider.
 
-    Attributes
-    ----------
-    frames : sequence of (bytes, str)
-        WebP images and what each shows; of a video, the one shown before it plays.
-    seconds : float
-        For which each is shown.
-    video : bytes, optional
-        MP4.
-    animation : str
-        Name of a file beside the report, for browsers that do not play the video.
+    frames (sequence of (bytes, str)): WebP images and what each shows; of a video, the one shown
+        before it plays.
+    seconds: for which each is shown.
+    video: MP4.
+    animation: name of a file beside the report, for browsers that do not play the video.
     """
 
     title: str
@@ -75,16 +70,10 @@ class Picture(NamedTuple):
 class Chapter(NamedTuple):
     """The part of the report on one instrument.
 
-    Attributes
-    ----------
-    lead : sequence of str
-        Paragraphs before the figures.
-    verdict : Tables, optional
-        Compliance with the requirements; placed on the first page.
-    vectors : dict, optional
-        `vector_map.map_data` with a ``title``, for an interactive map of the vectors.
-    film : Film, optional
-        Placed before the figures.
+    lead: paragraphs before the figures.
+    verdict: compliance with the requirements; placed on the first page.
+    vectors: `vector_map.map_data` with a ``title``, for an interactive map of the vectors.
+    film: placed before the figures.
     """
 
     title: str
@@ -108,20 +97,12 @@ def page(
 ) -> str:
     """The report as HTML, with embedded images; all text of the user is escaped.
 
-    Parameters
-    ----------
-    resolved : str
-        The experiment with all defaults, as YAML.
-    versions : mapping
-        Of lidar-mi and the libraries.
-    metrics : mapping
-        All numbers of the run.
-    warnings : sequence of str
-        Those that matter for the results.
-    answer : sequence of str
-        From `lidar_mi.assessment.report.answer.answer`.
-    data : sequence of str
-        Names of files beside the report, which links to them.
+    resolved: the experiment with all defaults, as YAML.
+    versions: of lidar-mi and the libraries.
+    metrics: all numbers of the run.
+    warnings: those that matter for the results.
+    answer: from `lidar_mi.assessment.report.answer.answer`.
+    data: names of files beside the report, which links to them.
     """
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]

@@ -95,12 +95,9 @@ def samples_of(experiment: Experiment, metrics: Mapping[str, float]) -> str:
 def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str]) -> str:
     """At which points of a campaign the error is in part the simulation's; empty: nowhere.
 
-    Parameters
-    ----------
-    dataset : xr.Dataset
-        The campaign's. Points without numbers of the simulation have as small a part as asked for.
-    place : callable
-        A point's coordinates as text, from its indices.
+    dataset: the campaign's. Points without numbers of the simulation have as small a part as asked
+        for.
+    place: a point's coordinates as text, from its indices.
 
     Returns
     -------

@@ -18,16 +18,11 @@ def map_data(
 ) -> dict[str, Any]:
     """Every n-th vector with its truth, standard error and flag, ready for JSON.
 
-    Parameters
-    ----------
-    wind : xr.Dataset, dims (z, y)
-        ``NAME`` and ``NAME_true`` of every component, m/s, v and w among them; ``NAME_stderr``
-        where there are any; ``flag`` with its CF attributes. Vectors are at y_vector, z_vector
-        or, where these are missing, at the nodes.
-    cores : sequence of Core
-        True vortices.
-    colour : str
-        What colours show at first: a component, or the speed of v and w.
+    wind (z, y): ``NAME`` and ``NAME_true`` of every component, m/s, v and w among them;
+        ``NAME_stderr`` where there are any; ``flag`` with its CF attributes. Vectors are at
+        y_vector, z_vector or, where these are missing, at the nodes.
+    cores: true vortices.
+    colour: what colours show at first: a component, or the speed of v and w.
 
     Returns
     -------

@@ -56,12 +56,8 @@ class AirAlongPath:
 
     The wake drifts as a whole. That other air bends, stretches or weakens it is neglected.
 
-    Parameters
-    ----------
-    drift : (float, float, float)
-        Of the wake, m/s, path frame.
-    t_c : float
-        When the wake is at its own place, s.
+    drift: of the wake, m/s, path frame.
+    t_c: when the wake is at its own place, s.
     """
 
     wake: WakeAlongPath | None
@@ -96,10 +92,7 @@ class AirAlongPath:
     def vortices(self, x: float, time: float) -> tuple[Vortex, Vortex]:
         """Port and starboard vortex in the plane x at a time.
 
-        Raises
-        ------
-        InputError
-            There is no wake, or it lies in the plane.
+        Raises InputError: there is no wake, or it lies in the plane.
         """
         if self.wake is None:
             raise InputError("encounter.air.wake: false leaves no vortices; expected true")

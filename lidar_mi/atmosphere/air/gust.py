@@ -18,21 +18,12 @@ _TOWARDS = {"up": (2, 1), "down": (2, -1), "left": (1, 1), "right": (1, -1)}
 class Gust:
     """U/2 (1 - cos(pi s / H)) for 0 <= s <= 2 H, across the path; the same at every y and z.
 
-    Parameters
-    ----------
-    direction : {"up", "down", "left", "right"}
-        In which it blows.
-    gradient : float
-        H, m: half of its length.
-    start : float
-        Where it begins, along x, m.
-    speed : float
-        U, the largest, m/s true airspeed.
+    direction {"up", "down", "left", "right"}: in which it blows.
+    gradient: H, m: half of its length.
+    start: where it begins, along x, m.
+    speed: U, the largest, m/s true airspeed.
 
-    Raises
-    ------
-    InputError
-        Numbers out of range, another direction.
+    Raises InputError: numbers out of range, another direction.
     """
 
     direction: Direction

@@ -31,21 +31,10 @@ class Microburst:
     u_r = lambda R^2/(2 r) (1 - exp(-r^2/R^2)) (exp(-z/z*) - exp(-z/e)),
     w = -lambda exp(-r^2/R^2) (e (exp(-z/e) - 1) - z* (exp(-z/z*) - 1)).
 
-    Parameters
-    ----------
-    outflow : float
-        The largest, m/s; lambda = outflow / (0.2357 R).
-    radius : float
-        R of the downdraft, m.
-    outflow_height : float
-        Height of the largest outflow, m: 0.22 z*. e = z*/12.5.
-    x, y : float
-        Of its axis, m.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
+    outflow: the largest, m/s; lambda = outflow / (0.2357 R).
+    radius: R of the downdraft, m.
+    outflow_height: height of the largest outflow, m: 0.22 z*. e = z*/12.5.
+    x, y: of its axis, m.
     """
 
     outflow: float

@@ -37,21 +37,12 @@ class LogarithmicShear:
     Source: MIL-F-8785C, section 3.7.3.2, with the wind W20 at 20 ft and z0 = 0.15 ft (approach) or
     2 ft; the law is that of Prandtl and von Karman.
 
-    Parameters
-    ----------
-    speed, reference : float
-        Wind (m/s) at a height (m) above the ground.
-    roughness : float
-        z0, m, below the reference.
-    towards : float
-        Direction in which it blows, rad: 0 is a tail wind, pi/2 goes to the left.
-    height : float
-        Of the start, m, where the frame moves with it.
+    speed, reference: wind (m/s) at a height (m) above the ground.
+    roughness: z0, m, below the reference.
+    towards: direction in which it blows, rad: 0 is a tail wind, pi/2 goes to the left.
+    height: of the start, m, where the frame moves with it.
 
-    Raises
-    ------
-    InputError
-        A roughness at or above the reference.
+    Raises InputError: a roughness at or above the reference.
     """
 
     speed: float

@@ -19,15 +19,7 @@ class StandardAir(NamedTuple):
 def standard_atmosphere(altitude: float) -> StandardAir:
     """Air of the U.S. Standard Atmosphere 1976, which is that of ICAO Doc 7488 up to 80 km.
 
-    Parameters
-    ----------
-    altitude : float
-        Geometric height above sea level in m, -5000 to 80 000.
-
-    Raises
-    ------
-    InputError
-        Out of range.
+    altitude: geometric height above sea level in m, -5000 to 80 000.
     """
     from fluids.atmosphere import ATMOSPHERE_1976
 

@@ -47,16 +47,8 @@ def mil_f_8785c(height: float, level: Level) -> tuple[float, float]:
     at 20 ft of 15, 30 or 45 knots. From 2000 ft on: isotropic, 2500 ft, the rms exceeded with a
     probability of 1e-2, 1e-3 or 1e-5 (figure 7). In between both are interpolated linearly.
 
-    Parameters
-    ----------
-    height : float
-        Above the ground, m; below 10 ft the values are those of 10 ft.
-    level : {"light", "moderate", "severe"}
-
-    Raises
-    ------
-    InputError
-        Another level.
+    height: above the ground, m; below 10 ft the values are those of 10 ft.
+    level {"light", "moderate", "severe"}
     """
     if level not in LEVELS:
         raise InputError(f"turbulence.level: {level!r} is not known; expected {', '.join(LEVELS)}")
@@ -88,17 +80,11 @@ def flight_profile_alleviation(
     F_g = (F_gz + F_gm)/2 with F_gz = 1 - Z_mo / 250000 ft and F_gm = sqrt(R2 tan(pi R1/4)); it
     grows linearly with the altitude to 1 at Z_mo.
 
-    Parameters
-    ----------
-    altitude, maximum_altitude : float
-        Of the flight, and Z_mo at which the aeroplane operates; m.
-    landing_weight, zero_fuel_weight : float
-        R1 and R2: the maximum weights over that of take-off, above 0, at most 1.
+    altitude, maximum_altitude: of the flight, and Z_mo at which the aeroplane operates; m.
+    landing_weight, zero_fuel_weight: R1 and R2: the maximum weights over that of take-off, above 0,
+        at most 1.
 
-    Raises
-    ------
-    InputError
-        Weights or a maximum altitude out of range.
+    Raises InputError: weights or a maximum altitude out of range.
     """
     for name, value in (("landing_weight", landing_weight), ("zero_fuel_weight", zero_fuel_weight)):
         if not 0 < value <= 1:
@@ -123,10 +109,7 @@ def design_gust_speed(altitude: float, gradient: float, alleviation: float = 1.0
 
     The altitude (m) is in the standard atmosphere; the gradient H is in m, F_g is the alleviation.
 
-    Raises
-    ------
-    InputError
-        A gradient or an alleviation factor out of range.
+    Raises InputError: a gradient or an alleviation factor out of range.
     """
     low, high = GRADIENTS
     # a gradient in rounded metres is within the range in feet

@@ -45,15 +45,10 @@ def energy_spectrum(k: ArrayLike, sigma: float, length: float, spectrum: Spectru
     Kolmogorov: sigma^2 k0^(2/3) k^(-5/3) from k0 on, nothing below. k0 = 1.306/L makes the inertial
     range, and with it the dissipation, that of von Karman's spectrum.
 
-    Parameters
-    ----------
-    k : array_like
-        Wavenumber, rad/m.
-    sigma : float
-        Rms of one component, m/s.
-    length : float
-        L, the integral scale along the wind of von Karman's spectrum, m.
-    spectrum : {"von_karman", "kolmogorov"}
+    k: wavenumber, rad/m.
+    sigma: rms of one component, m/s.
+    length: L, the integral scale along the wind of von Karman's spectrum, m.
+    spectrum {"von_karman", "kolmogorov"}
     """
     k = np.asarray(k, float)
     if spectrum == "von_karman":
@@ -71,12 +66,8 @@ class Turbulence:
     u(x, t) = sum over modes of a cos(k x - w t) + b sin(k x - w t) with a and b normal to k. Every
     octave of wavenumbers has the same number of modes, with the energy of the spectrum.
 
-    Attributes
-    ----------
-    waves : ndarray, shape (4, modes)
-        k (rad/m) and -w (rad/s) of every mode.
-    amplitudes : ndarray, shape (2, modes, 3)
-        a and b, m/s.
+    waves (4, modes): k (rad/m) and -w (rad/s) of every mode.
+    amplitudes (2, modes, 3): a and b, m/s.
     """
 
     waves: np.ndarray
@@ -112,27 +103,16 @@ def turbulence(
 ) -> Turbulence:
     """A realisation of turbulence.
 
-    Parameters
-    ----------
-    sigma : float
-        Rms of one component, m/s, >= 0, of the whole spectrum.
-    length : float
-        Length scale, m, of `energy_spectrum`.
-    spectrum : {"von_karman", "kolmogorov"}
-    shortest : float
-        Shortest wavelength, m, at most a tenth of the length. Finer turbulence is missing.
-    evolution : {"frozen", "turnover", "sweeping"}
-        In the frame of the mean wind. Frozen (Taylor): at rest. Turnover: the rates of the modes
-        are normal with a standard deviation of `UNSTEADINESS` sqrt(k^3 E(k)). Sweeping: of sigma k,
-        as large eddies carry small ones past a place (Tennekes, J. Fluid Mech. 67, 561-567, 1975);
-        waves lose their correlation as exp(-(sigma k t)^2/2).
-    modes : int
-        60 or more.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
+    sigma: rms of one component, m/s, >= 0, of the whole spectrum.
+    length: length scale, m, of `energy_spectrum`.
+    spectrum {"von_karman", "kolmogorov"}
+    shortest: shortest wavelength, m, at most a tenth of the length. Finer turbulence is missing.
+    evolution {"frozen", "turnover", "sweeping"}: in the frame of the mean wind. Frozen (Taylor): at
+        rest. Turnover: the rates of the modes are normal with a standard deviation of
+        `UNSTEADINESS` sqrt(k^3 E(k)). Sweeping: of sigma k, as large eddies carry small ones past a
+        place (Tennekes, J. Fluid Mech. 67, 561-567, 1975); waves lose their correlation as
+        exp(-(sigma k t)^2/2).
+    modes: 60 or more.
     """
     for name, value, allowed, words in (
         ("sigma", sigma, sigma >= 0, "0 m/s or more"),

@@ -24,10 +24,7 @@ def divergence_fraction(flow: xr.Dataset) -> float:
 
     0 for a field without divergence, 0.577 for independent isotropic noise in each component.
 
-    Parameters
-    ----------
-    flow : xarray.Dataset
-        u, v and w on (x, y, z), even.
+    flow: u, v and w on (x, y, z), even.
     """
     axes = [flow[name].values for name in "xyz"]
     gradients = np.array(
@@ -46,24 +43,14 @@ class AirVolume:
     that the mean wind carries to the same instant. Beyond its edges the wind is that at the edge:
     `missing` says where places are outside.
 
-    Parameters
-    ----------
-    flow : xarray.Dataset
-        u, v and w (m/s) on (x, y, z), m, even, 4 nodes or more along each; z above the ground. With
-        the dimension time (s, ascending, 0 as the path starts) it is a series of states.
-    start : float
-        x in the volume of the start of the path, m.
-    centre : float
-        y in the volume of the path, m.
-    height : float
-        At which the mean wind is that of the frame, m.
-    largest_divergence : float
-        Rms of the divergence over that of the velocity gradient, at most.
+    flow: u, v and w (m/s) on (x, y, z), m, even, 4 nodes or more along each; z above the ground.
+        With the dimension time (s, ascending, 0 as the path starts) it is a series of states.
+    start: x in the volume of the start of the path, m.
+    centre: y in the volume of the path, m.
+    height: at which the mean wind is that of the frame, m.
+    largest_divergence: rms of the divergence over that of the velocity gradient, at most.
 
-    Raises
-    ------
-    InputError
-        Fewer nodes, or a field with divergence.
+    Raises InputError: fewer nodes, or a field with divergence.
     """
 
     flow: xr.Dataset

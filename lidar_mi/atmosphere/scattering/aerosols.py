@@ -14,14 +14,9 @@ from lidar_mi.errors import InputError
 class LogNormal:
     """n(r) ~ exp(-ln^2(r/median)/(2 ln^2 sigma))/r.
 
-    Parameters
-    ----------
-    median : float
-        Median radius (of number) in m.
-    sigma : float
-        Geometric standard deviation, > 1.
-    smallest, largest : float
-        Radii in m between which particles exist; see `Aerosol.area_left_out`.
+    median: median radius (of number) in m.
+    sigma: geometric standard deviation, > 1.
+    smallest, largest: radii in m between which particles exist; see `Aerosol.area_left_out`.
     """
 
     median: float
@@ -38,14 +33,9 @@ class LogNormal:
 class ModifiedGamma:
     """n(r) ~ r^alpha exp(-(alpha/gamma) (r/mode)^gamma) (Deirmendjian 1969).
 
-    Parameters
-    ----------
-    mode : float
-        Radius of the largest n(r) in m.
-    alpha, gamma : float
-        > 0.
-    smallest, largest : float
-        Radii in m between which particles exist.
+    mode: radius of the largest n(r) in m.
+    alpha, gamma: > 0.
+    smallest, largest: radii in m between which particles exist.
     """
 
     mode: float
@@ -64,22 +54,12 @@ class ModifiedGamma:
 class Aerosol:
     """A kind of particle: shape, material, sizes, and how many there usually are.
 
-    Parameters
-    ----------
-    name, source : str
-        `source` says where the numbers come from.
-    sizes : LogNormal or ModifiedGamma
-        Of the radius of the sphere of equal volume.
-    index : tuple of (wavelength in m, complex refractive index)
-        Positive imaginary part absorbs. Linear between the wavelengths, undefined beyond them.
-    elongation : float
-        Length over width of a prolate spheroid; 1 is a sphere.
-    number_density : float
-        Typical particles per m^3.
-
-    Raises
-    ------
-    InputError
+    name, source: `source` says where the numbers come from.
+    sizes: of the radius of the sphere of equal volume.
+    index (tuple of (wavelength in m, complex refractive index)): positive imaginary part absorbs.
+        Linear between the wavelengths, undefined beyond them.
+    elongation: length over width of a prolate spheroid; 1 is a sphere.
+    number_density: typical particles per m^3.
     """
 
     name: str
@@ -120,10 +100,7 @@ class Aerosol:
     def refractive_index(self, wavelength: float) -> complex:
         """Refractive index at a wavelength in m.
 
-        Raises
-        ------
-        InputError
-            Outside the wavelengths that `index` gives.
+        Raises InputError: outside the wavelengths that `index` gives.
         """
         nodes = [node for node, _ in self.index]
         # a relative 1e-9 forgives the rounding of "532 nm"
@@ -237,13 +214,7 @@ AEROSOLS: dict[str, Aerosol] = {
 
 
 def aerosol(name: str) -> Aerosol:
-    """The aerosol of this name.
-
-    Raises
-    ------
-    InputError
-        No such name.
-    """
+    """The aerosol of this name."""
     if name not in AEROSOLS:
         raise InputError(
             f"aerosol: {name!r} is not known; expected one of {', '.join(sorted(AEROSOLS))}"
@@ -263,24 +234,14 @@ def changed(
 ) -> Aerosol:
     """A named aerosol with some of its numbers changed; what is None stays.
 
-    Parameters
-    ----------
-    name : str
-        A name in `AEROSOLS`.
-    wavelength : float
-        m, at which ``index`` holds.
-    new_name : str, optional
-        Needed when something is changed.
-    index, elongation, number_density
-        As in `Aerosol`; the index at one wavelength.
-    **sizes
-        ``radius`` (median of a log-normal, mode of a modified gamma distribution), ``smallest``,
-        ``largest`` in m; ``sigma`` of a log-normal one.
+    name: a name in `AEROSOLS`.
+    wavelength: m, at which ``index`` holds.
+    new_name: needed when something is changed.
+    index, elongation, number_density: as in `Aerosol`; the index at one wavelength.
+    **sizes: ``radius`` (median of a log-normal, mode of a modified gamma distribution),
+        ``smallest``, ``largest`` in m; ``sigma`` of a log-normal one.
 
-    Raises
-    ------
-    InputError
-        Unknown name, a number out of range, or a change without a new name.
+    Raises InputError: unknown name, a number out of range, or a change without a new name.
     """
     particles = aerosol(name)
     numbers = {"elongation": elongation, "number_density": number_density}

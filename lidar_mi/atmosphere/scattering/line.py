@@ -27,19 +27,9 @@ _FWHM = 2 * math.sqrt(2 * math.log(2))
 class Line:
     """A spectral line as a sum of Gaussians about the laser's frequency.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum, of the laser; the zero of the offsets.
-    weights : array (K,)
-        Fraction of the photons in each Gaussian, 0 or more, with a sum of one.
-    offsets, sigmas : array (K,)
-        Centres and standard deviations, Hz; sigma 0 is a monochromatic line.
-
-    Raises
-    ------
-    InputError
-        Numbers out of range.
+    wavelength: m, in vacuum, of the laser; the zero of the offsets.
+    weights (K,): fraction of the photons in each Gaussian, 0 or more, with a sum of one.
+    offsets, sigmas (K,): centres and standard deviations, Hz; sigma 0 is a monochromatic line.
     """
 
     wavelength: float
@@ -95,10 +85,7 @@ class Line:
         place better than to 1 / (N information)^(1/2) (Cramer-Rao), which an ideal spectral
         analyser does.
 
-        Raises
-        ------
-        InputError
-            A line with a monochromatic part, whose place has no error.
+        Raises InputError: a line with a monochromatic part, whose place has no error.
         """
         if not self.sigmas.all():
             raise InputError("line.sigmas: 0 Hz is not allowed; expected a line with a width")
@@ -175,10 +162,7 @@ def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -
     to 0.85 % of the peak; the missing wings leave an rms 0.4 % (y = 0.17) to 1.5 % (y = 1) below
     that of molecules without collisions, which it should equal.
 
-    Raises
-    ------
-    InputError
-        y beyond 1.027, where the fit ends.
+    Raises InputError: y beyond 1.027, where the fit ends.
     """
     _check("pressure", pressure, pressure >= 0, "0 Pa or more")
     unit = math.sqrt(2) * rayleigh_width(wavelength, temperature) / _FWHM
@@ -209,21 +193,11 @@ def backscatter_line(
 ) -> Line:
     """Line of the backscatter of air at rest, molecules and aerosol, with the laser's own width.
 
-    Parameters
-    ----------
-    wavelength, temperature, pressure : float
-        m, K, Pa; see `lidar_mi.atmosphere.air.standard_atmosphere`.
-    laser_width : float
-        Full width at half maximum of the emitted line, Hz.
-    aerosol_fraction : float
-        Fraction of the backscattered photons from aerosol, 0 to 1; aerosol is too
+    wavelength, temperature, pressure: m, K, Pa; see `lidar_mi.atmosphere.air.standard_atmosphere`.
+    laser_width: full width at half maximum of the emitted line, Hz.
+    aerosol_fraction: fraction of the backscattered photons from aerosol, 0 to 1; aerosol is too
         heavy to broaden the line.
-    shape : {"rayleigh", "rayleigh_brillouin"}
-        Of the molecular line.
-
-    Raises
-    ------
-    InputError
+    shape {"rayleigh", "rayleigh_brillouin"}: of the molecular line.
     """
     if shape not in SHAPES:
         raise InputError(f"shape: {shape!r} is not allowed; expected one of {', '.join(SHAPES)}")

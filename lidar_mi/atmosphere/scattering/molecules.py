@@ -140,20 +140,11 @@ def molecular_scattering(
 ) -> MolecularScattering:
     """Optical properties of molecular air that a lidar measurement depends on.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum.
-    pressure, temperature : float
-        Pa, K; see `lidar_mi.atmosphere.air.standard_atmosphere`.
-    band : {"cabannes", "rayleigh"}
-        What the receiver lets through: the Cabannes line (narrow filter) or all of it.
-    co2 : float
-        Volume fraction.
-
-    Raises
-    ------
-    InputError
+    wavelength: m, in vacuum.
+    pressure, temperature: Pa, K; see `lidar_mi.atmosphere.air.standard_atmosphere`.
+    band {"cabannes", "rayleigh"}: what the receiver lets through: the Cabannes line (narrow filter)
+        or all of it.
+    co2: volume fraction.
     """
     king = king_factor(wavelength, co2)
     # extinction is by the whole band, the received light that of one

@@ -52,22 +52,13 @@ def make_table(
 ) -> ScatteringTable:
     """The scattering table of an aerosol: averages over sizes and, for spheroids, orientations.
 
-    Parameters
-    ----------
-    particles : Aerosol or str
-        An aerosol or the name of one in `AEROSOLS`.
-    wavelength : float
-        m, in vacuum.
-    nodes : int, optional
-        Sizes to compute; default 128 for spheroids, 10 000 for spheres, with which the lidar
+    particles: an aerosol or the name of one in `AEROSOLS`.
+    wavelength: m, in vacuum.
+    nodes: sizes to compute; default 128 for spheroids, 10 000 for spheres, with which the lidar
         ratio has converged to 0.5 %.
-    notice : callable, optional
-        Called with a text that names the work and the fraction of it that is done.
+    notice: called with a text that names the work and the fraction of it that is done.
 
-    Raises
-    ------
-    InputError
-        Unknown name, no refractive index at this wavelength, ``scatrs`` missing.
+    Raises InputError: unknown name, no refractive index at this wavelength, ``scatrs`` missing.
 
     Notes
     -----

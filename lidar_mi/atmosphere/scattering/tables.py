@@ -31,27 +31,17 @@ _TOLERANCE = 1e-5
 class ScatteringTable:
     """What one kind of particle, or a mixture, does to light of one wavelength.
 
-    Parameters
-    ----------
-    wavelength : float
-        m, in vacuum.
-    angle : array (N,)
-        Scattering angle in degrees, rising from 0 to 180; values between are linear in angle.
-    elements : array (N, 6)
-        a1, a2, a3, a4, b1, b2; a1 averages to one over the sphere.
-    extinction_cross_section : float
-        m^2 per particle (the mean over the size distribution).
-    albedo : float
-        Single-scattering albedo.
-    number_density : float
-        Particles per m^3 that go with this table.
-    provenance : str
-        One line: the source of the numbers.
+    wavelength: m, in vacuum.
+    angle (N,): scattering angle in degrees, rising from 0 to 180; values between are linear in
+        angle.
+    elements (N, 6): a1, a2, a3, a4, b1, b2; a1 averages to one over the sphere.
+    extinction_cross_section: m^2 per particle (the mean over the size distribution).
+    albedo: single-scattering albedo.
+    number_density: particles per m^3 that go with this table.
+    provenance: one line: the source of the numbers.
 
-    Raises
-    ------
-    InputError
-        A number out of range, or a matrix that no collection of particles can have (`check`).
+    Raises InputError: a number out of range, or a matrix that no collection of particles can have
+    (`check`).
     """
 
     name: str
@@ -132,10 +122,6 @@ def check(table: ScatteringTable) -> None:
     Mee 1986, Astron. Astrophys. 157, 301); the symmetry relations forward (a2 = a3, b1 = b2 = 0)
     and backward (a2 = -a3, a4 = a1 - 2 a2, b1 = b2 = 0; van de Hulst 1957, sec. 5.2;
     Mishchenko & Hovenier 1995).
-
-    Raises
-    ------
-    InputError
     """
     label = f"scattering table {table.name!r}"
     numbers = {
@@ -218,10 +204,7 @@ def rayleigh_table(
 ) -> ScatteringTable:
     """The scattering matrix of molecules (Hansen & Travis 1974, eqs. 2.15-2.17).
 
-    Parameters
-    ----------
-    depolarization : float
-        Depolarisation factor of natural light at 90 degrees, 0 <= d < 0.5.
+    depolarization: depolarisation factor of natural light at 90 degrees, 0 <= d < 0.5.
 
     Notes
     -----
@@ -267,21 +250,14 @@ def mix(
 
     Matrices add weighted by scattering coefficient, albedos by extinction coefficient.
 
-    Parameters
-    ----------
-    tables : sequence of ScatteringTable
-        All of one wavelength.
-    extinctions : sequence of float
-        Extinction coefficient of each in m^-1, >= 0, not all zero. Their sum is the mixture's.
+    tables: all of one wavelength.
+    extinctions: extinction coefficient of each in m^-1, >= 0, not all zero. Their sum is the
+        mixture's.
 
     Returns
     -------
     ScatteringTable
         On the union of all angles. `extinction_cross_section` is the mean over all particles.
-
-    Raises
-    ------
-    InputError
     """
     tables, extinctions = list(tables), [float(value) for value in extinctions]
     if not tables or len(tables) != len(extinctions):

@@ -62,13 +62,7 @@ class WakeOf(NamedTuple):
 
 
 def aircraft_type(designator: str) -> AircraftType:
-    """An aircraft type by its ICAO designator.
-
-    Raises
-    ------
-    InputError
-        One that is not in the table.
-    """
+    """An aircraft type by its ICAO designator."""
     if designator not in TYPES:
         raise InputError(f"{designator!r} is not known; allowed: {', '.join(TYPES)}")
     return TYPES[designator]

@@ -63,20 +63,12 @@ def crow_filaments(
     impulse is conserved (Saffman 1992, section 3.2). It keeps this shape: real rings swing between
     long and wide (Dhanak and de Bernardinis, J. Fluid Mech. 109, 189-216, 1981).
 
-    Parameters
-    ----------
-    amplitude : float
-        m, >= 0.
-    separation, wavelength, core_radius : float
-        m.
-    model : {"lamb_oseen", "burnham_hallock"}
-    phase : float
-        Of the sine at s = 0, rad; rings have their middles where the sine is 1.
+    amplitude: m, >= 0.
+    separation, wavelength, core_radius: m.
+    model {"lamb_oseen", "burnham_hallock"}
+    phase: of the sine at s = 0, rad; rings have their middles where the sine is 1.
 
-    Raises
-    ------
-    InputError
-        A wave shorter than the separation, cores that are not thin.
+    Raises InputError: a wave shorter than the separation, cores that are not thin.
     """
     if wavelength < separation:
         raise InputError(

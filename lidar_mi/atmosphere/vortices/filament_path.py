@@ -29,13 +29,9 @@ class FilamentsAlongPath:
     circulation decays. What the lines do to their own shape in the seconds between scan and
     passage is neglected.
 
-    Parameters
-    ----------
-    pair : PairAlongPath
-        Circulation, separation, core, place, time, decay, wavelength and phase of the waves. Its
+    pair: circulation, separation, core, place, time, decay, wavelength and phase of the waves. Its
         `mean_wind` and `crow_amplitude` are 0.
-    amplitude : float
-        Of the waves, m; from that of linking on there are rings.
+    amplitude: of the waves, m; from that of linking on there are rings.
     """
 
     pair: PairAlongPath
@@ -115,11 +111,8 @@ class FilamentsAlongPath:
         Their places are where the lines cross the plane; cores are given by the circle of their
         area.
 
-        Raises
-        ------
-        InputError
-            A plane that does not cut both vortices once: between rings, along their ends, or along
-            the wake.
+        Raises InputError: a plane that does not cut both vortices once: between rings, along their
+        ends, or along the wake.
         """
         pair = self.pair
         check_cut(pair.axes[0], pair.crossing_angle)

@@ -65,10 +65,7 @@ class FilamentTable:
     of a period: the filaments are symmetric to the plane between both vortices, and about their
     crests. ``crest`` is the s of one (m).
 
-    Raises
-    ------
-    InputError
-        Cores too thin for the grids.
+    Raises InputError: cores too thin for the grids.
     """
 
     def __init__(self, filaments: Filaments, crest: float) -> None:

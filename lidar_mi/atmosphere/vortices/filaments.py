@@ -29,12 +29,8 @@ _CHUNK = 20_000
 class Curve:
     """One closed or endless line of a period, in the direction of its vorticity.
 
-    Attributes
-    ----------
-    places : (n, 3) array
-        Nodes, m, at equal steps of a smooth periodic parameter.
-    steps : (n, 3) array
-        Derivative of the place by the parameter, times its step, m.
+    places (n, 3): nodes, m, at equal steps of a smooth periodic parameter.
+    steps (n, 3): derivative of the place by the parameter, times its step, m.
     """
 
     places: np.ndarray
@@ -51,20 +47,14 @@ class Filaments:
     in three dimensions, g = erf(r/(2^(1/2) s)) - (2/pi)^(1/2) (r/s) exp(-r^2/2s^2) with
     s = r_c/(2 * 1.2564)^(1/2) (Leonard 1985), that of Lamb-Oseen. Both are free of divergence.
 
-    Parameters
-    ----------
-    curves : sequence of Curve
-        Of one period. Together they have no circulation in planes across s.
-    period : float
-        m.
-    core_radius : float
-        Of the straight vortex: radius of the largest tangential speed, m.
-    model : {"lamb_oseen", "burnham_hallock"}
-    separation : float
-        m. The lines beyond the images are those of a straight pair of this separation, whose
-        impulse they have: separation times period is the area of the curves as seen from above.
-    images : int
-        Periods on each side of the nearest one.
+    curves: of one period. Together they have no circulation in planes across s.
+    period: m.
+    core_radius: of the straight vortex: radius of the largest tangential speed, m.
+    model {"lamb_oseen", "burnham_hallock"}
+    separation: m. The lines beyond the images are those of a straight pair of this separation,
+        whose impulse they have: separation times period is the area of the curves as seen from
+        above.
+    images: periods on each side of the nearest one.
     """
 
     curves: Sequence[Curve]

@@ -33,27 +33,15 @@ class PairAboveGround:
     section 155): it sinks to half of its separation and spreads. The boundary layer at the
     ground, whose vorticity makes real vortices rise again, is not there.
 
-    Parameters
-    ----------
-    circulation, separation, core_radius : float
-        At age 0, m^2/s and m.
-    height : float
-        Of both vortices at age 0, m.
-    last : float
-        Latest time that is asked for, s; the first is 0.
-    age : float
-        At time 0, s.
-    decay_time : float, optional
-        s, in which circulation falls to 1/e.
-    crosswind : callable
-        `Crosswind`.
-    ground : bool
-        With images.
+    circulation, separation, core_radius: at age 0, m^2/s and m.
+    height: of both vortices at age 0, m.
+    last: latest time that is asked for, s; the first is 0.
+    age: at time 0, s.
+    decay_time: s, in which circulation falls to 1/e.
+    crosswind: `Crosswind`.
+    ground: with images.
 
-    Raises
-    ------
-    InputError
-        A pair that is no pair, or below the ground.
+    Raises InputError: a pair that is no pair, or below the ground.
     """
 
     circulation: float

@@ -25,21 +25,13 @@ LAMB_OSEEN_CONSTANT = 1.2564
 class Vortex:
     """A straight vortex along x.
 
-    Parameters
-    ----------
-    circulation : float
-        Gamma in m^2 s^-1; positive rotates about +x (port vortex of a wake).
-    core_radius : float
-        Radius of the largest tangential speed, m, > 0.
-    y, z : float
-        Position of the axis, m.
-    model : {"lamb_oseen", "burnham_hallock"}
-        Swirl profile, see `tangential_speed`.
+    circulation: Gamma in m^2 s^-1; positive rotates about +x (port vortex of a wake).
+    core_radius: radius of the largest tangential speed, m, > 0.
+    y, z: position of the axis, m.
+    model {"lamb_oseen", "burnham_hallock"}: swirl profile, see `tangential_speed`.
 
-    Raises
-    ------
-    InputError
-        For a core radius that is not positive, values that are not finite, an unknown model.
+    Raises InputError: for a core radius that is not positive, values that are not finite, an
+    unknown model.
     """
 
     circulation: float
@@ -128,10 +120,7 @@ def vortex_pair(
     down. Separation and core radius default to the paper's 47.1 m and 3 m. Both are about (y, z);
     lengths are in m, Gamma_0 > 0 in m^2 s^-1.
 
-    Raises
-    ------
-    InputError
-        For a separation or circulation that is not positive.
+    Raises InputError: for a separation or circulation that is not positive.
     """
     _check_pair(circulation, separation)
     half = separation / 2
@@ -163,14 +152,9 @@ def descent_speed(circulation: float, separation: float) -> float:
 def pair_wake(vortices: Sequence[Vortex], y: ArrayLike, z: ArrayLike, x: float = 0.0) -> xr.Dataset:
     """The flow of analytic vortices in the layout of `lidar_mi.io.wake_file.read_wake`.
 
-    Parameters
-    ----------
-    vortices : sequence of Vortex
-        For example from `vortex_pair`.
-    y, z : array_like
-        The axes, m, 1-D, ascending.
-    x : float
-        Place of the single plane, m.
+    vortices: for example from `vortex_pair`.
+    y, z: the axes, m, 1-D, ascending.
+    x: place of the single plane, m.
 
     Returns
     -------

@@ -20,10 +20,7 @@ _UNEVEN = 1e-3
 def check_nodes(spacing: float, counts: Mapping[str, int], most: int = MOST_NODES) -> None:
     """Whether as many nodes along each axis fit into memory, several fields of them.
 
-    Raises
-    ------
-    InputError
-        More than ``most`` nodes. 1e8 take 0.8 GB per field.
+    Raises InputError: more than ``most`` nodes. 1e8 take 0.8 GB per field.
     """
     if math.prod(counts.values()) > most:
         counted = " x ".join(f"{count} ({name})" for name, count in counts.items())
@@ -45,11 +42,8 @@ def resample(
     the range of their data, which a spline exceeds at sharp edges (a tracer would go negative
     there). The spacing (m) is at most the extent; ``most`` nodes are allowed.
 
-    Raises
-    ------
-    InputError
-        A spacing that is not positive, is larger than an extent or gives too many nodes, fewer than
-        4 nodes.
+    Raises InputError: a spacing that is not positive, is larger than an extent or gives too many
+    nodes, fewer than 4 nodes.
     """
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"wake.spacing: {spacing} m is not allowed; it must be > 0 m")
@@ -110,22 +104,15 @@ def centre(
 ) -> xr.Dataset:
     """Translate the wake: its point (y, z) to `about` in the lidar frame, by default the beam axis.
 
-    Parameters
-    ----------
-    y, z : float, optional
-        m, in the wake's own frame and inside it; default: the middle of the domain.
-    about : (float, float)
-        y and z in the lidar frame, m.
+    y, z: m, in the wake's own frame and inside it; default: the middle of the domain.
+    about: y and z in the lidar frame, m.
+
+    Raises InputError: a centre outside the wake.
 
     Returns
     -------
     xarray.Dataset
         The same values on shifted axes.
-
-    Raises
-    ------
-    InputError
-        A centre outside the wake.
     """
     shifted = wake
     for name, place, target in (("y", y, about[0]), ("z", z, about[1])):

@@ -34,11 +34,6 @@ def sarpkaya_decay_time(circulation: float, separation: float, dissipation_rate:
     """Time in which the circulation of a pair falls to 1/e, s.
 
     Circulation (m^2/s) and separation (m) are those at age 0, the dissipation rate is in m^2/s^3.
-
-    Raises
-    ------
-    InputError
-        A negative dissipation rate.
     """
     if not dissipation_rate >= 0:
         raise InputError(

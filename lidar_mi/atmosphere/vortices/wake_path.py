@@ -72,10 +72,7 @@ def cut_radius(core_radius: float, tangent: np.ndarray) -> float:
 def check_cut(along: np.ndarray, crossing_angle: float) -> None:
     """Whether planes across the path cut a wake with this axis.
 
-    Raises
-    ------
-    InputError
-        A wake that lies in the plane.
+    Raises InputError: a wake that lies in the plane.
     """
     if along[0] < _LEAST_ALONG:
         raise InputError(
@@ -94,32 +91,21 @@ class PairAlongPath:
     slopes dz/dx = -tan(climb_angle) and dy/dx = tan(crossing_angle) / cos(climb_angle). The pair
     descends by its mutual induction and drifts with the mean wind.
 
-    Parameters
-    ----------
-    circulation : float
-        m^2 s^-1, > 0, at age 0.
-    separation, core_radius : float
-        m, across the wake's axis.
-    model : {"lamb_oseen", "burnham_hallock"}
-    crossing_angle, climb_angle : float
-        rad; the first from 0 to pi/2, positive: the wake's axis goes to the left ahead.
-    x_c, t_c : float
-        Where along the path (m) and when (s) the centre of the pair is met.
-    miss : (float, float)
-        y and z (m) of the centre of the pair from the path, at x_c and t_c.
-    mean_wind : (float, float)
-        v and w, m s^-1.
-    decay_time : float, optional
-        s, in which the circulation falls to 1/e.
-    crow_amplitude, crow_wavelength : float
-        m; by default no deformation, and 8.6 separations. Each vortex is displaced by amplitude
-        times a sine along the axis, in planes inclined by 45 degrees, the direction in which the
-        partner's strain stretches it: outward and up, inward and down (Crow 1970, in the limit of
-        long waves). The sine moves with the pair and does not grow.
-    crow_phase : float
-        Of the sine at the wake's centre, rad.
-    age : float
-        At time 0, s.
+    circulation: m^2 s^-1, > 0, at age 0.
+    separation, core_radius: m, across the wake's axis.
+    model {"lamb_oseen", "burnham_hallock"}
+    crossing_angle, climb_angle: rad; the first from 0 to pi/2, positive: the wake's axis goes to
+        the left ahead.
+    x_c, t_c: where along the path (m) and when (s) the centre of the pair is met.
+    miss: y and z (m) of the centre of the pair from the path, at x_c and t_c.
+    mean_wind: v and w, m s^-1.
+    decay_time: s, in which the circulation falls to 1/e.
+    crow_amplitude, crow_wavelength: m; by default no deformation, and 8.6 separations. Each vortex
+        is displaced by amplitude times a sine along the axis, in planes inclined by 45 degrees, the
+        direction in which the partner's strain stretches it: outward and up, inward and down (Crow
+        1970, in the limit of long waves). The sine moves with the pair and does not grow.
+    crow_phase: of the sine at the wake's centre, rad.
+    age: at time 0, s.
 
     Notes
     -----
@@ -236,10 +222,7 @@ class PairAlongPath:
         Their places are where the axes cross the plane. The circulation through the plane is that
         across the axis (Stokes); the core, an ellipse there, is given by the circle of its area.
 
-        Raises
-        ------
-        InputError
-            A wake that lies in the plane.
+        Raises InputError: a wake that lies in the plane.
         """
         along, left, _ = self.axes
         check_cut(along, self.crossing_angle)

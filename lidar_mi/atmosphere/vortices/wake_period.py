@@ -20,16 +20,11 @@ _SAME_PLANE = 1e-5
 class Closing:
     """How a volume became a period, and what that changed.
 
-    Attributes
-    ----------
-    how : {"uniform", "periodic", "mirror", "blend"}
-    period : float
-        m; nan of a uniform wake.
-    changed : tuple of int
-        Planes of the period that are not those of the volume.
-    divergence, divergence_before : float
-        Rms divergence over the rms of all gradients (1/s), in and beside the planes that were
-        changed, and of all planes of the volume.
+    how {"uniform", "periodic", "mirror", "blend"}
+    period: m; nan of a uniform wake.
+    changed: planes of the period that are not those of the volume.
+    divergence, divergence_before: rms divergence over the rms of all gradients (1/s), in and beside
+        the planes that were changed, and of all planes of the volume.
     """
 
     how: str
@@ -56,19 +51,12 @@ def one_period(
         Its last ``length`` is blended into the first one by a raised cosine, and the period is
         shorter by that. Differences of the cores are blurred, and differences of u make divergence.
 
-    Parameters
-    ----------
-    flow : xarray.Dataset
-        v, w and maybe u on (x, y, z), x even; maybe tracers.
-    ends : {"mirror", "blend", "refuse"}
-    length : float
-        m.
+    flow: v, w and maybe u on (x, y, z), x even; maybe tracers.
+    ends {"mirror", "blend", "refuse"}
+    length: m.
 
-    Raises
-    ------
-    InputError
-        A volume of fewer than 4 planes; one that is not periodic, where that is refused; one that
-        is shorter than twice ``length``.
+    Raises InputError: a volume of fewer than 4 planes; one that is not periodic, where that is
+    refused; one that is shorter than twice ``length``.
     """
     count = flow.sizes["x"]
     if count == 1:

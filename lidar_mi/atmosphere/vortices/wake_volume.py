@@ -29,20 +29,13 @@ class VolumeAlongPath:
     the axis. Outside of the volume the wind is that of two straight vortices at the mean places
     with the mean circulations, the extinction the background.
 
-    Parameters
-    ----------
-    flow : xarray.Dataset
-        One period, from `one_period`: v, w, maybe u (m s^-1) and extinction (m^-1) on (x, y, z).
-    port, starboard : sequence of Vortex
-        In every plane of the period, in its own y and z.
-    background : float
-        Extinction outside of the volume, m^-1.
-    drift : (float, float)
-        Across the axis to the left and upwards, m s^-1.
-    origin : (float, float, float)
-        Place in the volume (m) that is met at ``x_c``, ``t_c`` and ``miss``.
-    crossing_angle, climb_angle, x_c, t_c, miss
-        As of `lidar_mi.atmosphere.vortices.wake_path.PairAlongPath`.
+    flow: one period, from `one_period`: v, w, maybe u (m s^-1) and extinction (m^-1) on (x, y, z).
+    port, starboard: in every plane of the period, in its own y and z.
+    background: extinction outside of the volume, m^-1.
+    drift: across the axis to the left and upwards, m s^-1.
+    origin: place in the volume (m) that is met at ``x_c``, ``t_c`` and ``miss``.
+    crossing_angle, climb_angle, x_c, t_c, miss: as of
+        `lidar_mi.atmosphere.vortices.wake_path.PairAlongPath`.
     """
 
     flow: xr.Dataset
@@ -185,10 +178,7 @@ class VolumeAlongPath:
         Their places are where the lines of the cores cross the plane; cores are given by the circle
         of their area.
 
-        Raises
-        ------
-        InputError
-            A wake that lies in the plane.
+        Raises InputError: a wake that lies in the plane.
         """
         check_cut(self.axes[0], self.crossing_angle)
         centre, rotation = self.centre_at(time), np.stack(self.axes)

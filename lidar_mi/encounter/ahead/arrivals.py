@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.atmosphere.vortices.wake_path import WakeAlongPath
+from lidar_mi.variables import variable
 
 # Places on the wing, in half spans.
 _PLACES = np.linspace(-0.9, 0.9, 7)
@@ -16,16 +17,10 @@ _PLACES = np.linspace(-0.9, 0.9, 7)
 class Arrival:
     """The wind expected on the wing in the plane of a slab.
 
-    Attributes
-    ----------
-    x, time : float
-        m and s.
-    y : ndarray, shape (places,)
-        On the wing, m, path frame.
-    z : float
-        m.
-    wind, stderr : ndarray, shape (2, places)
-        v and w as expected then, and their standard errors, m/s.
+    x, time: m and s.
+    y (places,): on the wing, m, path frame.
+    z: m.
+    wind, stderr (2, places): v and w as expected then, and their standard errors, m/s.
     """
 
     x: float
@@ -52,9 +47,9 @@ def arrivals_dataset(arrivals: Sequence[Arrival], air: WakeAlongPath) -> xr.Data
     _, *truth = air.wind(x, y, z, time)
     each, both = "arrival", ("arrival", "place")
     variables = {
-        "arrival_x": (each, x[:, 0], {"units": "m", "long_name": "plane of the slab"}),
-        "arrival_time": (each, time[:, 0], {"units": "s", "long_name": "time of arrival"}),
-        "arrival_y": (both, y, {"units": "m", "long_name": "place on the wing"}),
+        "arrival_x": variable(each, x[:, 0], "m", "plane of the slab"),
+        "arrival_time": variable(each, time[:, 0], "s", "time of arrival"),
+        "arrival_y": variable(both, y, "m", "place on the wing"),
     }
     for k, name in enumerate("vw"):
         for suffix, text, values in (
@@ -62,6 +57,7 @@ def arrivals_dataset(arrivals: Sequence[Arrival], air: WakeAlongPath) -> xr.Data
             ("_stderr", "standard error of that", [one.stderr[k] for one in arrivals]),
             ("_true", "as it is", truth[k]),
         ):
-            about = {"units": "m s-1", "long_name": f"{name} on the wing, {text}"}
-            variables[f"arrival_{name}{suffix}"] = (both, np.asarray(values), about)
+            variables[f"arrival_{name}{suffix}"] = variable(
+                both, np.asarray(values), "m s-1", f"{name} on the wing, {text}"
+            )
     return xr.Dataset(variables)

@@ -54,23 +54,14 @@ class Slab:
 class WakeTracker:
     """Scans in flight and tracks the vortices from slab to slab.
 
-    Attributes
-    ----------
-    period : float
-        From scan to scan, s.
-    stride : float
-        From slab to slab, m.
-    latest : float
-        Time of the last scan, s.
-    on_estimate : callable, optional
-        Called with the lidar's estimate after every scan.
-    ahead : WindAhead, optional
-        Learns the wind about the vortices from the vectors; without it the wind is that of the
+    period: from scan to scan, s.
+    stride: from slab to slab, m.
+    latest: time of the last scan, s.
+    on_estimate: called with the lidar's estimate after every scan.
+    ahead: learns the wind about the vortices from the vectors; without it the wind is that of the
         track alone.
-    slabs : list of Slab
-        Those that were delivered, in their order.
-    arrivals : list of Arrival
-        With `ahead`: the wind expected on the wing as it reached each slab.
+    slabs: those that were delivered, in their order.
+    arrivals: with `ahead`: the wind expected on the wing as it reached each slab.
     """
 
     lidar: Lidar

@@ -73,16 +73,10 @@ class WindAhead:
     ) -> None:
         """Take in the wind of a slab.
 
-        Parameters
-        ----------
-        x, time : float
-            Plane of the slab, m, and the time at which its wind is valid, s.
-        wind : Dataset, dims (z, y)
-            As of `Estimate.wind`.
-        vortices : callable, optional
-            Those that are tracked; None: there are none.
-        behind : float
-            Place of the aircraft, m: slabs far behind it are forgotten.
+        x, time: plane of the slab, m, and the time at which its wind is valid, s.
+        wind (z, y): as of `Estimate.wind`.
+        vortices: those that are tracked; None: there are none.
+        behind: place of the aircraft, m: slabs far behind it are forgotten.
         """
         self._slabs = [s for s in self._slabs if s.x > behind - _BEHIND * self.stride and s.x < x]
         self._slabs.append(_Seen(x, time, slab_vectors(counting(wind))))

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy
@@ -19,6 +18,7 @@ from lidar_mi.encounter.control_block.gust_axes import GUSTS
 from lidar_mi.encounter.control_block.losses import gust_dependence, loss_chain
 from lidar_mi.encounter.control_block.sensor_samples import MARGIN, SensorSamples
 from lidar_mi.errors import InputError
+from lidar_mi.variables import Variable, variable
 
 MOST_AFTER = 3
 """Planes beyond the estimated one that may have a weight, if they are scanned by then."""
@@ -26,9 +26,10 @@ MOST_AFTER = 3
 FREQUENCIES = 101
 """From 0 to the Nyquist frequency."""
 
-Variables = dict[str, tuple[Any, ...]]
-"""Of a data set: dims, values, attributes by name."""
+Variables = dict[str, Variable]
+"""Of a data set, by name."""
 
+_SQUARE = "square of the axis' units"
 _STATE = {
     "units": "1",
     "long_name": "x(k+1) = A x(k) + B input(k), output(k) = C x(k) + D input(k)",
@@ -44,10 +45,9 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
     second state. The wing is in the plane `arrival` seconds after the first scan, `lead` seconds
     after the delivery.
 
-    Parameters
-    ----------
-    flights : sequence of SensorSamples
-        Of one timing, range and span, as of `pooled`.
+    flights: of one timing, range and span, as of `pooled`.
+
+    Raises InputError: too few slabs; an input that is zero, as in air at rest.
 
     Returns
     -------
@@ -55,11 +55,6 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
         ``A``, ``B``, ``C``, ``D``, ``dt``, ``noise_covariance``, ``loss_transition``; filters,
         noise and spectra of every axis with their standard errors. Each variable has units and a
         meaning.
-
-    Raises
-    ------
-    InputError
-        Too few slabs; an input that is zero, as in air at rest.
     """
     one = flights[0]
     # margins without an estimate part the flights, and a row without a gust
@@ -96,10 +91,11 @@ def control_block(flights: Sequence[SensorSamples]) -> xr.Dataset:
     block = xr.Dataset(
         {
             **state_space(fits, delay_steps),
-            "noise_covariance": (
+            "noise_covariance": variable(
                 ("noise", "noise_2"),
                 covariance,
-                {"units": "product of the axes' units", "long_name": "of the white noise inputs"},
+                "product of the axes' units",
+                "of the white noise inputs",
             ),
             **_gust_model(truth[:, measured]),
             **_timing(one, delay_steps),
@@ -141,7 +137,6 @@ def _gust_model(truth: np.ndarray) -> Variables:
     fits = [fit_process(values - np.nanmean(values)) for values in truth.T]
     parts = [_process_state_space(lags) for lags, _ in fits]
     a, b, c = (scipy.linalg.block_diag(*(part[k] for part in parts)) for k in range(3))
-    square = {"units": "square of the axis' units"}
     about = {"units": "1", "long_name": "the gusts of these flights from white noise, as A to D"}
     innovations = [variance for _, variance in fits]
     variances = [autocovariance(*fit, 1)[0] for fit in fits]
@@ -150,15 +145,11 @@ def _gust_model(truth: np.ndarray) -> Variables:
         "gust_B": (("gust_state", "axis"), b, about),
         "gust_C": (("axis_2", "gust_state"), c, about),
         "gust_D": (("axis_2", "axis"), np.eye(len(fits)), about),
-        "gust_innovations": (
-            "axis",
-            np.array(innovations),
-            {**square, "long_name": "variances of this white noise"},
+        "gust_innovations": variable(
+            "axis", np.array(innovations), _SQUARE, "variances of this white noise"
         ),
-        "gust_variance": (
-            "axis",
-            np.array(variances),
-            {**square, "long_name": "of the gusts of this model"},
+        "gust_variance": variable(
+            "axis", np.array(variances), _SQUARE, "of the gusts of this model"
         ),
     }
 
@@ -209,17 +200,11 @@ def _timing(one: SensorSamples, delay_steps: int) -> Variables:
         ),
         "lift_per_gust": (one.lift_per_gust, "N s m-1", "force upwards of the wind per w"),
     }
-    return {
-        name: ((), value, {"units": units, "long_name": text})
-        for name, (value, units, text) in values.items()
-    }
+    return {name: variable((), *about) for name, about in values.items()}
 
 
 def _numbers(flights: Sequence[SensorSamples], fits: Sequence[FilterFit]) -> Variables:
     """Parameters of the axes, with standard errors; taps and lags that an axis lacks are 0."""
-    per_axis = {"units": "of the axis"}
-    square = {"units": "square of the axis' units"}
-    ratio = {"units": "1"}
 
     def padded(name: str) -> np.ndarray:
         rows = [np.atleast_1d(getattr(fit, name)) for fit in fits]
@@ -228,45 +213,38 @@ def _numbers(flights: Sequence[SensorSamples], fits: Sequence[FilterFit]) -> Var
         longest = max(1, *(len(row) for row in rows))
         return np.array([np.pad(row, (0, longest - len(row))) for row in rows])
 
-    def column(values: Sequence[float], about: dict[str, str], text: str) -> tuple[Any, ...]:
-        return "axis", np.array(values, float), {**about, "long_name": text}
+    def column(values: Sequence[float], units: str, text: str) -> Variable:
+        return variable("axis", np.array(values, float), units, text)
 
     noise, noise_stderr = zip(*(fit.noise_variance for fit in fits), strict=True)
     values = np.array([fit.parameters for fit in fits]).T
     errors = np.sqrt([np.diag(fit.covariance) for fit in fits]).T
     tap, lag = ("axis", "tap"), ("axis", "lag")
     texts = {
-        "offset": (per_axis, "mean error; not part of A, B, C, D"),
-        "gain": (ratio, "of a constant wind: the sum of taps"),
-        "decay_before": (ratio, "r: of taps from plane to plane before the estimated one"),
-        "decay_after": (ratio, "s: of taps from plane to plane after the estimated one"),
+        "offset": ("of the axis", "mean error; not part of A, B, C, D"),
+        "gain": ("1", "of a constant wind: the sum of taps"),
+        "decay_before": ("1", "r: of taps from plane to plane before the estimated one"),
+        "decay_after": ("1", "s: of taps from plane to plane after the estimated one"),
     }
     numbers = {}
     for name, value, error in zip(texts, values, errors, strict=True):
-        about, text = texts[name]
-        numbers[name] = column(value, about, text)
-        numbers[f"{name}_stderr"] = column(error, about, f"standard error of {name}")
+        units, text = texts[name]
+        numbers[name] = column(value, units, text)
+        numbers[f"{name}_stderr"] = column(error, units, f"standard error of {name}")
     return numbers | {
-        "taps": (
+        "taps": variable(
             tap,
             np.array([fit.taps for fit in fits]),
-            {**ratio, "long_name": "weights of the planes `tap` planes before the estimated one"},
+            "1",
+            "weights of the planes `tap` planes before the estimated one",
         ),
-        "tap": (
-            "tap",
-            np.arange(-fits[0].after, BEFORE + 1),
-            {**ratio, "long_name": "planes before"},
-        ),
-        "lags": (lag, padded("lags"), {**ratio, "long_name": "a: autoregression of the noise"}),
-        "lags_stderr": (
-            lag,
-            padded("lags_covariance"),
-            {**ratio, "long_name": "standard error of lags"},
-        ),
-        "noise_variance": column(noise, square, "of the error that the filter leaves"),
-        "noise_variance_stderr": column(noise_stderr, square, "standard error of noise_variance"),
-        "slabs": column([fit.count for fit in fits], ratio, "from which the axis is identified"),
-        "flights": ((), len(flights), {**ratio, "long_name": "from which it is identified"}),
+        "tap": variable("tap", np.arange(-fits[0].after, BEFORE + 1), "1", "planes before"),
+        "lags": variable(lag, padded("lags"), "1", "a: autoregression of the noise"),
+        "lags_stderr": variable(lag, padded("lags_covariance"), "1", "standard error of lags"),
+        "noise_variance": column(noise, _SQUARE, "of the error that the filter leaves"),
+        "noise_variance_stderr": column(noise_stderr, _SQUARE, "standard error of noise_variance"),
+        "slabs": column([fit.count for fit in fits], "1", "from which the axis is identified"),
+        "flights": variable((), len(flights), "1", "from which it is identified"),
     }
 
 
@@ -287,11 +265,12 @@ def _losses(flights: Sequence[SensorSamples], measured: list[int]) -> Variables:
         "loss_gust_p": (ratio_p, "p value of losses that do not depend on the gust"),
     }
     losses = {
-        name: (("axis",) if np.ndim(value) else (), value, {"units": "1", "long_name": text})
+        name: variable(("axis",) if np.ndim(value) else (), value, "1", text)
         for name, (value, text) in texts.items()
     }
-    about = {"units": "1", "long_name": "probability from received, lost to received, lost"}
-    return {**losses, "loss_transition": (("loss", "loss_2"), chain.transition, about)}
+    text = "probability from received, lost to received, lost"
+    losses["loss_transition"] = variable(("loss", "loss_2"), chain.transition, "1", text)
+    return losses
 
 
 def _spectra(fits: Sequence[FilterFit], dt: float, delay_steps: int) -> Variables:
@@ -299,33 +278,19 @@ def _spectra(fits: Sequence[FilterFit], dt: float, delay_steps: int) -> Variable
     delayed = np.exp(-2j * np.pi * cycles * delay_steps)
     noise = [fit.noise_spectrum(cycles) for fit in fits]
     dims = ("axis", "frequency")
-    density = {"units": "square of the axis' units per Hz"}
+    response, response_stderr = zip(*(fit.response(cycles) for fit in fits), strict=True)
+    psd, psd_stderr = (2 * dt * np.array(part) for part in zip(*noise, strict=True))
+    density = f"{_SQUARE} per Hz"
     return {
-        "frequency": (
-            "frequency",
-            cycles / dt,
-            {"units": "Hz", "long_name": "as the wing meets it"},
+        "frequency": variable("frequency", cycles / dt, "Hz", "as the wing meets it"),
+        "response": variable(
+            dims, np.array(response) * delayed, "1", "of the estimate to the gust, with its delay"
         ),
-        "response": (
-            dims,
-            np.array([fit.response(cycles)[0] * delayed for fit in fits]),
-            {"units": "1", "long_name": "of the estimate to the gust, with its delay"},
+        "response_stderr": variable(
+            dims, np.array(response_stderr), "1", "standard error of response"
         ),
-        "response_stderr": (
-            dims,
-            np.array([fit.response(cycles)[1] for fit in fits]),
-            {"units": "1", "long_name": "standard error of response"},
-        ),
-        "noise_psd": (
-            dims,
-            np.array([2 * dt * one[0] for one in noise]),
-            {**density, "long_name": "power spectral density of the error, one-sided"},
-        ),
-        "noise_psd_stderr": (
-            dims,
-            np.array([2 * dt * one[1] for one in noise]),
-            {**density, "long_name": "standard error of noise_psd"},
-        ),
+        "noise_psd": variable(dims, psd, density, "power spectral density of the error, one-sided"),
+        "noise_psd_stderr": variable(dims, psd_stderr, density, "standard error of noise_psd"),
     }
 
 

@@ -33,18 +33,12 @@ _LARGEST_DECAY = 0.8  # of which `BEFORE` samples hold 87 %
 class FilterFit:
     """A filter and its noise.
 
-    Attributes
-    ----------
-    parameters, covariance : ndarray, shape (4,) and (4, 4)
-        c, G, r, s. A decay at the edge of what is allowed, 0, has no error.
-    after : int
-        Samples after a sample that have a weight.
-    lags, lags_covariance : ndarray, shape (p,) and (p, p)
-        a.
-    innovations : ndarray, shape (n,)
-        e; NaN where input or output are missing.
-    count : int
-        Innovations.
+    parameters, covariance (4,): c, G, r, s. A decay at the edge of what is allowed, 0, has no
+        error.
+    after: samples after a sample that have a weight.
+    lags, lags_covariance (p,): a.
+    innovations (n,): e; NaN where input or output are missing.
+    count: innovations.
     """
 
     parameters: np.ndarray
@@ -112,18 +106,12 @@ class FilterFit:
 def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
     """The filter and its noise, with the number of lags that the data support.
 
-    Parameters
-    ----------
-    output, value : ndarray, shape (n,)
-        y and the input u, sample by sample; NaN where there is none. Two records are parted by
-        `BEFORE` samples or more without output.
-    after : int
-        Samples after a sample that may have a weight.
+    output, value (n,): y and the input u, sample by sample; NaN where there is none. Two records
+        are parted by `BEFORE` samples or more without output.
+    after: samples after a sample that may have a weight.
 
-    Raises
-    ------
-    InputError
-        Fewer than `LEAST_SAMPLES` samples that have all inputs and outputs before them.
+    Raises InputError: fewer than `LEAST_SAMPLES` samples that have all inputs and outputs before
+    them.
     """
     # all models are compared on the samples that the longest one has
     usable = np.isfinite([_delayed(output, k) for k in range(MOST_LAGS + 1)]).all(axis=0)
@@ -146,10 +134,8 @@ def fit_filter(output: np.ndarray, value: np.ndarray, after: int) -> FilterFit:
 def fit_process(values: np.ndarray) -> tuple[np.ndarray, float]:
     """An autoregressive model of a process: its lags, and the variance of its innovations.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Without a mean; NaN between two records. There are many more than `MOST_PROCESS_LAGS`.
+    values (n,): without a mean; NaN between two records. There are many more than
+        `MOST_PROCESS_LAGS`.
     """
     before = [_delayed(values, k) for k in range(MOST_PROCESS_LAGS + 1)]
     usable = np.isfinite(before).all(axis=0)

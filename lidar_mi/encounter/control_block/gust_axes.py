@@ -29,12 +29,8 @@ def span_nodes(span: float) -> tuple[np.ndarray, np.ndarray]:
 def gusts(span: float, wind: ArrayLike) -> np.ndarray:
     """The gusts of a wind on a level wing.
 
-    Parameters
-    ----------
-    span : float
-        m.
-    wind : array_like, shape (3, ..., n)
-        u, v, w (m/s) at the places of `span_nodes`.
+    span: m.
+    wind (3, ..., n): u, v, w (m/s) at the places of `span_nodes`.
 
     Returns
     -------

@@ -22,15 +22,9 @@ _ROUNDS, _SHRINKS = 200, 0.9  # in so many samples the changes shrink by this fa
 def stationary_distribution(transition: ArrayLike) -> np.ndarray:
     """Probabilities of the modes of a chain with one recurrent class; (modes,).
 
-    Parameters
-    ----------
-    transition : array_like, shape (modes, modes)
-        p_ij, from mode i to mode j; rows sum to 1.
+    transition (modes, modes): p_ij, from mode i to mode j; rows sum to 1.
 
-    Raises
-    ------
-    InputError
-        Not a matrix of probabilities.
+    Raises InputError: not a matrix of probabilities.
     """
     p = np.asarray(transition, float)
     if p.ndim != 2 or p.shape[0] != p.shape[1] or (p < 0).any() or not np.allclose(p.sum(1), 1):
@@ -50,19 +44,11 @@ def jump_covariance(
 
     With one mode this is the discrete Lyapunov equation.
 
-    Parameters
-    ----------
-    a, b, c, d : array_like, shape (modes, rows, columns)
-        Matrices of the modes.
-    transition : array_like, shape (modes, modes)
-        p_ij, from mode i to mode j.
-    noise : array_like, shape (inputs, inputs)
-        Covariance W of the white input, which is independent of the mode.
+    a, b, c, d (modes, rows, columns): matrices of the modes.
+    transition (modes, modes): p_ij, from mode i to mode j.
+    noise (inputs, inputs): covariance W of the white input, which is independent of the mode.
 
-    Raises
-    ------
-    InputError
-        The system has no finite variance, or the transition is none.
+    Raises InputError: the system has no finite variance, or the transition is none.
     """
     a, b, c, d = (np.asarray(one, float) for one in (a, b, c, d))
     p, w = np.asarray(transition, float), np.asarray(noise, float)

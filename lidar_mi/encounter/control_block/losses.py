@@ -20,14 +20,10 @@ RECEIVED, LOST = 0, 1
 class LossChain:
     """Probabilities of lost estimates, with standard errors.
 
-    Attributes
-    ----------
-    begin, end : float
-        a and b, by maximum likelihood. b is 1 where nothing was lost.
-    begin_stderr, end_stderr : float
-        Of the posterior with Jeffreys' prior, which is not 0 where nothing was lost.
-    memory_p : float
-        P value of the chain against one of second order; 1: no run was long enough to tell.
+    begin, end: a and b, by maximum likelihood. b is 1 where nothing was lost.
+    begin_stderr, end_stderr: of the posterior with Jeffreys' prior, which is not 0 where nothing
+        was lost.
+    memory_p: P value of the chain against one of second order; 1: no run was long enough to tell.
     """
 
     begin: float
@@ -58,10 +54,7 @@ class LossChain:
 def loss_chain(records: Sequence[np.ndarray]) -> LossChain:
     """The chain of several records.
 
-    Parameters
-    ----------
-    records : sequence of ndarray of bool, shape (n,)
-        True where an estimate is lost, slab by slab.
+    ``records``, each (n,): true where an estimate is lost, slab by slab.
     """
     pairs = np.zeros((2, 2), int)
     triples = np.zeros((2, 2, 2), int)

@@ -26,25 +26,15 @@ MARGIN = 8
 class SensorSamples:
     """Gusts of consecutive slabs of one flight: true, and as estimated.
 
-    Attributes
-    ----------
-    period : float
-        From slab to slab, s.
-    speed, span : float
-        Of the aircraft, m/s and m.
-    distance : float
-        Of a slab when it is scanned for the first time, m.
-    delay : float
-        From this scan to the delivery, s.
-    truth, estimate : ndarray, shape (slabs, 4)
-        Along `GUSTS` of `gust_axes`. The truth is that of the plane when the wing arrives on the
-        nominal path; NaN where nothing was estimated.
-    truth_before, truth_after : ndarray, shape (`MARGIN`, 4)
-        In the planes before and after.
-    roll_moment_per_gust : float
-        Rolling moment per roll gust, N m s/rad.
-    lift_per_gust : float
-        Force upwards per w, N s/m.
+    period: from slab to slab, s.
+    speed, span: of the aircraft, m/s and m.
+    distance: of a slab when it is scanned for the first time, m.
+    delay: from this scan to the delivery, s.
+    truth, estimate (slabs, 4): along `GUSTS` of `gust_axes`. The truth is that of the plane when
+        the wing arrives on the nominal path; NaN where nothing was estimated.
+    truth_before, truth_after (`MARGIN`, 4): in the planes before and after.
+    roll_moment_per_gust: rolling moment per roll gust, N m s/rad.
+    lift_per_gust: force upwards per w, N s/m.
     """
 
     period: float
@@ -61,13 +51,7 @@ class SensorSamples:
 
 
 def flights_in(folder: str | Path) -> list[Path]:
-    """Folders of finished flights with a lidar: this one, or those below it.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
+    """Folders of finished flights with a lidar: this one, or those below it."""
     folder = Path(folder)
     needed = (RECORD, FLIGHT_FILES["series"], FLIGHT_FILES["slabs"])
     files = sorted(
@@ -87,10 +71,7 @@ def flights_in(folder: str | Path) -> list[Path]:
 def samples_of(folder: Path) -> SensorSamples:
     """The slabs of a flight.
 
-    Raises
-    ------
-    InputError
-        A folder without a flight, or one whose slabs have no wind vectors.
+    Raises InputError: a folder without a flight, or one whose slabs have no wind vectors.
     """
     marker = folder / RECORD
     experiment = check(read_record(folder)["experiment"], str(marker)).read_from(folder)

@@ -15,22 +15,13 @@ from lidar_mi.retrieval.common_error import with_common_error
 class Completion:
     """From the wind of a slab's images to the delivered wind.
 
-    Attributes
-    ----------
-    common : float
-        Standard error of v and w by unknown pointing, m/s.
-    rotation : float
-        By unknown roll, rad/s.
-    offset : {"known", "free"}
-        As `with_common_error` takes it.
-    place : array (3,)
-        Of the telescope of the lines of sight, m, path frame.
-    roll_axis : (float, float)
-        y and z of the axis of the roll, m.
-    x : float
-        Plane of the slab, m.
-    crossflow_std : float, optional
-        As `combine` takes it.
+    common: standard error of v and w by unknown pointing, m/s.
+    rotation: by unknown roll, rad/s.
+    offset {"known", "free"}: as `with_common_error` takes it.
+    place (3,): of the telescope of the lines of sight, m, path frame.
+    roll_axis: y and z of the axis of the roll, m.
+    x: plane of the slab, m.
+    crossflow_std: as `combine` takes it.
     """
 
     common: float
@@ -65,29 +56,19 @@ def combined_in_flight(
 ) -> xr.Dataset:
     """u, v, w of a slab from its images' wind and its lines of sight.
 
-    Parameters
-    ----------
-    wind : Dataset, dims (z, y)
-        Of the images, path frame.
-    lines : Dataset, dim line
-        From a telescope at the origin, with axes as of the path frame.
-    place : array (3,)
-        Of the telescope, m, path frame.
-    x : float
-        Plane of the slab, m.
-    crossflow_std : float, optional
-        As `combine` takes it.
+    wind (z, y): of the images, path frame.
+    lines (line): from a telescope at the origin, with axes as of the path frame.
+    place (3,): of the telescope, m, path frame.
+    x: plane of the slab, m.
+    crossflow_std: as `combine` takes it.
+
+    Raises InputError: no valid vector or no line of sight on the grid.
 
     Returns
     -------
     Dataset, dims (z, y)
         From `combine`, path frame. Gates are fixed in the air, but air that moves along x within
         its slab moves in the images, since beams are oblique: `combine` subtracts this motion.
-
-    Raises
-    ------
-    InputError
-        No valid vector or no line of sight on the grid.
     """
     axes = {axis: wind.variables[axis] for axis in ("z", "y")}
     # the lines start at their telescope: so does the frame in which both are combined

@@ -25,12 +25,10 @@ class Cores(NamedTuple):
     def after(self, time: float, period: float, seconds: Mapping[str, float]) -> "Cores":
         """The cores with the work on this slab.
 
-        Parameters
-        ----------
-        time, period : float
-            Of the second image, and from the first one to it, s. Lines are recorded half way.
-        seconds : mapping
-            Duration of the parts, as `SlabEstimate.seconds`; a core without a part does nothing.
+        time, period: of the second image, and from the first one to it, s. Lines are recorded half
+            way.
+        seconds: duration of the parts, as `SlabEstimate.seconds`; a core without a part does
+            nothing.
         """
         parts = {name: seconds.get(name, 0.0) for name in PARTS}
         lines = max(self.vortices, time - period) + parts["vortices_before"]

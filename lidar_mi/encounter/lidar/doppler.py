@@ -50,17 +50,11 @@ class Midway(NamedTuple):
 class LineFrames(NamedTuple):
     """The frames that the Doppler lidar records of a slab.
 
-    Attributes
-    ----------
-    lines : Dataset, dim line
-        From `scan_wind`, in the frame of the aircraft, with the true speeds.
-    air : torch.Tensor, shape (lines, height, width)
-        Photoelectrons.
-    laser : torch.Tensor, shape (frames, height, width)
-    own : list of int
-        The laser's frame of every line.
-    scan : int
-        Number of the scan that completes the slab.
+    lines (line): from `scan_wind`, in the frame of the aircraft, with the true speeds.
+    air (lines, height, width): photoelectrons.
+    laser (frames, height, width)
+    own: the laser's frame of every line.
+    scan: number of the scan that completes the slab.
     """
 
     lines: xr.Dataset
@@ -74,14 +68,9 @@ class LineFrames(NamedTuple):
 class DopplerScans:
     """The true Doppler lidar, which records frames.
 
-    Attributes
-    ----------
-    experiment : Experiment
-        Its `doppler.lidar.range` is that of the slabs.
-    doppler : Doppler
-        Those of the experiment.
-    rings : Rings
-        The true instrument.
+    experiment: its `doppler.lidar.range` is that of the slabs.
+    doppler: those of the experiment.
+    rings: the true instrument.
     """
 
     experiment: Experiment
@@ -101,16 +90,10 @@ class DopplerScans:
     ) -> LineFrames:
         """Frames of all lines of sight of a slab.
 
-        Parameters
-        ----------
-        number : int
-            Of the scan that completes the slab.
-        x : float
-            Plane of the slab, m.
-        time : float
-            Half way between both scans, s.
-        misalignment : Rotation, optional
-            True attitude of the lidar relative to the one by which its beams are aimed.
+        number: of the scan that completes the slab.
+        x: plane of the slab, m.
+        time: half way between both scans, s.
+        misalignment: true attitude of the lidar relative to the one by which its beams are aimed.
         """
         sensor, seed = self.sensor, self.experiment.seed
         lidar = self.doppler.lidar.model_copy(update={"range": x - midway.place[0]})
@@ -153,10 +136,8 @@ class DopplerScans:
 def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
     """The Doppler lidar of an encounter, checked; None where its experiment has no `sensor`.
 
-    Raises
-    ------
-    InputError
-        Times of lines, a range that is not that of the slabs, an aircraft too fast for the etalon.
+    Raises InputError: times of lines, a range that is not that of the slabs, an aircraft too fast
+    for the etalon.
     """
     sensor = experiment.sensor
     if sensor is None:
@@ -185,10 +166,7 @@ def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
 def at_the_slabs(experiment: Experiment, gates: Gates) -> Experiment:
     """An encounter whose Doppler lidar, if there is one, has the slabs' range.
 
-    Raises
-    ------
-    InputError
-        Its own range is another one.
+    Raises InputError: its own range is another one.
     """
     doppler = experiment.fringes
     if experiment.sensor is None or doppler is None:

@@ -37,22 +37,15 @@ def _without_garbage_collection() -> Iterator[None]:
 class SlabEstimate(NamedTuple):
     """What is estimated from the signals of a slab.
 
-    Attributes
-    ----------
-    wind : Dataset or None
-        As `retrieve_wind` gives it; None without a method of vectors. By "variational" its
+    wind: as `retrieve_wind` gives it; None without a method of vectors. By "variational" its
         attribute `from_start` says whether it was found from the last one.
-    pair : VortexPairFit
-        Its `from_start` says whether it was found from the expected one.
-    seconds : dict
-        Of the parts `vortices`, `wind` and `combination` after the second image; `lines`,
+    pair: its `from_start` says whether it was found from the expected one.
+    seconds: of the parts `vortices`, `wind` and `combination` after the second image; `lines`,
         `vortices_before` and `wind_before` of the lines, the first image and the expected pair,
         before it. Processor time of the process that works on the part, so that other work of the
         machine does not count; on a GPU elapsed time.
-    lines : Dataset or None
-        As `with_speeds` gives them; None without frames.
-    flags : tuple of str
-        Of the wind's completion.
+    lines: as `with_speeds` gives them; None without frames.
+    flags: of the wind's completion.
     """
 
     wind: xr.Dataset | None
@@ -69,18 +62,13 @@ class Estimator:
     from the last one, moved with the expected pair if there is one: errors are the same in a
     fraction of the time.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Its `retrieval` has the windows and the method of the wind: the most accurate one listed.
-        Only "variational" has a fast form.
-    vectors : bool
-        Whether the wind is retrieved in addition to the vortices.
-    processes : int
-        2: the wind is retrieved and completed in a process of its own, while this one fits the
-        vortices. The numbers are the same but for rounding. It pays where a second core is idle.
-    speeds : LineSpeeds, optional
-        Reads the frames of the Doppler lidar.
+    experiment: its `retrieval` has the windows and the method of the wind: the most accurate one
+        listed. Only "variational" has a fast form.
+    vectors: whether the wind is retrieved in addition to the vortices.
+    processes: 2: the wind is retrieved and completed in a process of its own, while this one fits
+        the vortices. The numbers are the same but for rounding. It pays where a second core is
+        idle.
+    speeds: reads the frames of the Doppler lidar.
     """
 
     def __init__(
@@ -124,20 +112,13 @@ class Estimator:
     ) -> SlabEstimate:
         """Wind, vortices, speeds along lines of sight, and the time that each took.
 
-        Parameters
-        ----------
-        first : FirstImage
-            Vortices are fitted from the pair that it expects. With its slopes and a telescope the
-            fit is corrected for the motion in oblique beams by wind along x.
-        image2 : DataArray, dims (z, y)
-        frames : LineFrames, optional
-            Of the Doppler lidar, half way between both images.
-        complete : Completion, optional
-            Completes the images' wind with the lines.
-        telescope : (float, float, float), optional
-            As `fit_vortices` takes it.
-        take : (bool, bool)
-            Whether vortices (with the lines) and wind are estimated, see `Cores.take`.
+        first: vortices are fitted from the pair that it expects. With its slopes and a telescope
+            the fit is corrected for the motion in oblique beams by wind along x.
+        image2 (z, y)
+        frames: of the Doppler lidar, half way between both images.
+        complete: completes the images' wind with the lines.
+        telescope: as `fit_vortices` takes it.
+        take: whether vortices (with the lines) and wind are estimated, see `Cores.take`.
         """
         seconds: dict[str, float] = {}
         timed = partial(_timed, seconds, clock=self._clock)

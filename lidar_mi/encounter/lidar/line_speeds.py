@@ -29,10 +29,7 @@ class LineSpeeds:
     The reference is the fit of some frames of the first slab, or of a later one once it no longer
     describes half of the lines. Frames that it does not describe are fitted one by one.
 
-    Parameters
-    ----------
-    scans : DopplerScans
-        Whose frames are read; the instrument is the one that the experiment assumes.
+    scans: whose frames are read; the instrument is the one that the experiment assumes.
     """
 
     def __init__(self, scans: DopplerScans) -> None:

@@ -34,10 +34,7 @@ def check_reported(reported: Reported | None) -> None:
 
     The places of wake and aircraft have the same error, which cancels.
 
-    Raises
-    ------
-    InputError
-        Errors of the place, a bandwidth, a latency.
+    Raises InputError: errors of the place, a bandwidth, a latency.
     """
     if reported is None:
         return

@@ -23,11 +23,8 @@ _PARTS = (("near", "near"), ("far", "far"), ("far_noise", "far"))
 class Scan:
     """Both images of a scan with the standard deviations of their noise, path frame.
 
-    Attributes
-    ----------
-    near, far, far_noise : DataArray, dims (z, y)
-        Attenuated backscatter of the first and the last gate, and the latter's noise,
-        m^-1 sr^-1.
+    near, far, far_noise (z, y): attenuated backscatter of the first and the last gate, and the
+        latter's noise, m^-1 sr^-1.
     """
 
     near: xr.DataArray
@@ -39,12 +36,8 @@ class Scan:
 class ScanStore:
     """Scans in a folder of their own, by number.
 
-    Attributes
-    ----------
-    folder : Path
-        Made with the first scan.
-    made_by : str
-        Signature of the flight; scans of another one do not count.
+    folder: made with the first scan.
+    made_by: signature of the flight; scans of another one do not count.
     """
 
     folder: Path

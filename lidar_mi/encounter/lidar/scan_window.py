@@ -30,10 +30,7 @@ class ScanWindow:
     its slopes; else the likeliest one of the newest estimate, where a vortex is more probable than
     not; else back to straight ahead. Each scan moves by a tenth of its size at most.
 
-    Attributes
-    ----------
-    size : (float, float)
-        Of the image along y and z, m.
+    size: of the image along y and z, m.
     """
 
     encounter: Encounter
@@ -46,14 +43,9 @@ class ScanWindow:
     ) -> tuple[float, float]:
         """Of a scan, m.
 
-        Parameters
-        ----------
-        number : int
-            Of the scan.
-        place : (float, float)
-            y and z of the aircraft, m.
-        expected : VortexPairFit or None
-            In the nearer slab of this scan.
+        number: of the scan.
+        place: y and z of the aircraft, m.
+        expected: in the nearer slab of this scan.
         """
         if not self.encounter.window.follow:
             return 0.0, 0.0

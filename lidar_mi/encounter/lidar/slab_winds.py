@@ -34,17 +34,11 @@ _MOST = 0.5
 class FirstImage(NamedTuple):
     """The first image of a slab, and the pair of vortices that is expected there.
 
-    Attributes
-    ----------
-    image : DataArray, dims (z, y)
-    dt : float
-        To the second image, s.
-    noise : float or DataArray, optional
-        As `retrieve_wind` takes it.
-    times : sequence of two DataArray, optional
-        Of the pixels, as `retrieve_wind` takes them.
-    expected : VortexPairFit, optional
-        At mid-time.
+    image (z, y)
+    dt: to the second image, s.
+    noise: as `retrieve_wind` takes it.
+    times: of the pixels, as `retrieve_wind` takes them.
+    expected: at mid-time.
     """
 
     image: xr.DataArray
@@ -57,12 +51,8 @@ class FirstImage(NamedTuple):
 class SlabWind(NamedTuple):
     """The wind of a slab.
 
-    Attributes
-    ----------
-    flags : tuple of str
-        What limits the images' wind (`limits`), and those of its completion.
-    seconds : dict
-        Of the parts `wind`, and `combination` if it was completed.
+    flags: what limits the images' wind (`limits`), and those of its completion.
+    seconds: of the parts `wind`, and `combination` if it was completed.
     """
 
     wind: xr.Dataset
@@ -126,12 +116,8 @@ class SlabWinds:
     def retrieve(self, second: xr.DataArray, complete: Complete | None = None) -> SlabWind:
         """The wind of the slab that was prepared.
 
-        Parameters
-        ----------
-        second : DataArray, dims (z, y)
-            The slab's second image.
-        complete : callable, optional
-            Completes the images' wind. The next one starts from the images' wind alone.
+        second (z, y): the slab's second image.
+        complete: completes the images' wind. The next one starts from the images' wind alone.
 
         Returns
         -------

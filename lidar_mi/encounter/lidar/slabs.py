@@ -38,18 +38,11 @@ class Gates:
     Gates are fixed in the air: scan k records ``between`` + 1 consecutive ones, and the last one of
     scan k is the first one of scan k + 1.
 
-    Attributes
-    ----------
-    period : float
-        From scan to scan, s.
-    stride : float
-        Distance from slab to slab, m: flown in a period.
-    between : int
-        Gates from one slab to the next.
-    look_ahead : float
-        Range of the last gate's start, m, from the nominal place of the aircraft.
-    y, z : arrays
-        Nodes of the image of the last gate, m, about the aircraft.
+    period: from scan to scan, s.
+    stride: distance from slab to slab, m: flown in a period.
+    between: gates from one slab to the next.
+    look_ahead: range of the last gate's start, m, from the nominal place of the aircraft.
+    y, z: nodes of the image of the last gate, m, about the aircraft.
     """
 
     period: float
@@ -78,10 +71,7 @@ class Gates:
 
         The middle of the last gate's image is at ``window``: y and z about the aircraft, m.
 
-        Raises
-        ------
-        InputError
-            An aircraft in or behind the nearer slab.
+        Raises InputError: an aircraft in or behind the nearer slab.
         """
         start = self.look_ahead - self.stride - ahead
         if not start > 0:
@@ -109,11 +99,8 @@ class Gates:
 def gates_of(experiment: Experiment) -> Gates:
     """The gates of an encounter.
 
-    Raises
-    ------
-    InputError
-        No encounter, a look-ahead within the distance flown in a period, beams that are not aimed
-        at nodes at once, through planar gates.
+    Raises InputError: no encounter, a look-ahead within the distance flown in a period, beams that
+    are not aimed at nodes at once, through planar gates.
     """
     encounter, scan = encounter_of(experiment), experiment.scan
     for key, given, expected in (
@@ -167,12 +154,9 @@ class Air:
     The texture of a slab is that of the scan that has it in the farther gate. Until the scan that
     has it in the nearer gate, it is advected by all three components of the wind.
 
-    Attributes
-    ----------
-    background, molecules : float
-        Extinction coefficients, m^-1: mean of the aerosol, and of the air itself.
-    margin : (float, float)
-        Reach of the beams beyond the nodes, along y and z, m.
+    background, molecules: extinction coefficients, m^-1: mean of the aerosol, and of the air
+        itself.
+    margin: reach of the beams beyond the nodes, along y and z, m.
     """
 
     wake: WakeAlongPath
@@ -194,18 +178,11 @@ class Air:
 
         The nodes turn with a misaligned lidar, about its place.
 
-        Parameters
-        ----------
-        number : int
-            Of the scan.
-        place : (float, float)
-            y and z of the aircraft, m.
-        ahead : float
-            Of its nominal place, m.
-        misalignment : Rotation, optional
-            True attitude of the lidar relative to the one by which its beams are aimed.
-        window : (float, float)
-            Middle of the scan about the aircraft, y and z in m.
+        number: of the scan.
+        place: y and z of the aircraft, m.
+        ahead: of its nominal place, m.
+        misalignment: true attitude of the lidar relative to the one by which its beams are aimed.
+        window: middle of the scan about the aircraft, y and z in m.
 
         Returns
         -------
@@ -249,14 +226,9 @@ class Air:
     def _origins(self, places: Places, now: float, *spacing: float) -> Places:
         """Places of the air one period ago: Runge-Kutta steps of fourth order back in time.
 
-        Parameters
-        ----------
-        places : three arrays, shape (x, y, z)
-            m.
-        now : float
-            s.
-        *spacing : float
-            Along x, y and z, m: with it the steepest gradient of the wind sets the step.
+        places (x, y, z): m.
+        now: s.
+        *spacing: along x, y and z, m: with it the steepest gradient of the wind sets the step.
         """
         first = self._wind(places, now)
         steep = max(
@@ -284,10 +256,7 @@ class Air:
 def air_of(experiment: Experiment, gates: Gates) -> Air:
     """The air of an encounter: its texture has the longest period along the path that memory holds.
 
-    Raises
-    ------
-    InputError
-        A texture finer than its nodes.
+    Raises InputError: a texture finer than its nodes.
     """
     along_path, wake = air_along_path(experiment), experiment.wake
     assert wake is not None  # `air_along_path` refuses its absence

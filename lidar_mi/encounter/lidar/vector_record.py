@@ -8,6 +8,7 @@ import xarray as xr
 from lidar_mi.encounter.lidar.estimate import Estimate
 from lidar_mi.retrieval.along_path.vectors import counting, slab_vectors
 from lidar_mi.retrieval.common_error import NAMES, ROTATION
+from lidar_mi.variables import variable
 
 VECTORS = ("vector_row", "vector_column")
 """Dims of the vectors in a slab."""
@@ -53,8 +54,8 @@ def recorded_vectors(estimates: Sequence[Estimate]) -> xr.Dataset:
     dims = ("slab", *VECTORS)
     return xr.Dataset(
         {
-            "vector_z": (dims[:2], z, {"units": "m", "long_name": "place of the vectors"}),
-            "vector_y": (("slab", VECTORS[1]), y, {"units": "m", "long_name": "the same"}),
+            "vector_z": variable(dims[:2], z, "m", "place of the vectors"),
+            "vector_y": variable(("slab", VECTORS[1]), y, "m", "the same"),
             **{f"vector_{name}": (dims, values) for name, values in fields.items()},
             **{f"vector_{name}": ("slab", values) for name, values in common.items()},
         },

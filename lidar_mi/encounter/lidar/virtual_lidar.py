@@ -53,12 +53,9 @@ _OFF_RASTER = 0.01
 class SlabImages:
     """Images of one slab from two scans, on one grid in the path frame.
 
-    Attributes
-    ----------
-    first, second : DataArray, dims (z, y)
-        Attenuated backscatter, m^-1 sr^-1, the second one resampled onto the nodes of the first.
-    noise : DataArray, dims (z, y)
-        Standard deviation of the first one's noise.
+    first, second (z, y): attenuated backscatter, m^-1 sr^-1, the second one resampled onto the
+        nodes of the first.
+    noise (z, y): standard deviation of the first one's noise.
     """
 
     first: xr.DataArray

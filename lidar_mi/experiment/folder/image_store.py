@@ -25,12 +25,8 @@ class ImageStore:
 
     Rendered images are read back, so that new and stored ones have the same float32 values.
 
-    Attributes
-    ----------
-    folder_of : callable
-        ``folder_of(part)``: the folder of an image.
-    signature_of : callable
-        ``signature_of(part)``: what an image there is signed with.
+    folder_of: ``folder_of(part)``: the folder of an image.
+    signature_of: ``signature_of(part)``: what an image there is signed with.
     """
 
     folder_of: Callable[[str], Path]
@@ -43,10 +39,7 @@ class ImageStore:
     def stored(self, part: str) -> xr.Dataset | None:
         """A rendered image, without a detector's noise; None: it is not there.
 
-        Raises
-        ------
-        InputError
-            It was made by another experiment or version.
+        Raises InputError: it was made by another experiment or version.
         """
         path = self.path(part)
         if not path.is_file():

@@ -23,10 +23,7 @@ STUDY = "study.yaml"
 def read_record(folder: str | Path) -> dict[str, Any]:
     """Record of a run folder: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
 
-    Raises
-    ------
-    InputError
-        The folder's experiment.yaml is missing or was not written by a run.
+    Raises InputError: the folder's experiment.yaml is missing or was not written by a run.
     """
     marker = Path(folder) / RECORD
     if not marker.is_file():
@@ -45,10 +42,7 @@ def read_record(folder: str | Path) -> dict[str, Any]:
 def read_metrics(folder: str | Path) -> dict[str, float] | None:
     """Metrics of the run or the study in a folder, by today's names; None: not complete.
 
-    Raises
-    ------
-    InputError
-        The folder's metrics.json was not written by its run.
+    Raises InputError: the folder's metrics.json was not written by its run.
     """
     path, marker = Path(folder) / METRICS, Path(folder) / RECORD
     if not path.is_file():
@@ -80,6 +74,8 @@ def read_study(
 ) -> tuple[str, dict[str, dict[str, Any] | None], dict[str, dict[str, float]]]:
     """The contents of a study's folder.
 
+    Raises InputError: a file in it that was not written by a study.
+
     Returns
     -------
     name : str
@@ -88,11 +84,6 @@ def read_study(
         By variant, as of `read_record`; None: not run yet.
     metrics : dict
         By variant; of those that are done.
-
-    Raises
-    ------
-    InputError
-        A file in it that was not written by a study.
     """
     folder = Path(folder)
     try:

@@ -72,20 +72,11 @@ class RunFolder:
     Rendered images are read back, so that a resumed run has the same float32 values as an
     uninterrupted one.
 
-    Parameters
-    ----------
-    search_path : path
-        Folder in which files named by the experiment are looked for first.
-    shared : Store, optional
-        Images that are shared with other runs: used if they are there, else added.
-
-    Attributes
-    ----------
-    record : dict
-        The experiment, checksums of its files and of its metrics, versions.
-    made_by : str
-        SHA-256 of those parts of the record that determine the images. Every result has it as an
-        attribute; a result with another hash is not of this run.
+    search_path: folder in which files named by the experiment are looked for first.
+    shared: images that are shared with other runs: used if they are there, else added.
+    record: the experiment, checksums of its files and of its metrics, versions.
+    made_by: SHA-256 of those parts of the record that determine the images. Every result has it as
+        an attribute; a result with another hash is not of this run.
     """
 
     def __init__(
@@ -109,11 +100,8 @@ class RunFolder:
     def claimed(self, overwrite: bool) -> Iterator[None]:
         """Lock the folder for this run, keeping images of the same experiment.
 
-        Raises
-        ------
-        InputError
-            Another run is using the folder; it holds images of another experiment or version, and
-            ``overwrite`` is not set; or it is no run folder.
+        Raises InputError: another run is using the folder; it holds images of another experiment or
+        version, and ``overwrite`` is not set; or it is no run folder.
         """
         with held(self.path, "run folder"):
             self._begin(overwrite)
@@ -263,14 +251,9 @@ def write_verdict(
 def write_result(folder: Path, name: str, value: Any, experiment: str, signature: str) -> None:
     """Write the result of a stage into its file, if it has one.
 
-    Parameters
-    ----------
-    name : str
-        Of the stage.
-    value : Dataset or VortexFits or None
-        None: there is no such result.
-    experiment, signature : str
-        Name of the experiment and hash of its record, see `made_by`.
+    name: of the stage.
+    value: none: there is no such result.
+    experiment, signature: name of the experiment and hash of its record, see `made_by`.
     """
     from lidar_mi.io.vortex_file import write_vortices
 
@@ -292,10 +275,7 @@ def write_result(folder: Path, name: str, value: Any, experiment: str, signature
 def held(folder: Path, kind: str) -> Iterator[None]:
     """Create and lock a folder with a record; one with other contents is refused.
 
-    Raises
-    ------
-    InputError
-        Another process uses the folder, or it holds files but no record.
+    Raises InputError: another process uses the folder, or it holds files but no record.
     """
     refuse_strangers(folder, RECORD, kind)
     make_folder(folder)
@@ -308,10 +288,7 @@ def held(folder: Path, kind: str) -> Iterator[None]:
 def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
     """Refuse a folder that is not empty and lacks a marker file.
 
-    Raises
-    ------
-    InputError
-        The folder is not empty, and the marker is not in it.
+    Raises InputError: the folder is not empty, and the marker is not in it.
     """
     if not (folder / marker).is_file() and not is_free(folder):
         raise InputError(f"{folder}: is no {kind}; expected an empty or a new one (-o DIR)")
@@ -341,12 +318,8 @@ def _versions() -> dict[str, str]:
 def made_by(record: Mapping[str, Any], keys: Keys | None = None) -> str:
     """Hash of the settings, files and versions in a record on which rendered images depend.
 
-    Parameters
-    ----------
-    record : dict
-        From `new_record`.
-    keys : Keys, optional
-        Those that matter, of settings and of files that they name; default: all.
+    record: from `new_record`.
+    keys: those that matter, of settings and of files that they name; default: all.
     """
     # in SI units: 0.5 km is the experiment of 500 m
     settings, files = reading.in_si(record["experiment"]), record["files"]

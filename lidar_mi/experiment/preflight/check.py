@@ -60,22 +60,13 @@ def sections(
 ) -> Iterator[Section]:
     """Titled tables of an experiment's instruments and the observed air; nothing is written.
 
-    Parameters
-    ----------
-    search_path : path
-        Folder in which files named by the experiment are searched first.
-    notice : callable
-        Called with the name of the running step.
-    timed : bool
-        With the time of the run, which takes a probe of about a second.
-    sampled : bool
-        Say of Monte Carlo samples, where there is a detector, how many are chosen and what their
-        noise is relative to its own, which takes an image of few samples.
+    search_path: folder in which files named by the experiment are searched first.
+    notice: called with the name of the running step.
+    timed: with the time of the run, which takes a probe of about a second.
+    sampled: say of Monte Carlo samples, where there is a detector, how many are chosen and what
+        their noise is relative to its own, which takes an image of few samples.
 
-    Raises
-    ------
-    InputError
-        Anything that a run would refuse before it starts.
+    Raises InputError: anything that a run would refuse before it starts.
     """
     # processor time, which other programs do not affect
     start = time.process_time()

@@ -89,12 +89,8 @@ class Cost(NamedTuple):
 def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> Cost:
     """Processor time of a run on this machine, to a factor of two.
 
-    Parameters
-    ----------
-    results : mapping
-        Results of the stages that `lidar_mi.experiment.run.prepare` has computed.
-    preparation : float
-        Processor time that it took, s.
+    results: results of the stages that `lidar_mi.experiment.run.prepare` has computed.
+    preparation: processor time that it took, s.
     """
     # the constants are of another machine; rendering is timed on this one
     factor = slowness()
@@ -112,14 +108,9 @@ def cost(experiment: Experiment, results: Results, preparation: float = 0.0) -> 
 def flight_seconds(first: Experiment, results: Results, scans: float) -> float:
     """Processor time of a flight on this machine, to a factor of two.
 
-    Parameters
-    ----------
-    first : Experiment
-        The images of one slab.
-    results : mapping
-        Results of the stages that `lidar_mi.experiment.run.prepare` has computed of it.
-    scans : float
-        Of the lidar; each is of two slabs. Flights without it take hardly any time.
+    first: the images of one slab.
+    results: results of the stages that `lidar_mi.experiment.run.prepare` has computed of it.
+    scans: of the lidar; each is of two slabs. Flights without it take hardly any time.
     """
     factor = slowness()
     slab = factor * (FLIGHT_SLAB + FLIGHT_LINES * _lines(first))

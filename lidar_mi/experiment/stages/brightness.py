@@ -31,11 +31,8 @@ def check_brightness(
 ) -> None:
     """Refuse images whose pixels would mostly be dark, by the lidar equation of the median pixel.
 
-    Raises
-    ------
-    InputError
-        Too few samples contribute: free flights that end elsewhere, or a field of view that
-        contains hardly any of the beam; or light too weak for its error in single precision.
+    Raises InputError: too few samples contribute: free flights that end elsewhere, or a field of
+    view that contains hardly any of the beam; or light too weak for its error in single precision.
     """
     inside = float(np.median(truth.extinction[0].values))
     if not inside > 0:

@@ -17,6 +17,7 @@ from lidar_mi.instrument.coherent.scans import LineScan, dbs_scan, ppi_scan, rhi
 from lidar_mi.instrument.coherent.weighting import CoherentLidar
 from lidar_mi.schema.coherent import CoherentDoppler, CoherentScan
 from lidar_mi.schema.wake import Wake
+from lidar_mi.variables import variable
 
 _RINGS = np.arange(5.0, 15.125, 0.25)  # m, as of `ring_averages`
 
@@ -84,13 +85,7 @@ def passing_air(
 
 
 def check_scan(doppler: CoherentDoppler, wake: Wake | None) -> None:
-    """Refuse a scan that takes too much memory, or that is along the wake.
-
-    Raises
-    ------
-    InputError
-        With what is allowed.
-    """
+    """Refuse a scan that takes too much memory, or that is along the wake."""
     scan = doppler.scan
     cells = line_scan(scan).time.size * doppler.laser.gates
     if cells > _MOST_CELLS:
@@ -196,17 +191,19 @@ def _true_vortices(
     rows, both = true_vortices(doppler, air, times), ("time", "vortex")
     age = doppler.passage.age + times
 
-    def field(k: int, long_name: str, units: str) -> tuple[object, ...]:
-        return both, rows[..., k], {"units": units, "long_name": long_name}
-
     return {
         "vortex": ("vortex", list(VORTICES)),
-        "vortex_y": field(0, "true distance from the lidar along the scan's azimuth", "m"),
-        "vortex_z": field(1, "true height above the lidar", "m"),
-        "vortex_circulation": field(
-            2, "true circulation, mean over rings of 5 to 15 m, positive from y to z", "m2 s-1"
+        "vortex_y": variable(
+            both, rows[..., 0], "m", "true distance from the lidar along the scan's azimuth"
         ),
-        "wake_age": ("time", age, {"units": "s", "long_name": "age of the wake"}),
+        "vortex_z": variable(both, rows[..., 1], "m", "true height above the lidar"),
+        "vortex_circulation": variable(
+            both,
+            rows[..., 2],
+            "m2 s-1",
+            "true circulation, mean over rings of 5 to 15 m, positive from y to z",
+        ),
+        "wake_age": variable("time", age, "s", "age of the wake"),
     }
 
 

@@ -23,20 +23,13 @@ LEAST_OVERLAP = 0.9
 class LightBudget(NamedTuple):
     """The median pixel of the first gate of the first image.
 
-    Attributes
-    ----------
-    overlap : float
-        Fraction of the light from there that arrives within the field of view.
-    transmittance : float
-        Of the environment, to the gate and back.
-    lidar_ratio : float
-        Extinction over backscatter coefficient of slab and environment without the molecular part,
-        sr.
-    s0 : float
-        Received energy over emitted pulse energy, of single scattering.
-    photoelectrons, noise : float or None
-        Of a pulse, and the relative standard deviation of the signal of all pulses of a beam; None
-        without a detector.
+    overlap: fraction of the light from there that arrives within the field of view.
+    transmittance: of the environment, to the gate and back.
+    lidar_ratio: extinction over backscatter coefficient of slab and environment without the
+        molecular part, sr.
+    s0: received energy over emitted pulse energy, of single scattering.
+    photoelectrons, noise: of a pulse, and the relative standard deviation of the signal of all
+        pulses of a beam; None without a detector.
     """
 
     overlap: float
@@ -50,14 +43,9 @@ class LightBudget(NamedTuple):
 class BackscatterFractions(NamedTuple):
     """Fractions of the backscatter of the first gate, mean over the first image; their sum is 1.
 
-    Attributes
-    ----------
-    molecules : float
-        Of clear air.
-    background : float
-        Of the scatterers with the extinction ``wake.extinction.background``.
-    exhaust : float
-        Of what is added to it: by the wake's tracer, or by its speed.
+    molecules: of clear air.
+    background: of the scatterers with the extinction ``wake.extinction.background``.
+    exhaust: of what is added to it: by the wake's tracer, or by its speed.
     """
 
     molecules: float

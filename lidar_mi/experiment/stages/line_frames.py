@@ -35,13 +35,9 @@ _A_SCAN = 1 << 26
 class LineImages:
     """Images without noise, photons per pixel and pulse.
 
-    Attributes
-    ----------
-    middle, half : float
-        Of the speeds that they are for, m/s.
-    air : torch.Tensor, shape (nodes, height, width)
-        At the lidar's own range.
-    laser : torch.Tensor, shape (height, width)
+    middle, half: of the speeds that they are for, m/s.
+    air (nodes, height, width): at the lidar's own range.
+    laser (height, width)
     """
 
     middle: float
@@ -87,16 +83,10 @@ def line_frames(
 ) -> "tuple[torch.Tensor, torch.Tensor, list[int]]":
     """Frames of air and of the laser for some lines of a scan, sums over their pulses.
 
-    Parameters
-    ----------
-    lines : xr.Dataset, dim (line)
-        All lines of the scan, with ``v_los_true`` (m/s) and ``range`` (m).
-    numbers : sequence of int
-        Those whose frames are made.
-    pulses : int
-        Of a line.
-    scan : int
-        Its number selects random streams.
+    lines (line): all lines of the scan, with ``v_los_true`` (m/s) and ``range`` (m).
+    numbers: those whose frames are made.
+    pulses: of a line.
+    scan: its number selects random streams.
 
     Returns
     -------

@@ -38,16 +38,13 @@ def line_winds(
 ) -> xr.Dataset:
     """Profiles of the wind as of `fit_winds_to_lines`, beside the truth.
 
+    Raises InputError: scans without any wind.
+
     Returns
     -------
     xr.Dataset
         With `u_true`, `v_true`, `w_true` (m/s): means over the slanted lines of the scan or the
         interval, each at its own time where it crosses the height.
-
-    Raises
-    ------
-    InputError
-        Scans without any wind.
     """
     from lidar_mi.retrieval.ground_winds.winds import fit_winds_to_lines
 

@@ -36,6 +36,7 @@ from lidar_mi.schema.input_files import find_file
 from lidar_mi.schema.platform import Platform
 from lidar_mi.schema.sensor import Sensor
 from lidar_mi.schema.wake import Wake
+from lidar_mi.variables import variable
 
 if TYPE_CHECKING:
     from lidar_mi.retrieval.rings.model import PixelNoise
@@ -75,10 +76,7 @@ def requirement_tables(
 ) -> Mapping[tuple[str, str], RequirementTable]:
     """The tables that the lidars are compared with, as `read_requirements` gives them.
 
-    Raises
-    ------
-    InputError
-        A requirement table that is missing or not one.
+    Raises InputError: a requirement table that is missing or not one.
     """
     path = sensor.requirements if sensor else None
     if path:
@@ -113,11 +111,8 @@ def states_of_wind(platform: Platform, slab_wind: xr.Dataset, flows: Flows) -> x
 def check_lines(line_scan: LineScan, scan: Scan, rings: Rings) -> None:
     """Check that both lidars observe the same air, in the Doppler lidar's velocity range.
 
-    Raises
-    ------
-    InputError
-        Lidars that do not observe the same slab, lines that leave the wake, speeds beyond the
-        unambiguous range.
+    Raises InputError: lidars that do not observe the same slab, lines that leave the wake, speeds
+    beyond the unambiguous range.
     """
     sensor, states, speed = line_scan.sensor, line_scan.states, line_scan.platform.speed
     reference_frames(sensor.pulses, line_scan.doppler.reference.every, PULSES)
@@ -212,15 +207,15 @@ def with_speeds(
         "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),
         # independent errors: variances add
         "v_los_std": ("line", np.hypot(std, drift_std), lines.variables["v_los_std"].attrs),
-        "v_los_systematic": (
+        "v_los_systematic": variable(
             "line",
             np.hypot(systematic, plate_uncertainty(doppler)),
-            {"units": "m s-1", "long_name": "systematic standard error common to all lines"},
+            "m s-1",
+            "systematic standard error common to all lines",
         ),
     }
     shared = shared_covariance(doppler, pulses, laser_std, PULSES)
     if shared is not None:
         text = "covariance of the random errors of v_los by the laser's frames, beside v_los_std"
-        about = {"units": "m2 s-2", "long_name": text}
-        variables["v_los_covariance"] = ("line", "other_line"), shared, about
+        variables["v_los_covariance"] = variable(("line", "other_line"), shared, "m2 s-2", text)
     return lines.assign(variables)

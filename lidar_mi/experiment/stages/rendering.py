@@ -1,6 +1,7 @@
 """From the truth to the two images of the backscatter lidar: scan geometry, light, detector."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,7 @@ import xarray as xr
 
 from lidar_mi.atmosphere.vortices.cores import Core, find_cores
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.graph import But, Only, Store
+from lidar_mi.experiment.graph import But, Only, Store, bundle
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.observation import Observation
@@ -67,10 +68,7 @@ def scattering_air(
 ) -> Scatterer:
     """Phase function and albedo of the air; tables are read, or computed where they are missing.
 
-    Raises
-    ------
-    InputError
-        A scattering table that is missing or not one.
+    Raises InputError: a scattering table that is missing or not one.
     """
     check_variant(render.variant)
     log.bar("reading scattering matrices", None)
@@ -96,11 +94,8 @@ def check_light(
 ) -> None:
     """Check that the images will not be dark or their noise undetermined.
 
-    Raises
-    ------
-    InputError
-        Air that does not scatter, a detector inconsistent with the pulse, beams too wide for the
-        largest medium, moving air in more states than the memory holds.
+    Raises InputError: air that does not scatter, a detector inconsistent with the pulse, beams too
+    wide for the largest medium, moving air in more states than the memory holds.
     """
     truth, plans = observed.truth, observed.plans
     # refuses beams that are too wide for a medium
@@ -156,13 +151,20 @@ def samples_by_noise(
     return chosen.number
 
 
+@bundle
+class Light:
+    """How light goes from the lidar through the air, and how that is computed."""
+
+    lidar: Annotated[BackscatterLidar, But("pulse_energy")]
+    scattering: Scattering
+    render: Annotated[RenderSettings, But(*CHOOSING)]
+    seed: int
+    air: Scatterer
+
+
 def render_images(
     observed: ObservedAir,
-    lidar: Annotated[BackscatterLidar, But("pulse_energy")],
-    scattering: Scattering,
-    render: Annotated[RenderSettings, But(*CHOOSING)],
-    seed: int,
-    air: Scatterer,
+    light: Light,
     samples: int,
     log: Log,
     missing: Sequence[str] = IMAGES,
@@ -177,7 +179,7 @@ def render_images(
     scan : xr.Dataset, dims (gate, z, y)
         From `render_scans`, with the depolarisation and what else it gives.
     """
-    use_variant(render.variant)
+    use_variant(light.render.variant)
     platform, scan, plans = observed.observation.platform, observed.observation.scan, observed.plans
     wanted = [IMAGES.index(name) for name in missing]
     log(f"rendering {len(wanted)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
@@ -185,15 +187,11 @@ def render_images(
     def progress(index: int, done: int, total: int) -> None:
         log.bar(f"rendering scan {index + 1} of {len(plans)}", done / total)
 
-    chosen = samples if render.samples_per_beam == "auto" else None
+    chosen = samples if light.render.samples_per_beam == "auto" else None
     rendered = _rendered(
         observed,
         _fields(observed, wanted, log),
-        lidar,
-        scattering,
-        with_samples(render, samples),
-        seed,
-        air,
+        replace(light, render=with_samples(light.render, samples)),
         Series(wanted, progress, batches_of(IMAGES, store, log, chosen)),
     )
     motion = {"platform_speed": platform.speed, "dt": platform.dt}
@@ -223,24 +221,17 @@ def _fields(observed: ObservedAir, wanted: Sequence[int], log: Log) -> list[xr.D
 
 
 def _rendered(
-    observed: ObservedAir,
-    fields: Sequence[xr.DataArray],
-    lidar: BackscatterLidar,
-    scattering: Scattering,
-    render: RenderSettings,
-    seed: int,
-    air: Scatterer,
-    series: Series = ALL_IMAGES,
+    observed: ObservedAir, fields: Sequence[xr.DataArray], light: Light, series: Series = ALL_IMAGES
 ) -> Iterator[xr.Dataset]:
     """The scans of these fields, from `render_scans`."""
-    truth, plans = observed.truth, observed.plans
+    truth, plans, lidar = observed.truth, observed.plans, light.lidar
     around = ScatteringAir(
         environment_extinction(observed.observation.wake, truth),
-        *air,
-        molecules(truth.molecules, lidar.wavelength, scattering.band),
+        *light.air,
+        molecules(truth.molecules, lidar.wavelength, light.scattering.band),
     )
-    slabs = _media(lidar, fields, plans)
-    return render_scans(slabs, plans, lidar, around, render.for_winds(), seed, series)
+    slabs, settings = _media(lidar, fields, plans), light.render.for_winds()
+    return render_scans(slabs, plans, lidar, around, settings, light.seed, series)
 
 
 def chosen_samples(
@@ -264,8 +255,8 @@ def chosen_samples(
     beams, gates = len(plans[0].y) * len(plans[0].z), plans[0].gate_count
     number, seed = pilot_samples(render, beams, gates), seed + PILOT_SEED
     # noise is that of air at the scan's reference time, which need not be moved for it
-    few = with_samples(render, number)
-    pilots = list(_rendered(observed, truth.extinction, lidar, scattering, few, seed, air))
+    light = Light(lidar, scattering, with_samples(render, number), seed, air)
+    pilots = list(_rendered(observed, truth.extinction, light))
     pilots = with_pair_stderr(pilots, truth.wind, observation.platform.dt)
     pulses, mapping = observation.scan.pulses_per_beam, observation.wake.extinction
     choices = []
@@ -299,10 +290,8 @@ def batches_of(
 ) -> Callable[[int], Batches] | None:
     """Storage of an image's samples while it is rendered, by its index among the names.
 
-    Parameters
-    ----------
-    samples : int, optional
-        Per beam, where that was chosen: stored ones of an image with another number are not used.
+    samples: per beam, where that was chosen: stored ones of an image with another number are not
+        used.
     """
     if store is None:
         return None

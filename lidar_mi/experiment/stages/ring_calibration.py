@@ -30,10 +30,8 @@ _STREAMS = 3 << 25
 def calibration_file(doppler: Doppler, rings: Rings, search_path: Path) -> "Calibration | None":
     """The calibration that an experiment names, or none.
 
-    Raises
-    ------
-    InputError
-        A file that is missing, no calibration, or one of another camera, wavelength or gap.
+    Raises InputError: a file that is missing, no calibration, or one of another camera, wavelength
+    or gap.
     """
     from lidar_mi.retrieval.rings.calibration import calibrated, calibration_of
 
@@ -56,10 +54,7 @@ def assumed_rings(
     Simulated frames are of the true instrument, each with the noise of its camera; the calibration
     starts from the assumed one.
 
-    Raises
-    ------
-    InputError
-        Frames that do not fit the assumed instrument.
+    Raises InputError: frames that do not fit the assumed instrument.
     """
     import torch
 

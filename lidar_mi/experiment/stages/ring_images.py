@@ -106,10 +106,8 @@ def air_line(
 def ring_instrument(doppler: Doppler) -> Rings:
     """Instrument and air of the images, checked.
 
-    Raises
-    ------
-    InputError
-        Winds beyond the unambiguous range, fewer than two rings on the CCD, pixels that overflow.
+    Raises InputError: winds beyond the unambiguous range, fewer than two rings on the CCD, pixels
+    that overflow.
     """
     render, pixels = doppler.render, doppler.camera.width * doppler.camera.height
     # samples are traced pass by pass
@@ -181,10 +179,8 @@ def ring_models(doppler: Doppler) -> "tuple[RingModel, RingModel]":
 def check_rings(doppler: Doppler) -> None:
     """Check that scenes of the rings can be built.
 
-    Raises
-    ------
-    InputError
-        A lens that is too fast or has too wide a field; a variant that cannot run here.
+    Raises InputError: a lens that is too fast or has too wide a field; a variant that cannot run
+    here.
     """
     check_variant(doppler.render.variant)
     settings = [doppler.render]

@@ -34,17 +34,12 @@ def ring_model(
 ) -> "RingModel":
     """The model of a line's rings for the retrieval.
 
-    Parameters
-    ----------
-    line : Line, or function of the temperature (K) that returns one
-        Of air at rest, or of the laser.
-    temperatures : sequence of float
-        K, ascending; with them ``line`` is a function and the temperature a parameter of the fit.
+    line (Line, or function of the temperature (K) that returns one): of air at rest, or of the
+        laser.
+    temperatures: K, ascending; with them ``line`` is a function and the temperature a parameter of
+        the fit.
 
-    Raises
-    ------
-    InputError
-        A mirror that does not transmit, lines of different wavelengths.
+    Raises InputError: a mirror that does not transmit, lines of different wavelengths.
     """
     from lidar_mi.retrieval.rings.model import RingModel
 
@@ -94,13 +89,10 @@ def air_rings(
 ) -> "RingModel":
     """Rings of the backscatter at the lidar's altitude, for its temperature within 25 %.
 
-    Parameters
-    ----------
-    aerosol_std, temperature_std : float
-        Standard deviations of what is known of the fraction of aerosol (0: all) and of the
-        temperature (K), about those of the lidar's air.
-    light_degree, background_degree : int
-        Of the smooth variations of light and background that are fitted along.
+    aerosol_std, temperature_std: standard deviations of what is known of the fraction of aerosol
+        (0: all) and of the temperature (K), about those of the lidar's air.
+    light_degree, background_degree: of the smooth variations of light and background that are
+        fitted along.
     """
     pressure, temperature = air_of(lidar)
     # aerosol that is fitted has harmonics of its own: the line is that of molecules

@@ -28,10 +28,8 @@ WANTED = 0.5  # m/s, error for which the required scrambling is stated
 def reference_frames(averaged: int, every: int, key: str) -> tuple[int, int]:
     """Frames of the laser in an average of pulses, and averages that share one frame.
 
-    Raises
-    ------
-    InputError
-        An average that is neither a multiple nor a divisor of ``every``; ``key`` is its name.
+    Raises InputError: an average that is neither a multiple nor a divisor of ``every``; ``key`` is
+    its name.
     """
     if averaged % every and every % averaged:
         raise InputError(
@@ -58,14 +56,9 @@ def drifts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drift in the speed of averages of pulses, and its standard deviation, m/s.
 
-    Parameters
-    ----------
-    averaged : int
-        Pulses of an average.
-    numbers : sequence of int
-        Of the averages, counted from the first pulse of a series.
-    key : str
-        As of `reference_frames`.
+    averaged: pulses of an average.
+    numbers: of the averages, counted from the first pulse of a series.
+    key: as of `reference_frames`.
     """
     every = doppler.reference.every
     frames, sharing = reference_frames(averaged, every, key)

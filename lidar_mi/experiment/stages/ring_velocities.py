@@ -31,6 +31,7 @@ from lidar_mi.experiment.stages.ring_reference import (
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.schema.doppler import Doppler
+from lidar_mi.variables import variable
 
 if TYPE_CHECKING:
     import torch
@@ -244,45 +245,30 @@ def velocities(
         _warn_of_failures(name, v[places[name], ..., :count], reasons.get(name), log)
     return xr.Dataset(
         {
-            "v": (dims, v, {"units": "m s-1", "long_name": "retrieved line-of-sight wind"}),
-            "v_std": (
-                dims,
-                v_std,
-                {"units": "m s-1", "long_name": "random standard deviation as stated"},
-            ),
-            "v_systematic": (
+            "v": variable(dims, v, "m s-1", "retrieved line-of-sight wind"),
+            "v_std": variable(dims, v_std, "m s-1", "random standard deviation as stated"),
+            "v_systematic": variable(
                 dims,
                 v_systematic,
-                {
-                    "units": "m s-1",
-                    "long_name": "systematic standard deviation as stated, common to all images",
-                },
+                "m s-1",
+                "systematic standard deviation as stated, common to all images",
             ),
-            "tried": ("algorithm", tried, {"units": "1", "long_name": "images of every case"}),
-            "peak_bias": (
+            "tried": variable("algorithm", tried, "1", "images of every case"),
+            "peak_bias": variable(
                 ("coordinate", "piece"),
                 _peak_bias(doppler, rendered),
-                {
-                    "units": "m s-1",
-                    "long_name": "error of the innermost ring's peak by circular averaging, "
-                    "no noise",
-                },
+                "m s-1",
+                "error of the innermost ring's peak by circular averaging, no noise",
             ),
         },
         coords={
             "algorithm": list(settings.methods),
             "centre": list(settings.centre),
-            "averaged": (
-                "averaged",
-                list(settings.averaged),
-                {"units": "1", "long_name": "images of an average"},
-            ),
-            "v_los": ("v_los", list(speeds), {"units": "m s-1", "long_name": "true wind"}),
+            "averaged": variable("averaged", list(settings.averaged), "1", "images of an average"),
+            "v_los": variable("v_los", list(speeds), "m s-1", "true wind"),
             "coordinate": list(COORDINATES),
-            "piece": (
-                "piece",
-                list(PIECES),
-                {"units": "1", "long_name": "half width of the fitted piece in radii"},
+            "piece": variable(
+                "piece", list(PIECES), "1", "half width of the fitted piece in radii"
             ),
         },
         attrs={"Conventions": "CF-1.11", "title": "Line-of-sight winds retrieved from rings"},

@@ -96,12 +96,9 @@ def _shifted(lines: xr.Dataset) -> xr.Dataset | None:
 def with_systematic(combined: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
     """Vectors with the systematic standard errors of their components, m/s.
 
-    Parameters
-    ----------
-    found, shifted : xr.Dataset
-        Vectors by the same method from lines as measured, and from lines that all have the stated
-        systematic error of v_LOS. It is one error, common to all lines and vectors; the differences
-        of the vectors are what it makes of u, v and w.
+    found, shifted: vectors by the same method from lines as measured, and from lines that all have
+        the stated systematic error of v_LOS. It is one error, common to all lines and vectors; the
+        differences of the vectors are what it makes of u, v and w.
     """
     from lidar_mi.retrieval.combined.vectors import COMPONENTS
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
+from lidar_mi.experiment.graph import bundle
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.observation import Observation
 from lidar_mi.experiment.stages.rendering import gridded_scans
@@ -21,15 +22,22 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.settings import RenderSettings
 
 
+@bundle
+class _Images:
+    """Both scans: as detected beam by beam, on the grid of the winds, and where they looked."""
+
+    detected: Sequence[xr.Dataset]
+    scans: Sequence[xr.Dataset]
+    plans: Sequence[ScanPlan]
+
+
 def simulation_noise(
     observation: Observation,
     lidar: BackscatterLidar,
     render: RenderSettings,
     estimation: Estimation,
     seed: int,
-    detected: Sequence[xr.Dataset],
-    plans: Sequence[ScanPlan],
-    scans: Sequence[xr.Dataset],
+    images: _Images,
     wind: xr.Dataset,
     log: Log,
 ) -> xr.Dataset | None:
@@ -49,21 +57,21 @@ def simulation_noise(
     """
     from lidar_mi.retrieval.wind.pair import retrieve_wind
 
-    fraction = max(one.attrs.get("monte_carlo_fraction", np.inf) for one in detected)
+    fraction = max(one.attrs.get("monte_carlo_fraction", np.inf) for one in images.detected)
     if fraction <= render.monte_carlo_fraction:
         return None
     log.bar("retrieving winds with more noise of the simulation", None)
     wake, platform, scan = observation.wake, observation.platform, observation.scan
     retrieval = estimation.retrieval
     random = np.random.default_rng([seed, 2])
-    noisier = [_with_more_noise(one, random) for one in detected]
+    noisier = [_with_more_noise(one, random) for one in images.detected]
     pairs = rendered_pairs(wake, scan, gridded_scans(platform, noisier))
     source, (changed, _) = pairs.popitem()
     # methods that weight by noise are to do so as before
-    before, noise = rendered_pairs(wake, scan, scans)[source]
+    before, noise = rendered_pairs(wake, scan, images.scans)[source]
     # which pixels scattered beams reach depends on the wind between them, and so on the noise
     pair = [one.where(first.notnull()) for one, first in zip(changed, before, strict=True)]
-    times = pixel_times(wake, scan, scans)
+    times = pixel_times(wake, scan, images.scans)
     changes = []
     for method in retrieval.methods:
         noisy = retrieve_wind(
@@ -73,7 +81,7 @@ def simulation_noise(
             method=method,
             noise=noise,
             times=times,
-            blur=known_blur(retrieval, lidar, plans[0]),
+            blur=known_blur(retrieval, lidar, images.plans[0]),
             standard_errors=False,
             **window_settings(retrieval, estimation.device),
         )

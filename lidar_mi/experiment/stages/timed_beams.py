@@ -32,11 +32,8 @@ def timed_plans(
 ) -> list[ScanPlan]:
     """The plans of both scans with their beams; as they are where nothing takes time or moves.
 
-    Raises
-    ------
-    InputError
-        A table or trajectory that cannot be used, a scan longer than the time between the scans,
-        a scanner beyond its limits, a pose from which the slab is not reached.
+    Raises InputError: a table or trajectory that cannot be used, a scan longer than the time
+    between the scans, a scanner beyond its limits, a pose from which the slab is not reached.
     """
     if (scan.timing is None or scan.timing.is_instant) and is_steady(platform):
         return list(plans)
@@ -90,11 +87,6 @@ def line_beams(
     """Beams of the Doppler lidar's lines of sight, about the first scan's reference time.
 
     None where nothing takes time or moves.
-
-    Raises
-    ------
-    InputError
-        As `timed_plans`.
     """
     if (sensor.timing is None or sensor.timing.is_instant) and is_steady(platform):
         return None

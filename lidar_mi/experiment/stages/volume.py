@@ -35,12 +35,8 @@ from lidar_mi.schema.wake import Wake
 class Volumes:
     """Pairs of volumes by source, and their noise.
 
-    Attributes
-    ----------
-    pairs : dict of str to pair of xr.DataArray, dims (x, z, y)
-        Attenuated backscatter at both times, m^-1 sr^-1, by `Source`.
-    noise : dict of str to xr.DataArray, dims (x, z, y)
-        Standard error of the first volume of each, same unit.
+    pairs (x, z, y): attenuated backscatter at both times, m^-1 sr^-1, by `Source`.
+    noise (x, z, y): standard error of the first volume of each, same unit.
     """
 
     pairs: dict[str, Pair]
@@ -52,11 +48,8 @@ def check_volume(
 ) -> None:
     """Check that a wind in three dimensions can be retrieved.
 
-    Raises
-    ------
-    InputError
-        A wake without wind along x, gates that reach beyond it, fewer gates or beams than a window
-        has voxels.
+    Raises InputError: a wake without wind along x, gates that reach beyond it, fewer gates or beams
+    than a window has voxels.
     """
     if "u" not in flows[0]:
         raise InputError("wake.file: no wind along x (u) in it; expected u, v and w for volume")
@@ -117,16 +110,11 @@ def scan_volume(
     thick, so that little structure is lost. The variance of white noise is reduced to 0.76 in the
     mean, that of its long waves is not.
 
-    Parameters
-    ----------
-    s0 : xr.DataArray, dims (gate, z, y)
-        Received energy over emitted pulse energy.
-    plan : ScanPlan
-        Planar gates.
-    environment : float
-        Extinction coefficient up to the gates, m^-1.
-    nodes : x, z, y of the grid, m
-        x in the frame of the air, one per gate; inside the beams of every gate.
+    s0 (gate, z, y): received energy over emitted pulse energy.
+    plan: planar gates.
+    environment: extinction coefficient up to the gates, m^-1.
+    nodes (x, z, y of the grid, m): x in the frame of the air, one per gate; inside the beams of
+        every gate.
     """
     from lidar_mi.retrieval.images.common_grid import resample
 

@@ -33,14 +33,9 @@ if TYPE_CHECKING:
 class VortexFits:
     """Vortex pairs by the data they were fitted to.
 
-    Attributes
-    ----------
-    pairs : dict of str to VortexPairFit
-        The accepted ones, by `Origin`.
-    refused : dict of str to str
-        Reasons for which there is no other.
-    method : str, optional
-        Method of the wind vectors; None if no pair was fitted to vectors.
+    pairs: the accepted ones, by `Origin`.
+    refused: reasons for which there is no other.
+    method: method of the wind vectors; None if no pair was fitted to vectors.
     """
 
     pairs: "dict[str, VortexPairFit]"

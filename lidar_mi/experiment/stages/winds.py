@@ -44,10 +44,7 @@ class Estimation:
 def check_windows(retrieval: Retrieval, plans: Sequence[ScanPlan]) -> None:
     """Check that windows fit into the images.
 
-    Raises
-    ------
-    InputError
-        A search region larger than the images.
+    Raises InputError: a search region larger than the images.
     """
     image = len(plans[0].z), len(plans[0].y)
     check_window_sizes(image, retrieval.template, retrieval.search, retrieval.stride)

@@ -14,10 +14,8 @@ from lidar_mi.schema.wake import VortexPair
 def analytic_wake(pair: VortexPair, encounter: Encounter) -> PairAlongPath | FilamentsAlongPath:
     """The wake of an analytic pair along the flight path.
 
-    Raises
-    ------
-    InputError
-        A deformation of more than half of the separation, of filaments that are linked at age 0.
+    Raises InputError: a deformation of more than half of the separation, of filaments that are
+    linked at age 0.
     """
     path, wake = encounter.path, encounter.wake
     arrival = path.start / path.speed

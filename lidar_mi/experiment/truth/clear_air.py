@@ -42,12 +42,9 @@ def clear_air(
 ) -> ClearAir:
     """Molecules of the air, as stated or from the site's pressure and temperature.
 
-    Raises
-    ------
-    InputError
-        A sounding that cannot be used, that does not reach the site's altitude, or whose pressure
-        there is below half or above twice that of the standard atmosphere; a wavelength at
-        which the refractive index of air is not known.
+    Raises InputError: a sounding that cannot be used, that does not reach the site's altitude, or
+    whose pressure there is below half or above twice that of the standard atmosphere; a wavelength
+    at which the refractive index of air is not known.
     """
     molecules = wake_extinction.molecules
     if molecules == 0:
@@ -79,11 +76,6 @@ def in_air_of_its_site(experiment: Experiment, search_path: Path) -> Experiment:
     ``doppler.lidar`` does not state its own. Backscatter is that of molecules plus the
     ``aerosol_fraction``, extinction that of molecules; neither changes if all light is of aerosol.
     Without a site nothing changes.
-
-    Raises
-    ------
-    InputError
-        As of `clear_air`.
     """
     doppler, site = experiment.fringes, experiment.site
     if doppler is None or site == Site():

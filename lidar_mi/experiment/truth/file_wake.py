@@ -24,10 +24,7 @@ Pairs = tuple[tuple[Vortex, ...], tuple[Vortex, ...]]
 def refuse_ages(section: str, ages: Mapping[str, float | None]) -> None:
     """Refuse ages and decay times for the wake of a file.
 
-    Raises
-    ------
-    InputError
-        A key of the section has a value.
+    Raises InputError: a key of the section has a value.
     """
     for key, value in ages.items():
         if value:
@@ -40,10 +37,7 @@ def refuse_ages(section: str, ages: Mapping[str, float | None]) -> None:
 def read_planes(path: Path, wake: Wake, *, volume: bool = False) -> xr.Dataset:
     """Wind and tracers of the plane ``wake.x``, or of all planes.
 
-    Raises
-    ------
-    InputError
-        Several planes of which none is named.
+    Raises InputError: several planes of which none is named.
     """
     tracers, names = tracers_of(wake)
     flow = read_wake(path, wake.time, names, None if volume else wake.x, require=tracers)
@@ -65,10 +59,8 @@ def with_extinction(flow: xr.Dataset, wake: Wake) -> xr.Dataset:
 def pairs_in(flow: xr.Dataset, name: str) -> tuple[Pairs, tuple[float, float]]:
     """The vortices in each plane, and the wind v, w (m/s) that advects them, of all planes.
 
-    Raises
-    ------
-    InputError
-        A plane without two vortices of opposite sense, or with vortices that are too close.
+    Raises InputError: a plane without two vortices of opposite sense, or with vortices that are too
+    close.
     """
     sides: tuple[list[Vortex], list[Vortex]] = ([], [])
     drifts = []

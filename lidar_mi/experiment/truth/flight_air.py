@@ -38,10 +38,7 @@ _DRIFT_PLANES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 def air_along_path(experiment: Experiment) -> WakeAlongPath:
     """The wind of the wake and of all other air along the flight path.
 
-    Raises
-    ------
-    InputError
-        No encounter, a wake that is not known along its axis, air out of range.
+    Raises InputError: no encounter, a wake that is not known along its axis, air out of range.
     """
     encounter, wake = encounter_of(experiment), wake_along_path(experiment)
     air, path = encounter.air, encounter.path
@@ -65,12 +62,8 @@ def air_along_path(experiment: Experiment) -> WakeAlongPath:
 def moving_air(air: schema.Air, path: flight.Path, seed: int) -> tuple[MovingAir, ...]:
     """The parts of the air that are neither the wake nor read from a file.
 
-    Parameters
-    ----------
-    path : lidar_mi.schema.encounter.Path
-        Heights are above its ground; turbulence and gusts are those at its start.
-    seed : int
-        Of the experiment.
+    path: heights are above its ground; turbulence and gusts are those at its start.
+    seed: of the experiment.
     """
     parts: list[MovingAir] = []
     if air.turbulence is not None:

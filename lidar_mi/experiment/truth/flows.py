@@ -86,11 +86,8 @@ def read_flows(
 ) -> Flows:
     """The flow at t1 and, if it is a state of its own, at t2, centred and refined.
 
-    Raises
-    ------
-    InputError
-        A wake that cannot be read, or images of it that a run cannot hold: before more is made of
-        it.
+    Raises InputError: a wake that cannot be read, or images of it that a run cannot hold: before
+    more is made of it.
     """
     log.bar("reading the wake", None)
     scan = observation.scan
@@ -231,10 +228,7 @@ def _turbine(observation: Observation, turbine: Turbine, seed: int, most: int) -
 def analytic_axes(wake: Wake, key: str, most: int) -> list[np.ndarray]:
     """y and z of at most ``most`` nodes of an analytic wake, m, about the scan's axis.
 
-    Raises
-    ------
-    InputError
-        An extent that is not a multiple of the spacing, too many nodes.
+    Raises InputError: an extent that is not a multiple of the spacing, too many nodes.
     """
     ends = {}
     for axis, name in (("y", "width"), ("z", "height")):

@@ -28,10 +28,7 @@ def state_times(observation: Observation, flows: Flows, times: np.ndarray) -> np
 
     The middle one is that of the middle of the scan.
 
-    Raises
-    ------
-    InputError
-        More states than the memory holds.
+    Raises InputError: more states than the memory holds.
     """
     flow = mean_flow(flows)
     first, last = float(np.min(times)), float(np.max(times))
@@ -51,13 +48,7 @@ def state_times(observation: Observation, flows: Flows, times: np.ndarray) -> np
 
 
 def values_of_states(observation: Observation, flows: Flows, plans: Sequence[ScanPlan]) -> int:
-    """Values of all states of the scan that has most; 0 where air is frozen or beams have one time.
-
-    Raises
-    ------
-    InputError
-        As of `state_times`.
-    """
+    """Values of all states of the scan that has most; 0: air is frozen or beams have one time."""
     if observation.scan.air != "moving":
         return 0
     timed = [plan.beams.time for plan in plans if plan.beams is not None]
@@ -73,20 +64,12 @@ def air_in_time(
     The truth of the scan's reference time, advected by the same flow as the air from t1 to t2. With
     a stored state at t2, the mean of both states advected to the time, weighted linearly in time.
 
-    Parameters
-    ----------
-    times : array
-        Of the beams, s, from the scan's reference time.
+    times: of the beams, s, from the scan's reference time.
 
     Returns
     -------
     xarray.DataArray
         float32, at `state_times`, for linear interpolation. Without ``time`` where air is uniform.
-
-    Raises
-    ------
-    InputError
-        As of `state_times`.
     """
     if all(float(field.min()) == float(field.max()) for field in truth.extinction):
         return truth.extinction[which]

@@ -50,17 +50,10 @@ class MeanWind:
 class PassingWake:
     """All of the air, seen from the lidar.
 
-    Attributes
-    ----------
-    wake : PairAboveGround, VolumeAlongPath or None
-    gusts : Turbulence or None
-        Frozen in the mean wind at ``height`` unless it evolves.
-    height : float
-        m.
-    heading : float
-        Of the flight, rad, clockwise from north.
-    position : (float, float, float)
-        Of the lidar, m.
+    gusts: frozen in the mean wind at ``height`` unless it evolves.
+    height: m.
+    heading: of the flight, rad, clockwise from north.
+    position: of the lidar, m.
     """
 
     wake: PairAboveGround | VolumeAlongPath | None
@@ -118,11 +111,8 @@ def passing_wake(
 ) -> PassingWake:
     """The air of an experiment until a time (s).
 
-    Raises
-    ------
-    InputError
-        A file without two vortices in its plane; keys that it does not allow; turbulence out of
-        range.
+    Raises InputError: a file without two vortices in its plane; keys that it does not allow;
+    turbulence out of range.
     """
     passage, air = doppler.passage, doppler.air
     mean = _mean(air)

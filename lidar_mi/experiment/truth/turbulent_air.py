@@ -9,19 +9,11 @@ from lidar_mi.schema import air as schema
 def turbulent_air(keys: schema.Turbulence, height: float, seed: int, section: str) -> Turbulence:
     """Turbulence at a height above the ground, m.
 
-    Parameters
-    ----------
-    height : float
-        At which a standard is read, m.
-    seed : int
-        Of the experiment, where the section has none.
-    section : str
-        That has the key ``turbulence``, for messages.
+    height: at which a standard is read, m.
+    seed: of the experiment, where the section has none.
+    section: that has the key ``turbulence``, for messages.
 
-    Raises
-    ------
-    InputError
-        A shortest wavelength above a tenth of the length.
+    Raises InputError: a shortest wavelength above a tenth of the length.
     """
     sigma, length = turbulence_scales(keys, height)
     if keys.shortest > length / 10:

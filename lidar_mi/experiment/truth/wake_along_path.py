@@ -26,13 +26,7 @@ from lidar_mi.schema.wake import Wake
 
 
 def encounter_of(experiment: Experiment) -> Encounter:
-    """The encounter of an experiment.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
+    """The encounter of an experiment."""
     if experiment.encounter is None:
         raise InputError(
             f"encounter: missing in {experiment.name}; expected the section of a flight through "
@@ -44,10 +38,7 @@ def encounter_of(experiment: Experiment) -> Encounter:
 def wake_along_path(experiment: Experiment) -> WakeAlongPath:
     """Wind and vortices along the flight path.
 
-    Raises
-    ------
-    InputError
-        No encounter, or a wake that is not known along its axis.
+    Raises InputError: no encounter, or a wake that is not known along its axis.
     """
     encounter, wake = encounter_of(experiment), experiment.wake
     if wake is not None and wake.file:
@@ -118,13 +109,7 @@ def _period_of(
 
 
 def described_wake(experiment: Experiment) -> list[tuple[str, str]]:
-    """The wake of an encounter, if any, in words: a name and a line for each property.
-
-    Raises
-    ------
-    InputError
-        As of `wake_along_path`.
-    """
+    """The wake of an encounter, if any, in words: a name and a line for each property."""
     encounter, wake = encounter_of(experiment), experiment.wake
     if encounter.air is not None and not encounter.air.wake:
         return []

@@ -11,6 +11,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.instrument.coherent.scans import LineScan
 from lidar_mi.instrument.coherent.velocity_noise import cramer_rao, random_velocity
 from lidar_mi.instrument.coherent.weighting import CoherentLidar, Signal, WindField, gate_moments
+from lidar_mi.variables import variable
 
 START = np.datetime64("2000-01-01T00:00:00", "ns")
 """Time 0 of simulated lines."""
@@ -20,12 +21,8 @@ START = np.datetime64("2000-01-01T00:00:00", "ns")
 class Receiver:
     """What a receiver makes of a line.
 
-    Attributes
-    ----------
-    samples : float
-        Independent ones, of a gate times pulses of a line.
-    bandwidth : float
-        As a range of velocities, m/s.
+    samples: independent ones, of a gate times pulses of a line.
+    bandwidth: as a range of velocities, m/s.
     """
 
     samples: float = 1e5
@@ -50,14 +47,12 @@ def measured_lines(
     velocities uniform over the bandwidth, velocities are uniform, and flagged. Gates that overlap
     share their samples: noise at the distance x correlates by 1 - x / gate length.
 
-    Parameters
-    ----------
-    wind, scan, lidar, resolution, signal
-        As of `gate_moments`.
-    snr : float, (gates,) array or callable of the range (m)
-        Signal-to-noise ratio of the powers where the signal is 1, above 0.
-    receiver : Receiver, optional
-        Default: as `Receiver` has it.
+    wind, scan, lidar, resolution, signal: as of `gate_moments`.
+    snr (float, (gates,) array or callable of the range (m)): signal-to-noise ratio of the powers
+        where the signal is 1, above 0.
+    receiver: default: as `Receiver` has it.
+
+    Raises InputError: a signal that is not above 0, or of another number of gates.
 
     Returns
     -------
@@ -66,11 +61,6 @@ def measured_lines(
         `spectral_width` (of the pulse and of the wind within the gate), `snr`, `flag` (1: no
         signal);
         `azimuth` and `elevation` in degrees.
-
-    Raises
-    ------
-    InputError
-        A signal that is not above 0, or of another number of gates.
     """
     ranges = lidar.ranges
     ratio = np.asarray(snr(ranges) if callable(snr) else snr, float)
@@ -93,18 +83,17 @@ def measured_lines(
     uniform = receiver.bandwidth * (scipy.special.ndtr(noise) - 0.5)
     measured = np.where(lost, uniform, true + stderr * noise)
 
-    def field(values: np.ndarray, long_name: str, units: str = "m s-1") -> tuple[object, ...]:
-        return dims, values, {"units": units, "long_name": long_name}
-
     time = START + np.round(scan.time * 1e9).astype("timedelta64[ns]")
     degree = {"units": "degree"}
     return xr.Dataset(
         {
-            "radial_velocity": field(measured, "radial velocity, positive away"),
-            "radial_velocity_stderr": field(stderr, "standard error of the radial velocity"),
-            "radial_velocity_true": field(true, "radial velocity without noise"),
-            "spectral_width": field(width, "width of the Doppler spectrum"),
-            "snr": field(ratio, "signal-to-noise ratio of the powers", "1"),
+            "radial_velocity": variable(dims, measured, "m s-1", "radial velocity, positive away"),
+            "radial_velocity_stderr": variable(
+                dims, stderr, "m s-1", "standard error of the radial velocity"
+            ),
+            "radial_velocity_true": variable(dims, true, "m s-1", "radial velocity without noise"),
+            "spectral_width": variable(dims, width, "m s-1", "width of the Doppler spectrum"),
+            "snr": variable(dims, ratio, "1", "signal-to-noise ratio of the powers"),
             "flag": (
                 dims,
                 lost.astype(np.uint16),

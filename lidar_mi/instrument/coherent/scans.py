@@ -14,16 +14,10 @@ from lidar_mi.errors import InputError
 class LineScan:
     """Lines of sight, each at the middle of its accumulation.
 
-    Attributes
-    ----------
-    time : (lines,) array
-        s.
-    azimuth, elevation : (lines,) arrays
-        rad.
-    sweep : (lines,) array of int
-        Number of the scan.
-    azimuth_span, elevation_span : float
-        Angle that the beam moves through while it accumulates, rad.
+    time (lines,): s.
+    azimuth, elevation (lines,): rad.
+    sweep (lines,): number of the scan.
+    azimuth_span, elevation_span: angle that the beam moves through while it accumulates, rad.
     """
 
     time: np.ndarray
@@ -52,20 +46,12 @@ def rhi_scan(
 ) -> LineScan:
     """Vertical slices at one azimuth, up and down in turn.
 
-    Parameters
-    ----------
-    azimuth : float
-        rad.
-    elevation : (float, float)
-        First and last, rad; above pi/2: over the top.
-    rate : float
-        Angular speed, rad/s.
-    accumulation : float
-        Time of a line, s: a line every accumulation, without gaps.
-    count : int
-        Slices.
-    turn : float
-        Time between slices, s.
+    azimuth: rad.
+    elevation: first and last, rad; above pi/2: over the top.
+    rate: angular speed, rad/s.
+    accumulation: time of a line, s: a line every accumulation, without gaps.
+    count: slices.
+    turn: time between slices, s.
     """
     time, angle, sweep = _swept(elevation, rate, accumulation, count, turn, back=True)
     return LineScan(
@@ -99,14 +85,9 @@ def dbs_scan(
 ) -> LineScan:
     """Beams to the north, east, south and west, and a vertical one, step by step.
 
-    Parameters
-    ----------
-    elevation : float
-        Of the slanted beams, rad.
-    accumulation, move : float
-        Time of a beam, and from one to the next, s.
-    count : int
-        Cycles.
+    elevation: of the slanted beams, rad.
+    accumulation, move: time of a beam, and from one to the next, s.
+    count: cycles.
     """
     _check(accumulation=accumulation, count=count)
     azimuth = np.append(np.arange(4) * np.pi / 2, [0.0] if vertical else [])

@@ -21,16 +21,10 @@ def cramer_rao(snr: np.ndarray, width: np.ndarray, bandwidth: float, samples: fl
     dx and g = exp(-x^2 / 2) (Whittle's likelihood; Levin, IEEE Trans. Inf. Theory 11, 100-107,
     1965).
 
-    Parameters
-    ----------
-    snr : array
-        Ratio of the powers in the bandwidth, above 0.
-    width : array
-        Standard deviation of the signal's spectrum, m/s.
-    bandwidth : float
-        Of the receiver as a range of velocities, m/s: twice the largest that is measured.
-    samples : float
-        Of a gate times pulses.
+    snr: ratio of the powers in the bandwidth, above 0.
+    width: standard deviation of the signal's spectrum, m/s.
+    bandwidth: of the receiver as a range of velocities, m/s: twice the largest that is measured.
+    samples: of a gate times pulses.
     """
     _check(snr, width, bandwidth, samples)
     alpha = np.asarray(peak_ratio(snr, width, bandwidth))

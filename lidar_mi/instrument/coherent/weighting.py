@@ -23,16 +23,10 @@ _ACROSS = 4  # directions of the quadrature over a moving beam: exact to degree 
 class CoherentLidar:
     """A pulsed coherent Doppler lidar.
 
-    Parameters
-    ----------
-    wavelength : float
-        m.
-    pulse_duration : float
-        Full width at half maximum of the power, s.
-    gate_length : float
-        Of the time window of an estimate, m; gates closer than this overlap.
-    first_gate, gate_step : float
-        Middle of the first gate, distance of the next, m.
+    wavelength: m.
+    pulse_duration: full width at half maximum of the power, s.
+    gate_length: of the time window of an estimate, m; gates closer than this overlap.
+    first_gate, gate_step: middle of the first gate, distance of the next, m.
     """
 
     wavelength: float = 1.543e-6
@@ -91,10 +85,7 @@ def echo_shift(ranges: np.ndarray, ratio: np.ndarray, lidar: CoherentLidar) -> n
     Where the signal falls with range, the echo's middle is nearer: by the variance of
     `range_weight` times the slope of the logarithm of the signal, to first order in it.
 
-    Parameters
-    ----------
-    ranges, ratio : (gates,) arrays
-        Middles of the gates, m, and signal-to-noise ratio there, above 0.
+    ranges, ratio (gates,): middles of the gates, m, and signal-to-noise ratio there, above 0.
     """
     variance = lidar.pulse_length**2 / (8 * math.log(2)) + lidar.gate_length**2 / 12
     return variance * np.gradient(np.log(ratio), ranges)
@@ -114,16 +105,11 @@ def gate_moments(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Moments of the echo of every gate: radial velocity, its spread, relative power.
 
-    Parameters
-    ----------
-    wind : callable
-        `WindField`, with the lidar at its origin.
-    scan : LineScan
-        Every line at its own time; a moving beam averages over the angle that it moves through.
-    resolution : float
-        Distance of the points of the quadrature along a line, m: half of a vortex core or less.
-    signal : callable, optional
-        `Signal`, such as backscatter times transmittance over the range squared. Default: 1
+    wind: `WindField`, with the lidar at its origin.
+    scan: every line at its own time; a moving beam averages over the angle that it moves through.
+    resolution: distance of the points of the quadrature along a line, m: half of a vortex core or
+        less.
+    signal: `Signal`, such as backscatter times transmittance over the range squared. Default: 1
         everywhere.
 
     Returns

@@ -38,19 +38,13 @@ _LARGEST = 1 << 30
 def read_csv_lines(path: Path, names: Mapping[str, str]) -> Scan:
     """The lines of a table with a head of names and units, such as ``range [m]``.
 
-    Parameters
-    ----------
-    names : mapping
-        Ours to those of the head, without unit; a minus sign before that of radial_velocity turns
-        its sign, a plus sign retains it, whatever comments say of it. Rows of the same time and
-        angles are one line; time is ISO 8601 (UTC), seconds since 1970 or as of `dated`; ``snr``
-        may have the unit dB. Lines that begin with # are comments.
+    names: ours to those of the head, without unit; a minus sign before that of radial_velocity
+        turns its sign, a plus sign retains it, whatever comments say of it. Rows of the same time
+        and angles are one line; time is ISO 8601 (UTC), seconds since 1970 or as of `dated`;
+        ``snr`` may have the unit dB. Lines that begin with # are comments.
 
-    Raises
-    ------
-    InputError
-        No table, a column that is missing, a unit that does not convert, a cell that is no number,
-        two values for one line and gate.
+    Raises InputError: no table, a column that is missing, a unit that does not convert, a cell that
+    is no number, two values for one line and gate.
     """
     import pandas as pd
 

@@ -10,6 +10,7 @@ import xarray as xr
 from lidar_mi.errors import InputError
 from lidar_mi.flags import LineFlag, flag_attributes
 from lidar_mi.io.lines_of_sight.scan import ANGLES, FIELDS, PLACE, Scan
+from lidar_mi.variables import variable
 
 _SAME_PLACE = 0.01  # degrees: of one lidar, rounded differently from file to file
 _MOST_RANGES = 4  # times the gates of a line: common ranges of lines whose gates differ
@@ -33,10 +34,7 @@ def assembled(
 
     Each scan has its file's name and its flags (lines, gates); thresholds become attributes.
 
-    Raises
-    ------
-    InputError
-        Lidars at different places; gates that differ from line to line without end.
+    Raises InputError: lidars at different places; gates that differ from line to line without end.
     """
     ranges = _common_ranges([scan for _, scan, _ in scans])
     gates = [_gates(scan.range, ranges) for _, scan, _ in scans]
@@ -61,11 +59,7 @@ def assembled(
     )
     coords: dict[str, Any] = {
         "time": ("time", time[order], {"long_name": "time of the line (UTC)", "axis": "T"}),
-        "range": (
-            "range",
-            ranges,
-            {"units": "m", "long_name": "distance of the gate's centre from the lidar"},
-        ),
+        "range": variable("range", ranges, "m", "distance of the gate's centre from the lidar"),
     }
     for name, long_name in ANGLES.items():
         angles = [scan.angles.get(name) for _, scan, _ in scans]
@@ -79,7 +73,7 @@ def assembled(
                 _attributes(name, "degree", long_name),
             )
     sweep = np.repeat(np.arange(len(scans)), lines)
-    coords["sweep"] = "time", sweep[order], {"units": "1", "long_name": "number of the scan"}
+    coords["sweep"] = variable("time", sweep[order], "1", "number of the scan")
     for name, value in _place([scan for _, scan, _ in scans]).items():
         coords[name] = (), value, _attributes(name, *PLACE[name])
     dataset = xr.Dataset(data, coords, _about(scans) | thresholds)

@@ -52,15 +52,10 @@ def flags(
 ) -> tuple[np.ndarray, dict[str, float]]:
     """Flags (lines, gates) of a scan, and the thresholds that they were made with.
 
-    Parameters
-    ----------
-    scan : Scan
-        Reflections and repeated numbers that are found are added to its remarks.
-    min_cnr : float, optional
-        dB; default: `MIN_CNR` of the kind of file.
-    blind_range : float, optional
-        m; default: `BLIND_RANGE` of the kind of file, and behind it gates that measure the same
-        velocity in all directions.
+    scan: reflections and repeated numbers that are found are added to its remarks.
+    min_cnr: dB; default: `MIN_CNR` of the kind of file.
+    blind_range: m; default: `BLIND_RANGE` of the kind of file, and behind it gates that measure the
+        same velocity in all directions.
     """
     kind = str(scan.about.get("kind", ""))
     explicit = blind_range is not None

@@ -30,10 +30,7 @@ def read_halo(path: Path) -> Scan:
     Gates are adjacent, (gate + 1/2) gate lengths away, but for scans that are called overlapping:
     these begin at every sample, gate length over points apart.
 
-    Raises
-    ------
-    InputError
-        No header, a value of it that is no number, no ray.
+    Raises InputError: no header, a value of it that is no number, no ray.
     """
     head, body = _parts(read_text(path, _KIND, LARGEST), path)
     gates = int(_number(head, "Number of gates", path))

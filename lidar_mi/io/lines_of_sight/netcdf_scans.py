@@ -83,17 +83,11 @@ def is_lines(path: Path) -> bool:
 def read_netcdf_lines(path: Path, names: Mapping[str, str]) -> list[Scan]:
     """The sweeps of a file.
 
-    Parameters
-    ----------
-    names : mapping
-        Ours to the file's, before those known; a minus sign before the name of radial_velocity
+    names: ours to the file's, before those known; a minus sign before the name of radial_velocity
         turns its sign, a plus sign retains it, whatever the file says of it.
 
-    Raises
-    ------
-    InputError
-        As of `open_netcdf`; a variable that is missing or lies on other dimensions, a unit that
-        does not convert, times that cannot be decoded.
+    Raises InputError: as of `open_netcdf`; a variable that is missing or lies on other dimensions,
+    a unit that does not convert, times that cannot be decoded.
     """
     with open_netcdf(path) as root:
         about = _about(root, path)

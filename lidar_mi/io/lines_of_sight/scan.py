@@ -37,24 +37,15 @@ PLACE = {
 class Scan:
     """Lines of one file or of one of its sweeps.
 
-    Attributes
-    ----------
-    time : (lines,) array of datetime64[ns]
-        UTC.
-    angles : dict of str to (lines,) array
-        `ANGLES`, degrees: azimuth and elevation, the others where there are any.
-    range : (gates,) or (lines, gates) array
-        Of the gates' centres, m.
-    fields : dict of str to (lines, gates) array
-        `FIELDS`; NaN: missing.
-    place : dict of str to float
-        `PLACE`.
-    rejected : (lines, gates) array of bool, optional
-        By the lidar's own software.
-    about : dict
-        Attributes: kind, instrument, scan_type, gate_length (m), ...
-    remarks : list of str
-        What is unusual, a sentence each.
+    time (lines,): UTC.
+    angles (dict of str to (lines,) array): `ANGLES`, degrees: azimuth and elevation, the others
+        where there are any.
+    range (gates,) or (lines, gates) array: of the gates' centres, m.
+    fields (dict of str to (lines, gates) array): `FIELDS`; NaN: missing.
+    place: `PLACE`.
+    rejected (lines, gates): by the lidar's own software.
+    about: attributes: kind, instrument, scan_type, gate_length (m), ...
+    remarks: what is unusual, a sentence each.
     """
 
     time: np.ndarray
@@ -70,11 +61,8 @@ class Scan:
 def check(scan: Scan, path: Path) -> Scan:
     """A scan with angles in range and ranges in metres; changes become remarks.
 
-    Raises
-    ------
-    InputError
-        No line with a time and a direction, ranges that are no numbers, do not increase or can only
-        be kilometres.
+    Raises InputError: no line with a time and a direction, ranges that are no numbers, do not
+    increase or can only be kilometres.
     """
     lines = len(scan.time)
     complete = ~np.isnat(scan.time)
@@ -224,10 +212,7 @@ def dated(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, list[s
     They count from 1970, unless they then lie in the future or closer together than lines can: then
     the only other common encoding with dates from 1980 to today is used.
 
-    Raises
-    ------
-    InputError
-        No encoding, or more than one, is possible.
+    Raises InputError: no encoding, or more than one, is possible.
     """
     epoch = np.datetime64("1970-01-01", "s")
     finite = values[np.isfinite(values)]

@@ -7,17 +7,15 @@ from typing import Any
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.pixels.frames import Frames, damaged, frames_of
+from lidar_mi.io.pixels.frames import Frames, frames_of, reading
 from lidar_mi.io.size import check_size
 
 
 def read_davis(path: Path) -> Frames:
     """The frames of a DaVis image, raw counts; masked pixels are NaN.
 
-    Raises
-    ------
-    InputError
-        lvpyio is not installed; a damaged file; frames of several planes or different sizes.
+    Raises InputError: lvpyio is not installed; a damaged file; frames of several planes or
+    different sizes.
     """
     try:
         import lvpyio
@@ -26,7 +24,7 @@ def read_davis(path: Path) -> Frames:
             f"{path}: DaVis files need the library lvpyio of LaVision: pip install "
             "'lidar-mi[davis]'; or export TIFF"
         ) from None
-    try:
+    with reading(path, "DaVis image"):
         with path.open("rb") as file:
             width, height, depth, count = struct.unpack("<8x4i", file.read(24))
         if min(width, height, depth, count) < 1:
@@ -34,10 +32,6 @@ def read_davis(path: Path) -> Frames:
         check_size(path, 8 * width * height * depth * count)
         buffer = lvpyio.read_buffer(str(path))
         frames = [_frame(path, frame) for frame in buffer]
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "DaVis image", error) from None
     if len({image.shape for image in frames}) != 1:
         raise InputError(f"{path}: no frames, or of different sizes; expected one size")
     return frames_of(path, np.stack(frames))

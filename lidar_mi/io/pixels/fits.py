@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.pixels.frames import Frames, damaged, frames_of
+from lidar_mi.io.pixels.frames import Frames, frames_of, reading
 from lidar_mi.io.size import check_size
 
 _KIND = "FITS"
@@ -17,15 +17,10 @@ _KIND = "FITS"
 def read_fits(path: Path, layer: str | None) -> Frames:
     """The image or the planes of a cube, first row first, BSCALE, BZERO and BLANK applied.
 
-    Parameters
-    ----------
-    layer : str, optional
-        Name (EXTNAME) or number of the part that has the image. Default: the only one.
+    layer: name (EXTNAME) or number of the part that has the image. Default: the only one.
 
-    Raises
-    ------
-    InputError
-        astropy is not installed; a damaged file; no or several images; more than three dimensions.
+    Raises InputError: astropy is not installed; a damaged file; no or several images; more than
+    three dimensions.
     """
     try:
         from astropy.io import fits
@@ -33,7 +28,7 @@ def read_fits(path: Path, layer: str | None) -> Frames:
         raise InputError(
             f"{path}: FITS files need the library astropy: pip install 'lidar-mi[fits]'"
         ) from None
-    try:
+    with reading(path, _KIND):
         with warnings.catch_warnings():
             # a last block that is not filled up loses nothing; missing values are an error
             warnings.simplefilter("ignore")
@@ -44,10 +39,6 @@ def read_fits(path: Path, layer: str | None) -> Frames:
                         check_size(path, 8 * math.prod(part.shape))
                         images[number] = part
                 cube = _values(_chosen(path, images, layer))
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, _KIND, error) from None
     shape = cube.shape
     while cube.ndim > 2 and cube.shape[0] == 1:
         cube = cube[0]

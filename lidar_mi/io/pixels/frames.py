@@ -1,6 +1,7 @@
 """The result of every reader of pixels: the images of a file, one number a pixel."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,12 +18,8 @@ _ALPHA = 1
 class Frames:
     """The images of a file, read when they are asked for.
 
-    Attributes
-    ----------
-    read : callable
-        Images of the given numbers, (n, height, width), top row first, in the file's type.
-    channels : bool
-        They are channels of one moment by what the file says, not images one after the other.
+    read: images of the given numbers, (n, height, width), top row first, in the file's type.
+    channels: they are channels of one moment by what the file says, not images one after the other.
     """
 
     count: int
@@ -39,10 +36,8 @@ def frames_of(path: str | Path, images: np.ndarray) -> Frames:
 def checked(path: str | Path, pixels: np.ndarray) -> np.ndarray:
     """Pixels, if float64 holds every one of them exactly.
 
-    Raises
-    ------
-    InputError
-        No real numbers, no pixels, whole numbers beyond 2^53 or floats of more than 64 bits.
+    Raises InputError: no real numbers, no pixels, whole numbers beyond 2^53 or floats of more than
+    64 bits.
     """
     if pixels.dtype.kind not in "biuf" or pixels.dtype.itemsize > 8:
         raise InputError(f"{path}: pixels of type {pixels.dtype}; expected real numbers of 64 bits")
@@ -64,18 +59,11 @@ def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> n
 
     Nothing is weighted and no gamma is undone. Where the three are equal, the number is theirs.
 
-    Parameters
-    ----------
-    pixels : (..., height, width, channels) array
-    colours : int
-        1 or 3, the first of the channels.
-    more : int
-        Channels of transparency that follow: 0 or 1.
+    pixels (..., height, width, channels)
+    colours: 1 or 3, the first of the channels.
+    more: channels of transparency that follow: 0 or 1.
 
-    Raises
-    ------
-    InputError
-        Another number of channels: which of them is light is not known.
+    Raises InputError: another number of channels: which of them is light is not known.
     """
     channels = pixels.shape[-1]
     if colours not in (1, 3) or channels != colours + more or more > _ALPHA:
@@ -92,6 +80,17 @@ def grey(path: str | Path, pixels: np.ndarray, colours: int, more: int = 0) -> n
         return first
     with np.errstate(over="ignore", invalid="ignore"):
         return np.where(equal, first, pixels.mean(-1, dtype=float))
+
+
+@contextmanager
+def reading(path: str | Path, kind: str) -> Iterator[None]:
+    """Turn any exception of a library in a damaged file into `damaged`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise damaged(path, kind, error) from None
 
 
 def damaged(path: str | Path, kind: str, error: object) -> InputError:

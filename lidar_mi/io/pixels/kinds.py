@@ -39,10 +39,7 @@ def kind_of(path: Path) -> str:
 
     The content decides; the suffix does only for DaVis and MATLAB 4 files, which have no mark.
 
-    Raises
-    ------
-    InputError
-        No such file, one that cannot be opened, or of a kind that is not read.
+    Raises InputError: no such file, one that cannot be opened, or of a kind that is not read.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder; expected a file: an {KINDS}")

@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.pixels.frames import Frames, damaged, frames_of
+from lidar_mi.io.pixels.frames import Frames, frames_of, reading
 from lidar_mi.io.size import check_size
 
 if TYPE_CHECKING:
@@ -24,24 +24,17 @@ _PACKED = ("scale_factor", "add_offset")
 def read_npy(path: Path) -> Frames:
     """An image (height, width) or images (frames, height, width).
 
-    Raises
-    ------
-    InputError
-        A damaged file, Python objects, another number of dimensions.
+    Raises InputError: a damaged file, Python objects, another number of dimensions.
     """
-    try:
+    with reading(path, "npy"):
         with path.open("rb") as file:
             image = _numpy_array(path, file, path.stat().st_size)
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "npy", error) from None
     return _stack(path, image)
 
 
 def read_npz(path: Path, layer: str | None) -> Frames:
     """One array of a NumPy zip file, as `read_npy`; ``layer`` names it where there are several."""
-    try:
+    with reading(path, "npz"):
         with zipfile.ZipFile(path) as packed:
             names = {n.removesuffix(".npy"): n for n in packed.namelist() if n.endswith(".npy")}
             # two dimensions at least: parameters are stored beside images
@@ -54,21 +47,14 @@ def read_npz(path: Path, layer: str | None) -> Frames:
             check_size(path, size)
             with packed.open(names[chosen]) as file:
                 image = _numpy_array(path, file, size)
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the libraries in a damaged file
-        raise damaged(path, "npz", error) from None
     return _stack(path, image)
 
 
 def read_mat(path: Path, layer: str | None) -> Frames:
     """A matrix of a MATLAB file of version 4 to 7; ``layer`` names it where there are several.
 
-    Raises
-    ------
-    InputError
-        A damaged file; no or several matrices; an array of more than two dimensions, in which
-        images may be first or last.
+    Raises InputError: a damaged file; no or several matrices; an array of more than two dimensions,
+    in which images may be first or last.
     """
     from scipy.io import loadmat, whosmat
 
@@ -78,29 +64,23 @@ def read_mat(path: Path, layer: str | None) -> Frames:
         "logical",
         *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
     }
-    try:
+    with reading(path, "MATLAB file"):
         shapes = {name: shape for name, shape, kind in whosmat(path) if kind in numbers}
         chosen = _chosen(path, shapes, layer)
         check_size(path, 8 * math.prod(shapes[chosen]))
         image = loadmat(path, variable_names=[chosen])[chosen]
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "MATLAB file", error) from None
     return _matrix(path, np.asarray(image))
 
 
 def read_hdf5(path: Path, layer: str | None) -> Frames:
     """An image or images of an HDF5 file, of MATLAB 7.3 too; ``layer`` is the path of the data set.
 
-    Raises
-    ------
-    InputError
-        A damaged file; no or several images; a filter that is not installed; packed numbers.
+    Raises InputError: a damaged file; no or several images; a filter that is not installed; packed
+    numbers.
     """
     import h5py
 
-    try:
+    with reading(path, "HDF5"):
         with h5py.File(path, "r") as file:
             arrays: dict[str, Any] = {}
 
@@ -115,10 +95,6 @@ def read_hdf5(path: Path, layer: str | None) -> Frames:
             _refuse_unreadable(path, part)
             matlab = "MATLAB_class" in part.attrs
             image = part[()]
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "HDF5", error) from None
     return _matrix(path, image.T) if matlab else _stack(path, image)
 
 

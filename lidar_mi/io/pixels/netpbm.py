@@ -8,7 +8,7 @@ from typing import NoReturn
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.pixels.frames import Frames, damaged, frames_of, grey
+from lidar_mi.io.pixels.frames import Frames, frames_of, grey, reading
 from lidar_mi.io.size import check_size
 
 # white space and comments between the words of a header
@@ -23,16 +23,14 @@ _KIND = "PGM, PPM, PAM or PFM"
 def read_netpbm(path: Path) -> Frames:
     """All images of a file; float images, stored from the bottom row, are turned.
 
-    Raises
-    ------
-    InputError
-        A bitmap (P1, P4), a damaged file, images of different sizes, channels of unknown meaning.
+    Raises InputError: a bitmap (P1, P4), a damaged file, images of different sizes, channels of
+    unknown meaning.
     """
     content, place = path.read_bytes(), 0
     images: list[np.ndarray] = []
     if content[:2] in (b"P1", b"P4"):
         raise InputError(f"{path}: black and white (PBM) is no measured light; expected PGM or PPM")
-    try:
+    with reading(path, _KIND):
         while content[place:].strip(b"\0 \n\r\t"):
             image, place = _image(path, content, place)
             if images and image.shape != images[0].shape:
@@ -40,10 +38,6 @@ def read_netpbm(path: Path) -> Frames:
             images.append(image)
             if content[:2] in (b"P2", b"P3"):
                 break
-    except InputError:
-        raise
-    except (ValueError, IndexError, OverflowError) as error:
-        raise damaged(path, _KIND, error) from None
     return frames_of(path, np.stack(images))
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.pixels.frames import Frames, damaged, frames_of, grey
+from lidar_mi.io.pixels.frames import Frames, frames_of, grey, reading
 from lidar_mi.io.size import check_size
 
 if TYPE_CHECKING:
@@ -22,14 +22,12 @@ _GREY = {"1": 0, "L": 0, "LA": 1}
 def read_picture(path: Path) -> Frames:
     """All images of a JPEG, BMP, GIF or WebP file, turned as its EXIF orientation says.
 
-    Raises
-    ------
-    InputError
-        A damaged file, one that declares too much, inks (CMYK), or images of different sizes.
+    Raises InputError: a damaged file, one that declares too much, inks (CMYK), or images of
+    different sizes.
     """
     from PIL import ImageOps
 
-    try:
+    with reading(path, "JPEG, BMP, GIF or WebP"):
         with _opened(path, _FORMATS) as file:
             count = getattr(file, "n_frames", 1)
             check_size(path, 8 * count * file.width * file.height * 3)
@@ -40,33 +38,22 @@ def read_picture(path: Path) -> Frames:
                 images.append(_light(path, ImageOps.exif_transpose(file)))
                 if images[-1].shape != images[0].shape:
                     raise InputError(f"{path}: images of different sizes; expected one size")
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise damaged(path, "JPEG, BMP, GIF or WebP", error) from None
     return frames_of(path, np.stack(images))
 
 
 def read_jpeg2000(path: Path) -> Frames:
     """The image of a JPEG 2000 file, of whatever depth and sign.
 
-    Raises
-    ------
-    InputError
-        A damaged file, one that declares too much, or channels of unknown meaning.
+    Raises InputError: a damaged file, one that declares too much, or channels of unknown meaning.
     """
     import imagecodecs
 
-    try:
+    with reading(path, "JPEG 2000"):
         with _opened(path, ("JPEG2000",)) as file:
             check_size(path, 8 * file.width * file.height * len(file.getbands()))
         pixels = np.atleast_3d(imagecodecs.jpeg2k_decode(path.read_bytes()))
         channels = pixels.shape[-1]
         image = grey(path, pixels, channels if channels < 4 else 3, int(channels == 4))
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the libraries in a damaged file
-        raise damaged(path, "JPEG 2000", error) from None
     return frames_of(path, image[None])
 
 

@@ -19,10 +19,7 @@ _CHANNELS = {0: 1, 2: 3, 3: 4, 4: 2, 6: 4}
 def read_png(path: Path) -> Frames:
     """The image of a PNG file; grey of 1, 2 and 4 bits is 0 to 1, 3 and 15.
 
-    Raises
-    ------
-    InputError
-        A damaged file, one that declares too much, or an animation.
+    Raises InputError: a damaged file, one that declares too much, or an animation.
     """
     import imagecodecs
 

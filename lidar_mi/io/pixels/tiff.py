@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.pixels.frames import Frames, checked, damaged, frames_of, grey
+from lidar_mi.io.pixels.frames import Frames, checked, damaged, frames_of, grey, reading
 from lidar_mi.io.size import check_size
 
 if TYPE_CHECKING:
@@ -39,11 +39,9 @@ def read_tiff(path: Path) -> Frames:
     Reduced copies of a page (pyramids, thumbnails) and masks are omitted. A page is turned as its
     orientation says; GDAL's value for missing data becomes NaN.
 
-    Raises
-    ------
-    InputError
-        A damaged file, or one that declares too much; several axes in addition to height and width;
-        pages of different size; inks, mosaics, palettes of colours, white as 0, complex numbers.
+    Raises InputError: a damaged file, or one that declares too much; several axes in addition to
+    height and width; pages of different size; inks, mosaics, palettes of colours, white as 0,
+    complex numbers.
     """
     with _opened(path) as file:
         numbers, count, channels = _planes(path, file)
@@ -81,15 +79,12 @@ def _opened(path: Path) -> Iterator[Any]:
     logger.addHandler(lost)
     logger.propagate = False
     try:
-        # other files that the metadata name are not opened
-        with tifffile.TiffFile(path, _multifile=False) as file:
-            yield file
-        if lost.messages:
-            raise damaged(path, "TIFF", lost.messages[0])
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the libraries in a damaged file
-        raise damaged(path, "TIFF", error) from None
+        with reading(path, "TIFF"):
+            # other files that the metadata name are not opened
+            with tifffile.TiffFile(path, _multifile=False) as file:
+                yield file
+            if lost.messages:
+                raise damaged(path, "TIFF", lost.messages[0])
     finally:
         logger.removeHandler(lost)
         logger.propagate = former
