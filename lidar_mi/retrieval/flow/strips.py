@@ -189,9 +189,10 @@ def _inverse(whole: torch.Tensor, prior: Prior, settings: VariationalSettings) -
         return total
 
     def solved_to(right: torch.Tensor, tolerance: float) -> torch.Tensor:
+        # a strong prior needs double precision, whatever the gradients are in
         return conjugate_gradients(
-            lambda c: band.apply(whole, c), right, preconditioned, tolerance, solver.steps
-        )
+            lambda c: band.apply(whole, c), right.to(whole), preconditioned, tolerance, solver.steps
+        ).to(right)
 
     return solved_to
 
