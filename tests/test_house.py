@@ -22,54 +22,32 @@ ARROWS = {
     "atmosphere": set(),
     "instrument": {"atmosphere.scattering.line"},
     "retrieval": {"atmosphere.vortices.vortex", "instrument.coherent.weighting"},
-    "io": {
-        "atmosphere.scattering.aerosols",
-        "atmosphere.scattering.particle_scattering",
-        "atmosphere.regrid",
-        "atmosphere.scattering.tables",
-        "retrieval.vortices.model",
-        "retrieval.vortices.pair",
-    },
+    "io": set(
+        (
+            "atmosphere.scattering.aerosols atmosphere.scattering.particle_scattering "
+            "atmosphere.regrid atmosphere.scattering.tables retrieval.vortices.model "
+            "retrieval.vortices.pair"
+        ).split()
+    ),
     "rendering": {"atmosphere", "instrument", "io", "system", "plugins"},
     "inversion": {"instrument", "rendering", "retrieval"},
     "schema": {"atmosphere", "instrument", "io", "rendering.settings", "retrieval.method_names"},
     "assessment": {"atmosphere", "instrument", "retrieval", "io", "schema"},
     "aircraft": {"atmosphere", "instrument", "io", "schema"},
-    "experiment": {
-        "atmosphere",
-        "instrument",
-        "rendering",
-        "retrieval",
-        "assessment",
-        "io",
-        "schema",
-    },
-    "cli": {
-        "atmosphere",
-        "instrument",
-        "rendering",
-        "retrieval",
-        "assessment",
-        "io",
-        "schema",
-        "experiment",
-        "campaign",
-        "encounter",
-        "system",
-    },
+    "experiment": set(("atmosphere instrument rendering retrieval assessment io schema").split()),
+    "cli": set(
+        (
+            "atmosphere instrument rendering retrieval assessment io schema experiment campaign "
+            "encounter system"
+        ).split()
+    ),
     "campaign": {"assessment", "io", "schema", "experiment", "encounter", "system"},
-    "encounter": {
-        "atmosphere",
-        "instrument",
-        "rendering",
-        "retrieval",
-        "assessment",
-        "io",
-        "schema",
-        "aircraft",
-        "experiment",
-        "system",
-    },
+    "encounter": set(
+        (
+            "atmosphere instrument rendering retrieval assessment io schema aircraft experiment "
+            "system"
+        ).split()
+    ),
 }
 """What a room may import beside `errors` and `units`: a room, or modules of one. `atmosphere`,
 `instrument` and `retrieval` share descriptions alone: a vortex, a spectral line, the weight of a
@@ -110,18 +88,12 @@ NOT_YET: set[str] = set()
 FORMATS = ("yaml", "OpenEXR", "PIL", "h5netcdf", "astropy", "tifffile", "imagecodecs", "lvpyio")
 """Libraries of file formats."""
 
-OPENING = {
-    "open",
-    "read_text",
-    "write_text",
-    "read_bytes",
-    "write_bytes",
-    "loadtxt",
-    "savetxt",
-    "open_dataset",
-    "to_netcdf",
-    "savefig",
-}
+OPENING = set(
+    (
+        "open read_text write_text read_bytes write_bytes loadtxt savetxt open_dataset to_netcdf "
+        "savefig"
+    ).split()
+)
 
 
 def modules() -> dict[str, tuple[Path, ast.Module]]:

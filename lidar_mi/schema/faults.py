@@ -8,7 +8,7 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from lidar_mi.schema.section import section_in, tagged_section
+from lidar_mi.schema.section import metadata_of, section_in, tagged_section
 from lidar_mi.units import Unit, Within, to_si
 
 A_NAME = "at most 100 letters, digits, _, . and -, a letter or digit first"
@@ -43,10 +43,8 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     if fault["type"] == "value_error":
         return f"{field}: {message}" if field else message
     value = fault["input"]
-    unit, within = (
-        _metadata_at(model, fault["loc"], Unit),
-        _metadata_at(model, fault["loc"], Within),
-    )
+    key = _field_at(model, fault["loc"])
+    unit, within = (metadata_of(key, kind) for kind in (Unit, Within))
     symbol = unit.symbol if unit else ""
     text = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
     if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
@@ -109,18 +107,6 @@ def _key(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
         for part, _, _, is_tag in _steps(model, location)
         if not is_tag and part != "float" and not str(part).startswith(kinds)
     ]
-
-
-def _metadata_at(model: type[BaseModel], location: tuple[int | str, ...], kind: type) -> Any:
-    """Metadata of a type in the annotation of the key at a location; None without any."""
-    field = _field_at(model, location)
-    pending = [field.annotation, *field.metadata] if field else []
-    while pending:
-        part = pending.pop()
-        if isinstance(part, kind):
-            return part
-        pending += (*get_args(part), *getattr(part, "__metadata__", ()))
-    return None
 
 
 def _length_at(model: type[BaseModel], location: tuple[int | str, ...]) -> int:

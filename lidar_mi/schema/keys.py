@@ -24,7 +24,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.yaml import to_yaml_line
 from lidar_mi.schema.experiment import Experiment
 from lidar_mi.schema.faults import A_NAME
-from lidar_mi.schema.section import section_in, sections_in, tagged_section
+from lidar_mi.schema.section import metadata_of, section_in, sections_in, tagged_section
 from lidar_mi.units import Unit, Within, usual
 
 OF_A_FILE = {
@@ -120,7 +120,7 @@ def explain(name: str) -> Key:
     text = tuple(part for kind in kinds for part in _paragraphs(kind))
     last = name.rpartition(".")[2]
     about = tuple(part for part in _paragraphs(owner)[1:] if re.search(rf"`{last}\b", part))
-    unit = _first(field, Unit)
+    unit = metadata_of(field, Unit)
     symbol = unit.symbol if unit else ""
     allowed = _allowed(field.annotation, field.metadata, symbol)
     return Key(
@@ -210,17 +210,6 @@ def _paragraphs(model: type[BaseModel]) -> tuple[str, ...]:
     """Paragraphs of a section's documentation, each as one line."""
     text = inspect.cleandoc(model.__doc__ or "")
     return tuple(" ".join(part.replace("``", "`").split()) for part in text.split("\n\n"))
-
-
-def _first(field: FieldInfo, kind: type) -> Any:
-    """Metadata of a type in the annotation of a key; None without any."""
-    pending = [*field.metadata, field.annotation]
-    while pending:
-        part = pending.pop(0)
-        if isinstance(part, kind):
-            return part
-        pending += (*get_args(part), *getattr(part, "__metadata__", ()))
-    return None
 
 
 def _as_in_a_file(value: Any, symbol: str) -> str:

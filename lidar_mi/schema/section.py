@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Tag
+from pydantic.fields import FieldInfo
 
 from lidar_mi.description import Description
 
@@ -34,6 +35,17 @@ def tagged_section(annotation: Any, tag: object) -> type[BaseModel] | None:
         return section_in(annotation)
     sections = (tagged_section(part, tag) for part in get_args(annotation))
     return next(filter(None, sections), None)
+
+
+def metadata_of(field: FieldInfo | None, kind: type) -> Any:
+    """Metadata of a type in the annotation of a key, the outermost; None without any."""
+    pending = [field.annotation, *field.metadata] if field else []
+    while pending:
+        part = pending.pop()
+        if isinstance(part, kind):
+            return part
+        pending += (*get_args(part), *getattr(part, "__metadata__", ()))
+    return None
 
 
 def each_once(key: str, values: tuple[object, ...]) -> None:

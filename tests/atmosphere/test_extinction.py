@@ -32,11 +32,6 @@ def test_tracer_and_aerosol_by_hand(wake):
     assert result.attrs["units"] == "m-1" and result.dims == ("x", "y", "z")
 
 
-def test_stretch_one_is_linear(wake):
-    result = extinction_from_tracer(wake, stretch=1.0, aerosol=None)
-    np.testing.assert_allclose(result, 1e-4 + 1.7e-3 * wake.tracer / 0.4, rtol=1e-12)
-
-
 @pytest.mark.parametrize("stretch", [1.0, 1.5, 2.0, 4.0])
 def test_stretch_is_monotone_with_its_slope_for_thin_tracer(stretch):
     tracer = np.concatenate([[0.0, 1e-7], np.linspace(1e-3, 1, 500)])

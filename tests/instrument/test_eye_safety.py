@@ -225,18 +225,6 @@ def test_at_the_hazard_distance_the_exposure_is_the_limit():
     assert found[2] < found[0] < found[1] and found[2] < found[3] < found[1]
 
 
-def test_binoculars_see_seven_times_farther():
-    """7 x 50 gather 49 times a pupil's light from a beam wide at the objective."""
-    limit = permissible_pulse(532e-9, 10e-9, 0.0, 0.25)
-    plain = hazard_distance(0.1, limit, 0.01, 2e-3)
-    aided = hazard_distance(0.1, limit, 0.01, 2e-3, aid=ViewingAid())
-    assert aided / plain == pytest.approx(7, rel=2e-3)
-    # but all they can gather is the beam
-    assert exposure_at(0.0, 1.0, 1e-3, 0.0, 7e-3, aid=ViewingAid()) == pytest.approx(
-        1 / (math.pi / 4 * 7e-3**2), rel=1e-6
-    )
-
-
 def test_safe_at_the_exit_and_never_safe():
     eye_safe = assess_pulses(PulsedBeam(1550e-9, 1e-3, 10e-9, 0.05, 1e-3), 10.0)
     assert eye_safe.hazard_distance == eye_safe.aided_hazard_distance == 0

@@ -58,23 +58,6 @@ def test_radii_of_the_default_instrument():
     assert moved == pytest.approx(0.075, abs=5e-4)
 
 
-@pytest.mark.parametrize("v", [-300.0, 0.0, 300.0])
-@pytest.mark.parametrize("index", [1.0, 1.476])
-def test_rings_are_where_the_image_is_brightest(index, v):
-    """On a cut through the image, parabolas through the peaks, to 0.02 px of 145 to 386."""
-    wide = FringeCamera(width=3, height=4001, pixel=1.2e-6, centre=(1, 0))
-    etalon = Etalon(reflectivity=0.9, index=index)
-    cut = fringe_image(wide, etalon, laser_line(WAVELENGTH, 1e6), v)[:, 1].numpy()
-    peaks = 1 + np.flatnonzero((cut[1:-1] > cut[:-2]) & (cut[1:-1] > cut[2:]))
-    a, b, c = (cut[peaks + k] for k in (-1, 0, 1))
-    found = (peaks + (a - c) / 2 / (a - 2 * b + c)) * 1.2 / 7.4
-    radii = ring_radii(CAMERA, etalon, WAVELENGTH, v)
-    count = min(len(found), len(radii))
-    assert count >= 3
-    # rings of a finite width, r^2 and not r being even, peak outside by width^2 / (8 r^3)
-    np.testing.assert_allclose(found[:count], radii[:count], atol=0.02)
-
-
 def gaussian(count):
     """Nodes and weights of the mean over a standard normal distribution."""
     nodes = np.linspace(-7, 7, count)
@@ -251,11 +234,6 @@ def test_digitiser_clips_at_both_ends():
     assert bool((counts % 2 == 0).all())
 
 
-def test_read_noise_is_gaussian():
-    counts = expose(flat(0), ideal(read_noise=5.0, bits=None), seed=8)[0].numpy().ravel()
-    assert stats.kstest(counts[:100_000], stats.norm(scale=5).cdf).pvalue > 1e-3
-
-
 def test_an_image_is_its_seed_and_number_whatever_the_batch():
     expected = fringe_image(SMALL, ETALON, AIR, photons=1e5)
     settings = {"ccd": CCD(), "seed": 9, "modes": 10.0}
@@ -272,13 +250,6 @@ def test_images_and_seeds_are_independent():
     correlation = np.corrcoef(images.reshape(16, -1).numpy())
     apart = correlation[~np.eye(16, dtype=bool)]
     assert abs(apart).max() < 4.5 / math.sqrt(300 * 400)
-
-
-def test_pixels_are_independent():
-    image = expose(flat(32), CCD(), seed=10, modes=10.0)[0].double() - 32
-    for other in (image.roll(1, 0), image.roll(1, 1), image.roll((1, 1), (0, 1))):
-        correlation = float((image * other).mean() / image.var())
-        assert abs(correlation) < 4 / math.sqrt(780 * 960)
 
 
 # bad input

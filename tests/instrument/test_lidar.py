@@ -8,35 +8,6 @@ from pydantic import ValidationError
 from lidar_mi.instrument.lidar import BackscatterLidar
 
 
-def test_defaults_are_the_papers():
-    lidar = BackscatterLidar()
-    assert lidar.wavelength == pytest.approx(532e-9)
-    assert (lidar.beam_radius, lidar.beam_cut, lidar.aperture_radius) == (0.1, 0.1, 0.5)
-    assert lidar.divergence_full == pytest.approx(2e-3)
-    assert lidar.fov_half == pytest.approx(5e-3)
-    assert lidar.stokes == (1, 1, 0, 0)
-    assert lidar.pulse_duration == 0
-
-
-def test_units_are_read():
-    lidar = BackscatterLidar(
-        wavelength="354.7 nm",
-        beam_radius="5 cm",
-        divergence_full="0.1 mrad",
-        pulse_energy="70 mJ",
-        pulse_duration="10 ns",
-        aperture_radius="200 mm",
-        fov_half="0.1 deg",
-    )
-    assert lidar.wavelength == pytest.approx(354.7e-9)
-    assert lidar.beam_radius == pytest.approx(0.05)
-    assert lidar.divergence_full == pytest.approx(1e-4)
-    assert lidar.pulse_energy == pytest.approx(0.07)
-    assert lidar.pulse_duration == pytest.approx(1e-8)
-    assert lidar.aperture_radius == pytest.approx(0.2)
-    assert lidar.fov_half == pytest.approx(math.radians(0.1))
-
-
 def test_area_is_that_of_the_disc():
     assert BackscatterLidar(aperture_radius=0.2).aperture_area == pytest.approx(0.125663706)
 

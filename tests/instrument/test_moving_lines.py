@@ -103,12 +103,6 @@ def test_latency_of_a_steady_climb_is_known_velocity_at_a_late_place():
         assert found[name].values == pytest.approx(value, abs=1e-4)
 
 
-def test_drift_of_the_reported_place_is_an_error_of_the_platforms_velocity():
-    lines = measured(uniform(), beams(Motion(), {"drift": {"y": "0.3 m/s"}}))
-    found = wind_from_triples(lines)
-    assert found["v"].values == pytest.approx(WIND[1] - 0.3, abs=1e-5)
-
-
 def test_light_goes_from_the_true_place():
     """A telescope 5 m to port of where it is told sees a shear that is 5 m to starboard."""
     one = beams(Motion())

@@ -128,15 +128,6 @@ def test_beams_fixed_to_the_body_turn_and_drift_with_it():
     assert turned.direction[:, 1] == pytest.approx(by_hand)
 
 
-def test_jitter_moves_the_truth_alone():
-    still = flight()(TIME)
-    beams = steered(still, still, jitter=1e-3, random=np.random.default_rng(1))
-    assert beams.reported_places(FAR) == pytest.approx(PLACES, abs=1e-10)
-    moved = (beams.true_places(FAR) - PLACES) / FAR
-    # oblique beams, up to 6 degrees, cross the plane a little farther out
-    assert moved.std() == pytest.approx(1e-3, rel=4 / np.sqrt(4 * 101) + 0.01)
-
-
 @pytest.mark.parametrize(
     ("place", "turned", "message"),
     [

@@ -97,14 +97,6 @@ def test_distances_that_are_none_are_refused(distance):
         plan_scans(Scan(), Y, Z, (0.0, distance))
 
 
-def test_defaults_are_the_papers():
-    scan = Scan()
-    assert (scan.range, scan.thickness, scan.gates, scan.gate_count) == (500, 2.5, "planar", 1)
-    assert (scan.columns, scan.rows) == (219, 139)
-    assert np.degrees(scan.azimuth_half) == pytest.approx([6.2, 6.4])
-    assert np.degrees(scan.elevation_half) == pytest.approx([3.9, 4.1])
-
-
 @pytest.mark.parametrize(
     "bad",
     [

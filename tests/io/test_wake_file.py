@@ -3,7 +3,6 @@ file that does not end in one line naming file, variable and what is allowed."""
 
 import gc
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from lidar_mi.io.wake_file import read_wake
 from lidar_mi.units import parse_units
 
 SLAB = files("lidar_mi.scenes") / "wake_slab_40s.nc"
-VOLUME = Path(__file__).parents[3] / "shared" / "data" / "wake_les_40s.nc"
 T, X, Y, Z = (np.array([1.0, 1.1]), np.arange(3) + 0.5, np.arange(6) - 2.5, np.arange(5) * 2.0)
 
 
@@ -139,12 +137,6 @@ def test_time_is_picked_by_value(write):
     fails(path, "1.05", "1, 1.1 s", time=1.05)
     fails(path, "has 2 times, and none is chosen", "wake.time: one of 1, 1.1 s")
     assert float(read_wake(write(example().isel(time=[1]))).time) == pytest.approx(1.1)
-
-
-def test_float32_time_is_found(write):
-    data = example()
-    data["time"] = ("time", T.astype("float32"), {"units": "s"})
-    assert float(read_wake(write(data), time=1.1).time) == pytest.approx(1.1)
 
 
 @pytest.mark.filterwarnings("ignore:Cannot close a netcdf_file:RuntimeWarning")
@@ -362,15 +354,6 @@ def test_sample_has_the_published_ranges():
     assert (float(wake.y[0]), float(wake.z[0])) == (-54.5, -94.5)
     assert 0.62 <= float(wake.aerosol.min()) and float(wake.aerosol.max()) <= 1.31
     assert -13.1 <= float(wake.w.min()) and float(wake.v.max()) <= 11.4
-
-
-@pytest.mark.skipif(not VOLUME.exists(), reason=f"the full simulation {VOLUME.name} is not here")
-def test_sample_is_a_plane_of_the_full_simulation():
-    plane = read_wake(VOLUME, time=40.1, x=20.5)
-    sample = read_wake(SLAB, time=40.1)
-    part = plane.sel(y=sample.y, z=sample.z)
-    for name in sample.data_vars:
-        np.testing.assert_array_equal(part[name], sample[name])
 
 
 def test_a_minus_sign_changes_the_sign(write):

@@ -127,20 +127,6 @@ def test_displaced_origin_is_a_displaced_scene(world, statistics, estimator):
     assert first_error.max() < 0.05 * first.min() or estimator == "analog"
 
 
-def test_a_cloud_is_imaged_by_the_beam_that_points_at_it(world):
-    """One beam's place in its gate holds the only air there is."""
-    beams = table(origin=10.0)
-    for beam in (3, 17, 34):
-        along = (501.25 - beams[beam, 0]) / beams[beam, 3]
-        place = beams[beam, :3] + along * beams[beam, 3:6]
-        cloud = world.box(place - 1.5, place + 1.5, world.homogeneous(1e-3))
-        stokes, _ = world.render(world.scene(sensor(world, beams), cloud=cloud))
-        everywhere = beams[:, :3] + (501.25 - beams[:, :1]) * beams[:, 3:6]
-        near = np.linalg.norm(everywhere - place, axis=1) < 5
-        lit = stokes[0, 0].ravel() > 0
-        assert lit[beam] and not lit[~near].any()
-
-
 def test_planar_gates_lie_between_the_same_planes(world):
     beams = table()
     lidar = mi.load_dict(sensor(world, beams))

@@ -213,21 +213,6 @@ def test_folded_is_the_mean_of_sampled(kind):
     np.testing.assert_allclose(elements(folded, sine, 2 * 80 / WAVELENGTH), expected, atol=3e-5)
 
 
-def test_sampled_places_on_the_plates_have_the_defects_folded_in():
-    """Means over drawn gaps; 4 sigma."""
-    defects = {"surface_rms": 5e-9, "bow": 30e-9}
-    sharp = {"type": "spectral_line", "sigmas": "0"}
-    folded = etalon(line_shape="folded", line=sharp, **defects)
-    sampled = etalon(**defects)
-    number = 1 << 18
-    rng = np.random.default_rng(1)
-    for sine in (0.001, 0.0036, 0.006):
-        values = transmitted(sampled, sine, rng.random((2, number)))
-        mean = elements(folded, sine)[0][0]
-        assert values.mean() == pytest.approx(mean, abs=4 * values.std() / number**0.5 + 1e-5)
-        assert values.std() > 1e-3
-
-
 def transmitted(bsdf, sine, place):
     context = mi.BSDFContext()
     context.type_mask = +mi.BSDFFlags.Null

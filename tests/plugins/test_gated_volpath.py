@@ -133,14 +133,10 @@ def test_standard_error_is_correct(world, statistics, case):
 class TestVariants:
     @pytest.mark.parametrize(
         "variant",
-        [
-            "llvm_ad_mono",
-            "llvm_ad_rgb",
-            "llvm_ad_spectral",
-            "llvm_ad_spectral_polarized",
-            "cuda_ad_mono_polarized",
-            "cuda_ad_rgb",
-        ],
+        (
+            "llvm_ad_mono llvm_ad_rgb llvm_ad_spectral llvm_ad_spectral_polarized "
+            "cuda_ad_mono_polarized cuda_ad_rgb"
+        ).split(),
         indirect=True,
     )
     def test_same_seed_same_intensity_in_every_variant(self, world, variant):

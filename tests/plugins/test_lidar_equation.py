@@ -47,29 +47,6 @@ def lidar_equation(edges, extinction, depth, breaks=()):
     return total
 
 
-def layered_signal(edges, secant, steps):
-    """`lidar_equation` for layers along x, (start, extinction) each; gates ``edges`` along x.
-
-    ``secant`` is 1 / cos of the angle between each beam and x: all paths grow by it.
-    """
-    starts, values = (np.array(v, float) for v in zip(*steps, strict=True))
-    depths = np.concatenate([[0], np.cumsum(np.diff(starts) * values[:-1])])
-
-    def layer(r):
-        return np.searchsorted(starts, r / secant, side="right") - 1
-
-    def depth(r):
-        k = layer(r)
-        return secant * (depths[k] + (r / secant - starts[k]) * values[k])
-
-    return lidar_equation(
-        np.asarray(edges, float).reshape(-1, *[1] * secant.ndim) * secant,
-        lambda r: values[layer(r)],
-        depth,
-        [start * secant for start in starts[1:]],
-    )
-
-
 def secants(scene, shape):
     """1 / cos between beam and x, (rows, columns)."""
     directions = np.array(mi.traverse(scene)["sensor.directions"]).reshape(*shape, 3)
@@ -93,78 +70,6 @@ def slab_scene(world, size=(219, 139), gate=(500.0, 502.5), slab=None, low=490.0
             [low, -65, -45], [high, 65, 45], slab or world.homogeneous(2e-2), world.ENVIRONMENT
         ),
     )
-
-
-def test_nested_slabs(world, statistics):
-    """Telescope in the environment, a slab around a denser slab; the gate straddles its face."""
-    photons = 512
-    core = {"type": "ref", "id": "outer"}
-    outer = world.homogeneous(5e-3) | {"id": "outer"}
-    scene = world.scene(
-        world.lidar((31, 21), (400.0, 420.0), environment=world.ENVIRONMENT, gate_count=4, **SCAN),
-        environment=world.homogeneous(1e-3),
-        slab=world.box([300, -80, -80], [450, 80, 80], outer, world.ENVIRONMENT),
-        core=world.box([350, -70, -70], [416.25, 70, 70], world.homogeneous(2e-2), core),
-    )
-    stokes, error = world.render(scene, seed=2, spp=4 * photons)
-    secant = secants(scene, (21, 31))
-    truth = layered_signal(
-        np.linspace(400, 420, 5), secant, [(0, 1e-3), (300, 5e-3), (350, 2e-2), (416.25, 5e-3)]
-    )
-    for gate in range(4):
-        statistics.assert_agree(stokes[gate, 0], error[gate], truth[gate], photons, bias=TRUNCATION)
-
-
-class TestMajorants:
-    """Null collisions: a homogeneous medium equals a constant grid, whatever bounds it.
-
-    A slab of 100 m and optical depth 1; gate 60 m behind its face. The majorant is raised by one
-    voxel in a corner that no beam comes near. Optical depth there and back: 1.2.
-    """
-
-    SIGMA = 1e-2
-    LOW, HIGH = (500.0, -80.0, -60.0), (600.0, 80.0, 60.0)
-
-    SIZE = (7, 5)
-
-    def scene(self, world, raise_, integrator=None):
-        if raise_ is None:
-            slab = world.homogeneous(self.SIGMA)
-        else:
-            values = np.full((24, 32, 20), self.SIGMA)
-            values[0, 0, 0] *= raise_
-            slab = world.grid(values, self.LOW, self.HIGH)
-        return world.scene(
-            world.lidar(self.SIZE, (560.0, 562.5), environment=world.ENVIRONMENT, **SCAN),
-            integrator,
-            environment=world.homogeneous(1e-4),
-            slab=world.box(self.LOW, self.HIGH, slab, world.ENVIRONMENT),
-        )
-
-    def truth(self, scene):
-        return layered_signal(
-            [560, 562.5], secants(scene, self.SIZE[::-1]), [(0, 1e-4), (500, self.SIGMA)]
-        )[0]
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("raise_", [None, 1, 4, 20])
-    def test_gated(self, world, statistics, raise_):
-        photons = 20_000
-        scene = self.scene(world, raise_)
-        stokes, error = world.render(scene, seed=3, spp=photons)
-        statistics.assert_agree(stokes[0, 0], error[0], self.truth(scene), photons, bias=TRUNCATION)
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("raise_", [None, 1, 4, pytest.param(20, marks=pytest.mark.slow)])
-    def test_analog(self, world, raise_):
-        """Compared over the whole scan: one photon in 70 collides in the gate."""
-        scene = self.scene(world, raise_, {"estimator": "analog"})
-        stokes, error = world.render(scene, seed=4, spp=40_000)
-        truth = self.truth(scene)
-        ratio = stokes[0, 0] / truth
-        sigma = math.sqrt(((error[0] / truth) ** 2).mean() / ratio.size)
-        assert sigma < 0.02
-        assert abs(ratio.mean() - 1) < 4 * sigma
 
 
 class TestGates:
@@ -282,14 +187,6 @@ def test_albedo_scales_the_signal_alone(world):
         scene = slab_scene(world, (5, 4), slab=world.homogeneous(2e-2, albedo=albedo))
         images.append(world.render(scene, seed=11)[0][0, 0])
     assert images[1] / images[0] == pytest.approx(0.5, rel=1e-6)
-
-
-def test_signal_grows_with_the_telescope_area(world):
-    images = []
-    for radius in (0.5, 0.25):
-        scene = slab_scene(world, (5, 4), aperture_radius=radius)
-        images.append(world.render(scene, seed=12, spp=1024)[0][0, 0])
-    assert images[1].mean() / images[0].mean() == pytest.approx(0.25, rel=1e-4)
 
 
 def test_pulse_energy_and_wavelength_do_not_change_the_relative_signal(world):

@@ -45,24 +45,6 @@ def directions_at(optics, rng, degrees):
     return incident, incident * np.cos(angle) + across * np.sin(angle)
 
 
-@pytest.mark.parametrize("step", [1.0, 5.0])
-def test_rayleigh_table_equals_rayleigh(optics, step):
-    """Within the truncation error of linear interpolation, h^2 / 8 max |f''|.
-
-    |f''| <= 1.5 / (4 pi) for every element; the scale factor has the same relative error.
-    """
-    rng = np.random.default_rng(1)
-    degrees = np.concatenate([[0, 180, 179.9], rng.uniform(0, 180, 500)])
-    incident, scattered = directions_at(optics, rng, degrees)
-    found, _ = optics.evaluate(
-        plugin(rayleigh_table(np.arange(0, 180 + step, step))), incident, scattered
-    )
-    exact, _ = optics.evaluate(mi.load_dict({"type": "rayleigh_polarized"}), incident, scattered)
-    truncation = np.radians(step) ** 2 / 8 * 1.5 / (4 * math.pi)
-    difference = np.abs(found - exact).max()
-    assert difference < truncation * (1 + 1.5) + 1e-6
-
-
 def test_matrix_is_that_of_its_amplitudes(optics):
     """E'_par = S2 E_par, E'_per = S1 E_per with complex amplitudes, as of spheres.
 

@@ -66,21 +66,6 @@ def test_backscatter_is_diag_1_1_m1_m1(optics, offset):
     assert np.abs(turned - expected).max() < 2e-6 * BACKSCATTER + offset**2
 
 
-def test_light_scattered_by_90_degrees_is_fully_polarised(optics):
-    rng = np.random.default_rng(2)
-    incident = optics.unit_vectors(rng, 500)
-    scattered = optics.perpendicular(incident, rng)
-    matrix, _ = optics.evaluate(phase(), incident, scattered)
-    out = matrix[:, :, 0]  # from natural light
-    assert out[:, 0] == pytest.approx(3 / (16 * math.pi), rel=1e-5)
-    assert np.linalg.norm(out[:, 1:], axis=1) / out[:, 0] == pytest.approx(1, abs=1e-5)
-    # perpendicular to the scattering plane
-    normal = np.cross(incident, scattered)
-    first, second = optics.axes(scattered)
-    expected = optics.stokes(normal, first, second)
-    assert np.abs(out / out[:, :1] - expected).max() < 1e-5
-
-
 def uniaxial_dipoles(depolarization):
     """Polarisabilities of randomly oriented molecules, as tensors (m, 3, 3), and their weights.
 
@@ -120,30 +105,6 @@ def test_stokes_vectors_are_those_of_radiating_dipoles(optics, depolarization):
     assert np.abs(found - expected).max() < 1e-6
 
 
-@pytest.mark.parametrize("depolarization", [0.0, 0.028, 0.3])
-def test_depolarisation_factor_is_that_of_natural_light(optics, depolarization):
-    rng = np.random.default_rng(4)
-    incident = optics.unit_vectors(rng, 100)
-    across = optics.perpendicular(incident, rng)
-    # natural light at 90 degrees: parallel over perpendicular to the scattering plane
-    matrix, _ = optics.evaluate(phase(depolarization), incident, across)
-    normal = np.cross(incident, across)
-    first, second = optics.axes(across)
-    reference = optics.stokes(normal, first, second)
-    out = matrix[:, :, 0]
-    q = (out[:, 1:3] * reference[:, 1:3]).sum(-1)
-    assert (out[:, 0] - q) / (out[:, 0] + q) == pytest.approx(depolarization, abs=1e-5)
-    # linear light in backscatter: cross-polarised over co-polarised
-    matrix, _ = optics.evaluate(phase(depolarization), incident, -incident)
-    turned = onto_common_axis(optics, matrix, incident, -incident, across)
-    co, cross = turned[:, 0, 0] + turned[:, 1, 1], turned[:, 0, 0] - turned[:, 1, 1]
-    expected = depolarization / (2 - depolarization)
-    assert cross / co == pytest.approx(expected, abs=1e-5)
-    # circular light: twice the linear ratio over one minus it (Mishchenko & Hovenier 1995)
-    circular = (turned[:, 0, 0] + turned[:, 3, 3]) / (turned[:, 0, 0] - turned[:, 3, 3])
-    assert circular == pytest.approx(2 * expected / (1 - expected), abs=1e-5)
-
-
 @pytest.mark.parametrize("depolarization", [0.0, 0.028, 0.45])
 def test_integrates_to_one_over_the_sphere(optics, depolarization):
     """Exact: the phase function is a quadratic in the cosine; only rounding is left."""
@@ -168,24 +129,6 @@ def test_samples_follow_the_density(depolarization, wi):
         SphericalDomain(), sample, density, sample_dim=3, sample_count=500_000, res=51, ires=8
     )
     assert test.run(significance_level=0.01, test_count=4, quiet=True), test.messages
-
-
-def test_weight_is_value_over_density(optics):
-    rng = np.random.default_rng(5)
-    incident = optics.unit_vectors(rng, 1000)
-    plugin = phase(0.028)
-    first = mi.Float(rng.random(1000))
-    pair = mi.Point2f(mi.Float(rng.random(1000)), mi.Float(rng.random(1000)))
-    wo, weight, pdf = plugin.sample(
-        mi.PhaseFunctionContext(), optics.interaction(incident), first, pair
-    )
-    wo = np.array(wo).T
-    assert np.linalg.norm(wo, axis=1) == pytest.approx(1, abs=1e-6)
-    matrix, density = optics.evaluate(plugin, incident, wo)
-    assert np.array(pdf) == pytest.approx(density, rel=1e-5)
-    weight = np.array(weight)[:, :, 0].transpose(2, 0, 1)
-    assert np.abs(weight - matrix / density[:, None, None]).max() < 1e-5
-    assert weight[:, 0, 0] == pytest.approx(1, abs=1e-5)
 
 
 @pytest.mark.parametrize(

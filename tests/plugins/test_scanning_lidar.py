@@ -124,18 +124,6 @@ class TestWherePixelsLook:
             assert np.abs(np.array(ray.o).T - [10, -2, 3]).max() < 1e-6
             assert np.array(weight).max() == 1
 
-    def test_beam_frame_is_e_h_e_v_axis(self, world, optics):
-        rng = np.random.default_rng(2)
-        table = optics.unit_vectors(rng, 20)
-        sensor = mi.load_dict(
-            world.lidar((20, 1), GATE, directions=mi.TensorXf(table), gate_kind="spherical")
-        )
-        frame = sensor.beam_frame(beams(20))
-        s, t, n = (np.array(v).T.astype(float) for v in (frame.s, frame.t, frame.n))
-        assert np.abs(n - table).max() < 1e-6
-        assert np.abs(s[:, 2]).max() == 0
-        assert np.abs(np.cross(s, t) - n).max() < 1e-6
-
 
 class TestGates:
     def test_planar_gates_lie_between_planes(self, world):

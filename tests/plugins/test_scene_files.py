@@ -114,12 +114,9 @@ def test_xml_and_dictionary_give_the_same_image_in_every_variant(world, scene_fi
     """Back and forth between variants, in one process."""
     images = {}
     for name in (
-        "llvm_ad_mono_polarized",
-        "llvm_ad_rgb",
-        "llvm_ad_spectral_polarized",
-        "llvm_ad_mono_polarized",
-        "llvm_ad_rgb",
-    ):
+        "llvm_ad_mono_polarized llvm_ad_rgb llvm_ad_spectral_polarized llvm_ad_mono_polarized "
+        "llvm_ad_rgb"
+    ).split():
         mi.set_variant(name)
         from_xml, _ = world.render(mi.load_file(str(scene_file)), seed=1)
         from_dict, _ = world.render(same_scene(world), seed=1)

@@ -79,14 +79,6 @@ def test_of_analog_samples(world):
         assert_stated(found[component], found[f"{component}_stderr"])
 
 
-@pytest.mark.slow
-def test_of_one_pass_and_of_many(world):
-    arguments = (world, "1, 0.3, 0.5, 0.7", "rayleigh_polarized", 64, 1)
-    one, many = images(*arguments), images(*arguments, samples_per_pass=50)
-    for name in ("S1_stderr", "S2_stderr", "S3_stderr", "S0_S1_correlation"):
-        np.testing.assert_allclose(many[name], one[name], rtol=2e-4, atol=2e-4 * one[name].max())
-
-
 def test_a_rendered_file_has_them(tmp_path):
     out = tmp_path / "slab.exr"
     image = render_file(lm.scene_file("slab"), out, samples=16)

@@ -360,16 +360,6 @@ def test_grids_are_layers(volume, extinctions):
     assert_within_errors(found, image(layers(*extinctions), spp=4000))
 
 
-def test_trilinear_grid_is_its_average_in_many_layers():
-    cells = [1e-3, 9e-3]
-    at = np.linspace(0, 1, 40, endpoint=False) + 0.5 / 40
-    linear = np.interp(at, [0.25, 0.75], cells)
-    assert_within_errors(
-        image(scene(grid(cells, filter_type="trilinear")), spp=4000),
-        image(layers(*map(float, linear)), spp=4000),
-    )
-
-
 def test_albedo_of_a_grid():
     albedo = mi.TensorXf(np.full((1, 1, 2, 1), 0.4, np.float32))
     at = mi.ScalarTransform4f().translate([40, -30, -30]).scale([40, 60, 60])

@@ -54,24 +54,6 @@ def expected(tilt=0.0, extinction=EXTINCTION):
     return lambertian * math.pi * (APERTURE / RANGE) ** 2 * math.exp(-2 * extinction * RANGE)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("estimator", ["gated", "analog"])
-@pytest.mark.parametrize("tilt", [0.0, 40.0])
-@pytest.mark.parametrize(
-    "variant", ["llvm_ad_mono_polarized", "llvm_ad_mono", "llvm_ad_rgb"], indirect=True
-)
-def test_return_of_a_wall(world, variant, estimator, tilt):
-    """Through air that absorbs, in the wall's gate alone, unpolarised."""
-    air = world.homogeneous(EXTINCTION, "isotropic", 0.0)
-    scene = target(world, air=air, wall=wall(tilt), integrator={"estimator": estimator})
-    found = rendered(scene, 40_000)
-    error = max(4 * found[2, 4], 2e-4 * found[2, 0])
-    assert abs(found[2, 0] - expected(tilt)) < error < 0.02 * expected(tilt)
-    assert (found[[0, 1, 3], 0] == 0).all() and (found[:, 1:4] == 0).all()
-    # as scattered once
-    np.testing.assert_allclose(found[:, 5], found[:, 0], rtol=1e-5)
-
-
 def test_a_pulse_spreads_it_over_gates(world):
     duration = 3e-8
     scene = target(world, gates=10, laser={"pulse_duration": duration}, wall=wall())

@@ -42,7 +42,6 @@ def test_images_that_are_the_same_are_named():
 @pytest.mark.parametrize("checks", [True, False])
 @pytest.mark.parametrize("method", ["cc", "ws", "multipass", "variational", "vortex_fit"])
 def test_one_image_given_twice_has_no_valid_wind(method, checks):
-    """It was 0 m/s, and valid all over."""
     y, z = np.arange(40.0), np.arange(32.0)
     air = 1 + gaussian_filter(np.random.default_rng(1).standard_normal((32, 41)), 1.5)
     image, moved = (data_array(air[:, k : k + 40], y, z) for k in (0, 1))

@@ -114,12 +114,8 @@ def by_xarray(path: Path, file: File, engine: str = "h5netcdf") -> None:
 
 
 _FORMATS = (
-    "NETCDF4",
-    "NETCDF4_CLASSIC",
-    "NETCDF3_CLASSIC",
-    "NETCDF3_64BIT_OFFSET",
-    "NETCDF3_64BIT_DATA",
-)
+    "NETCDF4 NETCDF4_CLASSIC NETCDF3_CLASSIC NETCDF3_64BIT_OFFSET NETCDF3_64BIT_DATA"
+).split()
 _FILTERS = ("zlib", "zstd", "bzip2")
 
 

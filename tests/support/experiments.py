@@ -20,20 +20,14 @@ _PNG = png._png
 FIXED = {"axes.titley": 1.0, "legend.loc": "upper right"}
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 
-FIGURES = {
-    "fig00_overview",
-    "fig05_extinction",
-    "fig06_wind_from_extinction",
-    "fig07_deviation_from_truth",
-    "fig08_backscatter",
-    "fig09_backscatter_against_extinction",
-    "fig10_wind_from_backscatter",
-    "fig11_deviation_from_extinction_winds",
-    "fig12_error_by_texture",
-    "fig12b_error_and_bound",
-    "fig14_depolarization",
-    "fig15_multiple_scattering",
-}
+FIGURES = set(
+    (
+        "fig00_overview fig05_extinction fig06_wind_from_extinction fig07_deviation_from_truth "
+        "fig08_backscatter fig09_backscatter_against_extinction fig10_wind_from_backscatter "
+        "fig11_deviation_from_extinction_winds fig12_error_by_texture fig12b_error_and_bound "
+        "fig14_depolarization fig15_multiple_scattering"
+    ).split()
+)
 
 
 def small(name="small", **wake):

@@ -21,26 +21,12 @@ from typing import Any
 
 # imported by the server, so that no fork has to
 PRELOADED = (
-    "lidar_mi.cli.app",
-    "lidar_mi.experiment.preflight.check",
-    "lidar_mi.experiment.study",
-    "lidar_mi.io.images",
-    "lidar_mi.rendering.fringes",
-    "lidar_mi.retrieval.wind.pair",
-    "mitsuba",
-    "lidar_mi.retrieval.rings.analysis",
-    "lidar_mi.assessment.figures.rings",
-    "lidar_mi.io.vortex_file",
-    "xarray",
-    "h5netcdf",
-    "PIL.Image",
-    "PIL.ImageFile",
-    "PIL.PngImagePlugin",
-    "tifffile",
-    "imagecodecs",
-    "scipy.io",
-    "astropy.io.fits",
-)
+    "lidar_mi.cli.app lidar_mi.experiment.preflight.check lidar_mi.experiment.study "
+    "lidar_mi.io.images lidar_mi.rendering.fringes lidar_mi.retrieval.wind.pair mitsuba "
+    "lidar_mi.retrieval.rings.analysis lidar_mi.assessment.figures.rings "
+    "lidar_mi.io.vortex_file xarray h5netcdf PIL.Image PIL.ImageFile PIL.PngImagePlugin "
+    "tifffile imagecodecs scipy.io astropy.io.fits"
+).split()
 
 PATIENCE = 10
 """Time of a call by the clock over its processor time, at most."""

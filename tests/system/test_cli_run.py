@@ -113,16 +113,10 @@ def test_names_are_no_markup(there, lidar_mi):
 )
 def test_a_signal_stops_cleanly_and_the_run_can_be_resumed(there, number, output):
     """In the middle of rendering, where Dr.Jit puts its own exception in the interrupt's place."""
-    slow = [
-        "run",
-        "tiny.yaml",
-        "-o",
-        "run",
-        "--set",
-        "render.samples_per_beam=30000",
-        "--set",
-        "render.samples_per_pass=20000",
-    ]
+    slow = (
+        "run tiny.yaml -o run --set render.samples_per_beam=30000 --set "
+        "render.samples_per_pass=20000"
+    ).split()
     with subprocess.Popen(
         [sys.executable, "-m", "lidar_mi.cli.app", *slow],
         text=True,

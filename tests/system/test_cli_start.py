@@ -147,7 +147,8 @@ def _value_at(experiment, name):
 PLAIN = [
     name
     for name in keys.settable()
-    if re.match(r"(scan|render|retrieval)\.(?!timing)", name) and keys.explain(name).example
+    if re.match(r"(lidar|render|retrieval|scan|site)\.(?!timing)", name)
+    and keys.explain(name).example
 ]
 # what their examples need besides
 TOGETHER = {"retrieval.pointing.offset": ["retrieval.pointing.stderr=1 mrad"]}
@@ -246,14 +247,6 @@ def test_a_set_option_is_completed(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         cli.app(prog_name="lidar-mi")
     assert "scan.gates=spherical" in capsys.readouterr().out
-
-
-def test_examples_of_help_are_one_a_line(lidar_mi):
-    _, out, _ = lidar_mi("run", "--help")
-    after = out[out.index("Examples:") :].splitlines()
-    lines = [line.strip(" •") for line in after if "lidar-mi" in line]
-    assert lines[0] == "lidar-mi run wake_backscatter"
-    assert lines[1].startswith("lidar-mi run my.yaml -o outputs/calm")
 
 
 def test_new_file_like_an_instrument(lidar_mi, tmp_path, monkeypatch):

@@ -47,30 +47,19 @@ SMALL = {
         },
     },
 }
-FILES = {
-    "experiment.yaml",
-    "fringes_emitted.exr",
-    "fringes_emitted.png",
-    "fringes_photons.exr",
-    "fringes_photons.png",
-    "fringes_received_00.exr",
-    "fringes_received_00.png",
-    "fringes_received_01.exr",
-    "fringes_received_01.png",
-    "v_los.nc",
-    "metrics.json",
-    "report.html",
-    "summary.txt",
-    "log.txt",
-    "figures",
-}
-FIGURES = {
-    "fig03_fringes",
-    "fig04_ring_cuts",
-    "fig16_doppler_errors",
-    "fig17_doppler_bias",
-    "fig18_doppler_speeds",
-}
+FILES = set(
+    (
+        "experiment.yaml fringes_emitted.exr fringes_emitted.png fringes_photons.exr "
+        "fringes_photons.png fringes_received_00.exr fringes_received_00.png "
+        "fringes_received_01.exr fringes_received_01.png v_los.nc metrics.json report.html "
+        "summary.txt log.txt figures"
+    ).split()
+)
+FIGURES = set(
+    (
+        "fig03_fringes fig04_ring_cuts fig16_doppler_errors fig17_doppler_bias fig18_doppler_speeds"
+    ).split()
+)
 
 
 def check(**changes):
@@ -115,43 +104,6 @@ QUICK = {
 # ---------------------------------------------------------------- images
 
 
-def mean_r2(rendered, low, high):
-    """Mean of r^2 (m^2) over the light above the lowest in a ring's order: its middle."""
-    camera = check().doppler.camera
-    r2 = camera.radius_squared()
-    steps = np.linspace(low, high, 101)
-    light, _ = np.histogram(r2, steps, weights=rendered["S0"].values)
-    count, _ = np.histogram(r2, steps)
-    profile = light / count
-    profile -= profile.min()
-    return float(profile @ (steps[1:] + steps[:-1]) / 2 / profile.sum())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "v"),
-    [
-        ("fringes_emitted.exr", 0.0),
-        ("fringes_received_00.exr", 50.0),
-        ("fringes_received_01.exr", -300.0),
-    ],
-)
-def test_rings_lie_where_the_wind_puts_them(small, name, v):
-    """The second ring's middle, from the light itself: cos(theta) = m / (m_0 (1 + 2 v / c)).
-
-    To 1 m/s: an order of r^2 is 1940 m/s, summed in 101 steps of it.
-    """
-    f, order = 0.3, 77248.5
-
-    def r2(m):
-        return f**2 * ((order * (1 + 2 * v / speed_of_light) / m) ** 2 - 1)
-
-    rendered = read_fringes(small[0] / name)
-    got = mean_r2(rendered, r2(77247.5), r2(77246.5))
-    per_speed = f**2 * 2 * 2 / speed_of_light
-    assert abs(got - r2(77247)) / per_speed < 1.0
-
-
 def test_images_are_described_by_their_headers(small):
     received = [read_fringes(small[0] / f"fringes_received_{k:02d}.exr") for k in (0, 1)]
     assert [rendered.attrs["v_los"] for rendered in received] == list(SPEEDS)
@@ -177,11 +129,6 @@ def test_winds_scatter_as_the_bound_says(small, found, centre, averaged):
     assert low * bound**2 < (error**2).sum() < high * (bound**2 + own**2)
     # of averages, it is seen as a misfit, by which stated errors grow
     np.testing.assert_allclose(case["v_std"], bound, rtol=0.15)
-
-
-def test_bound_falls_with_the_root_of_the_number(small):
-    one, nine = (small[1][f"doppler.bound.centre_free.averaged_{n}.std"] for n in (1, 9))
-    assert nine == pytest.approx(one / 3)
 
 
 def test_the_paper_s_chain_has_its_bias_and_its_cure(found):
@@ -232,15 +179,9 @@ def test_folder_has_all_files(small):
 
 
 def test_metrics_are_the_stable_ones(small):
-    measures = {
-        "retrieved_fraction",
-        "bias",
-        "bias_lowest",
-        "bias_highest",
-        "bias_stderr",
-        "std",
-        "std_stderr",
-    }
+    measures = set(
+        ("retrieved_fraction bias bias_lowest bias_highest bias_stderr std std_stderr").split()
+    )
     cases = [f"centre_{c}.averaged_{n}" for c in ("free", "known") for n in (1, 9)]
     expected = {f"doppler.bound.{case}.std" for case in cases}
     for method in SMALL["doppler"]["retrieval"]["methods"]:
@@ -253,22 +194,11 @@ def test_metrics_are_the_stable_ones(small):
     expected |= {
         f"doppler.{name}"
         for name in (
-            "photons",
-            "background_photons",
-            "signal",
-            "speckle_modes",
-            "line_width",
-            "free_spectral_range",
-            "finesse",
-            "velocity_range",
-            "render.mc_relative_error",
-            "render.largest_error",
-            "reference.laser_drift",
-            "reference.etalon_drift",
-            "reference.bow_and_pupil",
-            "reference.wedge_and_pupil",
-            "reference.scrambling_needed",
-        )
+            "photons background_photons signal speckle_modes line_width free_spectral_range "
+            "finesse velocity_range render.mc_relative_error render.largest_error "
+            "reference.laser_drift reference.etalon_drift reference.bow_and_pupil "
+            "reference.wedge_and_pupil reference.scrambling_needed"
+        ).split()
     } | {f"timing.doppler_{name}_s" for name in ("render", "retrieve", "figures")}
     assert set(small[1]) == expected
     assert small[1]["doppler.photons"] == pytest.approx(2.4e7, rel=0.01)

@@ -12,33 +12,19 @@ import pytest
 
 from tests.support.loaded import modules_of_command
 
-COMPUTING = {
-    "torch",
-    "kornia",
-    "mitsuba",
-    "drjit",
-    "matplotlib",
-    "jsbsim",
-    "distributed",
-    "loky",
-    "scipy.stats",
-    "scipy.signal",
-    "lidar_mi.plugins",
-}
+COMPUTING = set(
+    (
+        "torch kornia mitsuba drjit matplotlib jsbsim distributed loky scipy.stats scipy.signal "
+        "lidar_mi.plugins"
+    ).split()
+)
 """Loaded by what is rendered, retrieved, drawn, flown or run on workers."""
-READING = {
-    "xarray",
-    "pandas",
-    "dask",
-    "h5py",
-    "h5netcdf",
-    "pint",
-    "scipy.interpolate",
-    "scipy.ndimage",
-    "scipy.optimize",
-    "scipy.spatial",
-    "jinja2",
-}
+READING = set(
+    (
+        "xarray pandas dask h5py h5netcdf pint scipy.interpolate scipy.ndimage scipy.optimize "
+        "scipy.spatial jinja2"
+    ).split()
+)
 """Loaded by wakes, by the air's motion and by units that are rare."""
 DESCRIBING = {"numpy", "scipy"}
 """Loaded by an experiment file."""

@@ -82,19 +82,6 @@ def test_a_study_is_refused_in_a_folder_at_work(there, lidar_mi):
 
 
 @pytest.mark.slow
-def test_images_of_another_seed_are_not_used(tmp_path, quick):
-    folder, other = tmp_path / "run", tmp_path / "other"
-    run(check(small()), folder)
-    run(check(small() | {"seed": 2}), other)
-    shutil.copy(other / "image_t2.exr", folder)
-    with pytest.raises(InputError, match=r"image_t2.exr of another experiment; .*--overwrite"):
-        run(check(small()), folder)
-    assert read_scan(folder / "image_t2.exr").attrs["seed"] == 2  # untouched
-    run(check(small()), folder, overwrite=True)
-    assert read_scan(folder / "image_t2.exr").attrs["seed"] == 1
-
-
-@pytest.mark.slow
 def test_a_damaged_image_is_rendered_again(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)

@@ -24,16 +24,10 @@ from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.atmosphere.vortices.cores import Core
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.graph import call
-from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import judged
 from lidar_mi.experiment.preflight import check
 from lidar_mi.experiment.run import prepare, run
-from lidar_mi.experiment.stages.sensor import (
-    combine_settings,
-    doppler_alone,
-    mean_squares_without,
-    with_truth,
-)
+from lidar_mi.experiment.stages.sensor import combine_settings, mean_squares_without, with_truth
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
 from lidar_mi.schema import reading as config
@@ -242,22 +236,6 @@ def test_no_valid_vector_is_reported_and_the_rest_is_shown(whole, tmp_path, monk
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("variant")
-def test_lines_without_a_velocity_are_reported_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
-    report, folder = again(
-        whole,
-        tmp_path,
-        monkeypatch,
-        lambda wind, lines: (wind, lines.assign(v_los=lines["v_los"] * np.nan)),
-    )
-    assert "Warning: no wind from both lidars: " in report
-    assert "0 of 15 lines of sight were retrieved" in report
-    assert "From the images, the errors of the circulations are" in report
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert "sensor.rmse_v_los" not in metrics
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("variant")
 def test_two_lines_give_no_vector_which_is_reported(whole, tmp_path, monkeypatch):
     report, folder = again(
         whole,
@@ -367,84 +345,6 @@ def test_largest_cause_of_error_of_u_is_reported(amplitude, noise, errors, limit
     assert f"limited by {sensor_report._CAUSES[limit]}" in output[0]
     # standard errors do not hold them
     assert bool(sensor_report._not_stated(experiment.sensor.errors)) == bool(errors)
-
-
-@pytest.mark.slow
-def test_an_error_common_to_all_lines_is_stated_apart():
-    """Lines within 22 degrees of x that are all 0.5 m/s too fast: so is u, hardly v and w."""
-    experiment = changed()
-    y, z = np.arange(-54, 54.1, 2.0), np.arange(-34, 34.1, 2.0)
-    metres, zero = {"units": "m"}, np.zeros((len(z), len(y)))
-    truth = xr.Dataset(
-        {n: (("z", "y"), zero + value) for n, value in (("u", 2.0), ("v", 0.0), ("w", 0.0))},
-        coords={"y": ("y", y, metres), "z": ("z", z, metres)},
-    )
-    settings = experiment.sensor
-    lines = scan_wind(
-        truth, settings.directions, experiment.doppler.lidar, 0.1, 1, 70.0, settings.errors
-    )
-    crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), zero.astype(np.uint8)))
-    crossflow.attrs = {"template": 4, "stride": 1}
-    silent = combined(experiment, truth, lines, crossflow)
-    biased = lines.assign(v_los_systematic=("line", np.full(lines.sizes["line"], 0.5)))
-    found = combined(experiment, truth, biased, crossflow)
-    assert "u_systematic" not in silent
-    xr.testing.assert_identical(found["u_stderr"], silent["u_stderr"])
-    valid = found["flag"] == 0
-    u = found["u_systematic"].where(valid)
-    assert float(u.min()) > 0.4 and float(u.max()) < 0.6
-    assert float(found["v_systematic"].where(valid).max()) < 0.1
-    alone = doppler_alone(biased, Log())["neighbours"]
-    assert float(alone["u_systematic"].median()) == pytest.approx(0.5, rel=0.1)
-
-
-def test_the_fraction_of_noise_is_between_those_of_draws_and_of_the_lines():
-    """Mean square error less that without noise, over 8 draws: no less than the variance of u over
-    the draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than
-    one line's variance."""
-    experiment, noise = changed(), 0.4
-    y, z = np.arange(-54, 54.1, 2.0), np.arange(-34, 34.1, 2.0)
-    waves = np.sin(2 * np.pi * z[:, None] / 40) * np.sin(2 * np.pi * y / 60)
-    metres = {"units": "m"}
-    truth = xr.Dataset(
-        {n: (("z", "y"), f) for n, f in {"u": waves, "v": 0 * waves, "w": 0 * waves}.items()},
-        coords={"y": ("y", y, metres), "z": ("z", z, metres)},
-    )
-    crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), np.zeros(waves.shape, np.uint8)))
-    crossflow.attrs = {"template": 2, "stride": 1}
-    directions = experiment.sensor.directions.model_copy(update={"columns": 9, "rows": 7})
-    experiment = experiment.model_copy(
-        update={"sensor": experiment.sensor.model_copy(update={"directions": directions})}
-    )
-    winds, gained = [], []
-    for seed in range(8):
-        lines = scan_wind(truth, directions, experiment.doppler.lidar, noise, seed, 70.0)
-        found = combined(experiment, truth, lines, crossflow)
-        metrics = limit_metrics(
-            call(
-                mean_squares_without,
-                experiment,
-                truth=truth,
-                states=truth,
-                line_beams=None,
-                lines=lines,
-                crossflow=crossflow,
-                combined=found,
-                cores=[],
-            )
-        )
-        valid = found["flag"].values == 0
-        full = ((found["u"] - found["u_true"]).values[valid] ** 2).mean()
-        gained.append(full - metrics["sensor.error_budget.line_noise.rmse_u"] ** 2)
-        assert metrics["sensor.error_budget.line_noise.fraction_u"] == pytest.approx(
-            gained[-1] / full
-        )
-        winds.append(found["u"].values[valid])
-    scatter = np.var(winds, axis=0, ddof=1).mean()
-    assert scatter - 3 * np.std(gained) / math.sqrt(8) < np.mean(gained) < noise**2, (
-        scatter,
-        gained,
-    )
 
 
 def test_points_are_counted_as_each_table_means_them():

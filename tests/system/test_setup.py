@@ -256,14 +256,6 @@ def test_llvm_is_installed_where_that_is_allowed(machine, user):
     assert log[-2:] == ["venv", "pip"]
 
 
-def test_another_llvm_is_installed_where_there_is_no_19(machine):
-    machine.fact("good_llvm", there=False)
-    machine.fact("only_llvm18")
-    machine.has_apt()
-    assert machine.set_up().returncode == 0
-    assert "apt-get install -q -y --no-install-recommends libllvm18" in machine.log()
-
-
 @pytest.mark.parametrize("obstacle", ["no apt", "no sudo", "sudo asks", "no network"])
 def test_llvm_that_cannot_be_installed_is_requested(machine, obstacle):
     machine.fact("good_llvm", there=False)

@@ -17,7 +17,7 @@ from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.io.exr import read_scan
 from lidar_mi.schema import reading as config
-from tests.support.experiments import FIGURES, SOURCES, check, small, without_figures
+from tests.support.experiments import SOURCES, check, small, without_figures
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
@@ -99,28 +99,6 @@ def test_aiming_by_angles_is_as_good(plain, variation):
         key = f"backscatter.cc.rmse_{name}"
         assert metrics[key] == pytest.approx(plain[1][key], rel=0.05)
         assert abs(metrics[f"backscatter.cc.bias_{name}"]) < 0.1
-
-
-@pytest.mark.slow
-def test_vortex_pair(tmp_path):
-    """No file at all: analytic flow, even air, texture only. With figures, whose sweep meets air
-    without any structure and so without any vector."""
-    metrics = run(check(small()), tmp_path / "run").metrics
-    drawn = {path.stem for path in (tmp_path / "run" / "figures").iterdir()}
-    assert drawn == FIGURES - {"fig15_multiple_scattering"}
-    # Lamb-Oseen: 1 - e^-1.2564 of 150 m^2/s at the core radius of 2 m
-    for side, sign in (("port", 1), ("starboard", -1)):
-        assert metrics[f"wake.{side}_core.y"] == pytest.approx(8 * sign, abs=0.1)
-        assert metrics[f"wake.{side}_core.radius"] == pytest.approx(2, abs=0.13)
-        assert metrics[f"wake.{side}_core.circulation"] == pytest.approx(
-            sign * 150 * (1 - np.exp(-1.2564)), rel=0.01
-        )
-    assert metrics["texture_sweep.0_percent.valid_fraction"] == 0
-    assert "texture_sweep.0_percent.rmse_v" not in metrics
-    # beyond the steep cores (angular velocity 12 s^-1) good texture gives 0.1 px = 0.5 m/s
-    for name in ("v", "w"):
-        assert metrics[f"extinction.cc.outside_cores.rmse_{name}"] < 0.5
-        assert metrics[f"backscatter.cc.outside_cores.rmse_{name}"] < 1.0
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import integrate, optimize
+from scipy import integrate
 from scipy.spatial.transform import Rotation
 
 from validation import fringe_reference as reference
@@ -143,29 +143,6 @@ def test_pupil_of_bowed_and_wedged_plates():
     assert rms == pytest.approx(bow, rel=1e-12)
 
 
-def test_shape_of_plates_moves_and_damps_the_profile():
-    """Harmonics of the profile: those of even plates times the pupil's characteristic function."""
-    instrument = Instrument()
-    defects, light = Defects(bow=4e-9, wedge=3e-9), Light(pupil=0.7, pupil_shift=0.2)
-    line = ((1.0, 1e9),)
-    _, even = reference.profile(instrument, NONE, light, line)
-    _, bent = reference.profile(instrument, defects, light, line)
-    ratio = np.fft.rfft(bent[:-1])[1:4] / np.fft.rfft(even[:-1])[1:4]
-    orders, weight = reference.pupil_orders(instrument, defects, light, 40, 80)
-    exact = [(weight * np.exp(2j * np.pi * n * orders)).sum() for n in (1, 2, 3)]
-    np.testing.assert_allclose(ratio, exact, rtol=1e-5)
-
-
-def test_finesse_is_lowered():
-    reflectivity = reference.mirror_reflectivity(Instrument(), Defects(finesse=0.9))
-    finesse = math.pi * math.sqrt(reflectivity) / (1 - reflectivity)
-    assert finesse == pytest.approx(0.9 * math.pi * math.sqrt(0.7) / 0.3, rel=1e-12)
-    # and 1 / 2 arcsin(1 / sqrt(F)) pi of Airy's own width at half height
-    strength = 4 * reflectivity / (1 - reflectivity) ** 2
-    half = optimize.brentq(lambda m: 1 / (1 + strength * math.sin(math.pi * m) ** 2) - 0.5, 0, 0.5)
-    assert 0.5 / half == pytest.approx(finesse, rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("defects", "speed"),
     [(Defects(warming=1.0), 5e-7 * 299792458 / 2), (Defects(drift=10e6), 354.7e-9 / 2 * 10e6)],
@@ -175,24 +152,6 @@ def test_shifts_are_speeds(defects, speed):
     moved = reference.air_frame(SMALL, NONE, 10.0 + speed).signal
     # the product of two shifts, 1e-13 of the frequency, is 1e-8 orders
     np.testing.assert_allclose(shifted, moved, rtol=1e-7)
-
-
-def test_drift_is_that_of_the_echo_alone():
-    frames = [reference.laser_frame(SMALL, defects).mean for defects in (Defects(drift=1e7), NONE)]
-    np.testing.assert_array_equal(*frames)
-
-
-def test_illumination_of_laser_and_air():
-    defects = Defects(laser=Light(slope=(0.05, 0.0)), air=Light(radius=4e-3, slope=(0.0, -0.1)))
-    laser = reference.laser_frame(SMALL, defects).signal / reference.laser_frame(SMALL, NONE).signal
-    x = (np.arange(240) - 119.5) / math.hypot(195, 240) * 2
-    row = laser[97] / laser[97].mean()
-    np.testing.assert_allclose(row, 1 + 0.05 * x, rtol=1e-3)
-    np.testing.assert_allclose(laser.mean(1) / laser.mean(), 1, rtol=2e-3)
-    air = reference.air_frame(SMALL, defects).signal / reference.air_frame(SMALL, NONE).signal
-    y = (np.arange(195) - 97) / math.hypot(195, 240) * 2
-    column = np.exp(-2 * ((np.arange(195) - 97) * SMALL.pixel / 4e-3) ** 2) * (1 - 0.1 * y)
-    np.testing.assert_allclose(air[:, 119] / air[97, 119], column, rtol=2e-3)
 
 
 def test_hot_and_dead_pixels_and_bump():
@@ -216,14 +175,6 @@ def test_hot_and_dead_pixels_and_bump():
     assert abs(x[0] - 119.5 - 0.3 * scale) < 1 and abs(y[0] - 97 - 0.2 * scale) < 1
 
 
-def test_aerosol_adds_the_laser_line():
-    air, both = (reference.air_frame(SMALL, Defects(aerosol=a), 0.0).signal for a in (0.0, 0.25))
-    laser = reference.laser_frame(SMALL, NONE).signal
-    # transmission of either line is the mean of Airy's function, up to the orders on the camera
-    np.testing.assert_allclose(both, 0.75 * air + 0.25 * laser, rtol=0.02)
-    assert np.abs(both / air - 1).max() > 0.1
-
-
 def test_exposures():
     """Mean and variance of 400 frames: Poisson, speckle of the light alone, read noise."""
     instrument = Instrument().binned(30)
@@ -236,11 +187,3 @@ def test_exposures():
     ratio = (drawn.var(0, ddof=1) / error**2).mean()
     assert abs(ratio - 1) < 4 * math.sqrt(2.8 / 400 / z.size)
     np.testing.assert_array_equal(drawn[0], reference.exposures(frame, 1, 5, 6.0, 8.0)[0])
-
-
-def test_binned_is_the_same_field():
-    instrument = Instrument(centre=(300.0, 250.0))
-    fine = reference.air_frame(instrument.binned(2), NONE, 20.0).signal
-    coarse = reference.air_frame(instrument.binned(4), NONE, 20.0, points=4).signal
-    summed = fine[:390].reshape(195, 2, 240, 2).sum((1, 3))
-    np.testing.assert_allclose(coarse, summed, rtol=2e-3)

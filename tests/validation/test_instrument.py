@@ -80,11 +80,6 @@ def test_refused_frames_are_in_the_table():
     assert lines[-1].count("|") == lines[-2].count("|") and "refused" in lines[-1]
 
 
-def test_bias_has_a_standard_error():
-    error = np.random.default_rng(1).normal(size=400)
-    assert Outcome(error, error, error, 1.0).bias_std == pytest.approx(1 / 20, rel=4 / np.sqrt(800))
-
-
 def test_coverage_has_a_standard_error():
     """Pulses that share a calibration are no independent ones: two of four calibrations miss."""
     error = np.repeat([0.5, 0.5, 2.0, 2.0], 100)

@@ -258,6 +258,8 @@ def test_every_stored_row_passes(name):
 QUICK = (
     "air: statistics divergence regulations",
     "filaments: rings instability wakes",
+    "lidar_equation: profile_through_layers surfaces_that_touch valley_of_extinction"
+    " phase_functions depolarisation diffuse_targets",
     "loads: gusts response",
     "molecules: cross_sections refraction depolarisation density",
     "receivers: published",
@@ -268,7 +270,7 @@ QUICK = (
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("checks", QUICK)
+@pytest.mark.parametrize("checks", QUICK, ids=lambda checks: checks.partition(":")[0])
 def test_results_are_in_date(effort, checks):
     """The same rows again, and all of them pass."""
     module, *functions = checks.replace(":", "").split()

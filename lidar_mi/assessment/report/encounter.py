@@ -102,22 +102,13 @@ def encounter_summary(
     metrics: Mapping[str, float], controller: str = "", met: str = "wake"
 ) -> list[Table]:
     """The main numbers for a terminal; `controller` and `met` as in `encounter_chapter`."""
-    modes = [mode for mode in MODES if f"encounter.{mode}.largest_roll" in metrics]
-    rows = [
-        (f"{label} / {unit}" if unit else label, *_values(metrics, modes, key, factor))
-        for key, label, unit, factor in _of_a_flight(metrics, met)
-    ]
-    rows.append(("flight lost (upset)", *("yes" if _lost(metrics, m) else "no" for m in modes)))
-    heads = ("", *(flight_name(mode, controller) for mode in modes))
-    tables = [Table(f"flights into the {met}", rows, heads, f"flight lost: {_UPSET}")]
-    lidar = [
-        (f"{label} / {unit}" if unit else label, _cell(metrics.get(f"encounter.{key}"), factor))
-        for key, label, unit, factor in _OF_THE_LIDAR
-        if f"encounter.{key}" in metrics
-    ]
-    if lidar:
-        tables.append(Table("the lidar in flight", lidar))
-    return tables
+    heads, flights, lidar = _numbers(metrics, controller, met)
+    rows, of_lidar = (
+        [(f"{label} / {unit}" if unit else label, *values) for label, unit, values in part]
+        for part in (flights, lidar)
+    )
+    tables = [Table(f"flights into the {met}", rows, ("", *heads), f"flight lost: {_UPSET}")]
+    return tables + ([Table("the lidar in flight", of_lidar)] if lidar else [])
 
 
 def encounter_chapter(
@@ -138,20 +129,8 @@ def encounter_chapter(
     """
     from lidar_mi.assessment.report.page import Chapter, Tables
 
-    modes = [mode for mode in MODES if f"encounter.{mode}.largest_roll" in metrics]
-    flights = [
-        (label, unit, _values(metrics, modes, key, factor))
-        for key, label, unit, factor in _of_a_flight(metrics, met)
-    ]
-    flights.append(
-        ("flight lost (upset)", "", ["yes" if _lost(metrics, mode) else "no" for mode in modes])
-    )
-    tables = [("The flights", [flight_name(mode, controller) for mode in modes], flights)]
-    lidar = [
-        (label, unit, [_cell(metrics[f"encounter.{key}"], factor)])
-        for key, label, unit, factor in _OF_THE_LIDAR
-        if f"encounter.{key}" in metrics
-    ]
+    heads, flights, lidar = _numbers(metrics, controller, met)
+    tables = [("The flights", heads, flights)]
     if lidar:
         tables.append(("The lidar and its track", ["value"], lidar))
     numbers = Tables(
@@ -166,6 +145,29 @@ def encounter_chapter(
     return Chapter(
         f"Into the {met}", [], drawn, numbers, _verdict(judged) if judged else None, film=film
     )
+
+
+_Row = tuple[str, str, list[str]]
+"""Name, unit, values as text."""
+
+
+def _numbers(
+    metrics: Mapping[str, float], controller: str, met: str
+) -> tuple[list[str], list[_Row], list[_Row]]:
+    """Names of the flights, rows with their numbers, and rows of the lidar."""
+    modes = [mode for mode in MODES if f"encounter.{mode}.largest_roll" in metrics]
+    flights = [
+        (label, unit, [_cell(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes])
+        for key, label, unit, factor in _of_a_flight(metrics, met)
+    ]
+    lost = ["yes" if _lost(metrics, mode) else "no" for mode in modes]
+    flights.append(("flight lost (upset)", "", lost))
+    lidar = [
+        (label, unit, [_cell(metrics[f"encounter.{key}"], factor)])
+        for key, label, unit, factor in _OF_THE_LIDAR
+        if f"encounter.{key}" in metrics
+    ]
+    return [flight_name(mode, controller) for mode in modes], flights, lidar
 
 
 def encounter_answer(
@@ -343,12 +345,6 @@ def _verdict(judged: Judged) -> "Tables":
         "without Doppler measurements has no u.",
         judged,
     )
-
-
-def _values(
-    metrics: Mapping[str, float], modes: Sequence[str], key: str, factor: float
-) -> list[str]:
-    return [_cell(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
 
 
 def _lost(metrics: Mapping[str, float], mode: str) -> bool:

@@ -156,37 +156,6 @@ def test_window_means_of_a_curved_wind():
     np.testing.assert_allclose(window_mean(truth, 8, "cc")["z"].diff("z"), H)
 
 
-def test_displacements_in_a_core_are_off_by_the_time_step_alone():
-    """Air goes round one vortex on circles (closed form), and a vector is the straight way."""
-    vortex = Vortex(400.0, 3.0, 0.3, -0.4)
-    y, z = (np.arange(n) * H / 2 - (n - 1) * H / 4 for n in (81, 81))
-    place = np.meshgrid(y, z)
-    metres = {"z": z, "y": y}
-    truth = xr.Dataset(
-        {
-            n: xr.DataArray(x, metres, ("z", "y"))
-            for n, x in zip("vw", velocity((vortex,), *place), strict=True)
-        }
-    )
-    start = place[0] - vortex.y + 1j * (place[1] - vortex.z)
-    r = np.abs(start)
-    swirl = 400 / (2 * np.pi * r) * (1 - np.exp(-1.2564 * r**2 / 9))
-    moved = start * (np.exp(1j * swirl / r * DT) - 1)
-    found = winds(moved.real / DT, moved.imag / DT, "cc")
-    found = found.assign_coords(
-        y_vector=(("z", "y"), place[0] + moved.real / 2),
-        z_vector=(("z", "y"), place[1] + moved.imag / 2),
-    )
-    found["flag"] = found["flag"].where(r < 8, 1)
-    budget = error_budget(found, {}, truth, [])
-    assert budget["rmse_v"] > 0.05
-    assert budget["time_step.fraction"] > 0.999
-    # a field that knows of curved paths has no such error
-    assert "time_step.fraction" not in error_budget(
-        found.assign_attrs(method="variational"), {}, truth, []
-    )
-
-
 # --- shares
 
 

@@ -10,7 +10,6 @@ import xarray as xr
 from lidar_mi.assessment.metrics.errors import (
     commonest_flag,
     deviations,
-    direction,
     error_by_quality,
     error_statistics,
     truth_at_vectors,
@@ -86,11 +85,6 @@ def test_no_truth_outside_the_flow_or_without_a_place():
     found = truth_at_vectors(wind, still)
     assert np.isfinite(found["v"].values[0]).tolist() == [True, False, False, False]
     assert found["v"].dims == wind["v"].dims
-
-
-def test_direction_is_counted_from_y_towards_z():
-    assert direction(1.0, 0.0) == 0
-    assert direction(0.0, 1.0) == pytest.approx(np.pi / 2)
 
 
 def test_directions_wrap_at_pi():
@@ -215,18 +209,3 @@ def test_statistics_of_gaussian_errors_are_the_closed_forms():
         assert found[key] == pytest.approx(
             fraction, abs=4 * np.sqrt(fraction * (1 - fraction) / n)
         ), key
-
-
-def test_statistics_of_a_few_known_errors():
-    error = np.array([1.0, -2.0, np.nan, 3.0, 100.0])
-    stderr = np.array([2.0, 1.0, 1.0, np.nan, 1.0])
-    found = error_statistics(error, stderr, np.array([True, True, True, True, False]))
-    assert found["rmse"] == pytest.approx(np.sqrt(14 / 3))
-    assert found["bias"] == pytest.approx(2 / 3)
-    # the third has no error, the fourth no standard error
-    assert found["normalised_error_variance"] == pytest.approx((0.25 + 4) / 2)
-    assert found["stderr"] == pytest.approx(np.sqrt(2.5))
-    assert found["coverage_68"] == 0.5 and found["coverage_95"] == 0.5
-    assert error_statistics(error, stderr, np.zeros(5, bool)) == {}
-    assert error_statistics([np.nan]) == {}
-    assert set(error_statistics([1.0], [0.0])) == {"rmse", "bias"}

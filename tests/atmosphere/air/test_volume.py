@@ -75,13 +75,6 @@ def test_a_plane_is_no_volume(flow):
         AirVolume(flow.isel(x=[0]), 0.0, 0.0, 60.0)
 
 
-def test_order_of_dimensions_does_not_matter(flow):
-    first = AirVolume(flow, 100.0, 0.0, 60.0)
-    second = AirVolume(flow.transpose("z", "x", "y"), 100.0, 0.0, 60.0)
-    at = (30.0, 10.0, 50.0, 0.0)
-    np.testing.assert_allclose(first.velocity(*at), second.velocity(*at))
-
-
 def passing(times, wind, x=(-40.0, 400.0)):
     """States (s) of a wave that the wind carries along x and that grows by 10 % a second."""
     axes = {

@@ -41,13 +41,6 @@ def test_derived_numbers_in_closed_form():
     assert table.backscatter == pytest.approx(1e-4 / table.lidar_ratio, rel=1e-12)
 
 
-def test_asymmetry_converges_with_the_angles():
-    """Linear interpolation is of second order: half the step, 25 % of the error."""
-    errors = [abs(haze(step=step).asymmetry - 0.7) for step in (1.0, 0.5, 0.25)]
-    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
-    assert errors[1] / errors[2] == pytest.approx(4, rel=0.1)
-
-
 @pytest.mark.parametrize("depolarization", [0.0, 0.0073, 0.0284, 0.3])
 def test_rayleigh(depolarization):
     """Backscatter depolarisation d/(2 - d); Chandrasekhar's backward value; symmetric, so g = 0."""
@@ -78,14 +71,6 @@ def test_mixture_weights_by_hand():
     )
     # so does scattered power times cosine
     assert 0.37 * both.asymmetry == pytest.approx(0.27 * dry.asymmetry, rel=1e-3)
-
-
-def test_mixture_of_one_is_itself():
-    table = haze()
-    alone = mix([table, rayleigh_table(0.0, 532e-9, 5e-31)], [1e-4, 0.0])
-    np.testing.assert_allclose(alone.at(table.angle), table.elements, rtol=1e-12, atol=1e-15)
-    assert alone.albedo == pytest.approx(table.albedo, rel=1e-12)
-    assert alone.number_density == pytest.approx(table.number_density, rel=1e-12)
 
 
 def test_description_agrees_with_the_table(tmp_path):

@@ -96,17 +96,6 @@ def test_circulation_through_a_plane_across_the_path():
             assert around == pytest.approx(vortex.circulation, rel=1e-4)
 
 
-def test_place_of_a_vortex_is_where_its_own_swirl_vanishes():
-    x, when = 570.0, 6.0
-    pair = OBLIQUE.vortices(x, when)
-    for vortex, partner in zip(pair, pair[::-1], strict=True):
-        _, v, w = OBLIQUE.wind(x, vortex.y, vortex.z, when)
-        # what is left is the mean wind and the partner's, some metres per second at most
-        far = math.hypot(vortex.y - partner.y, vortex.z - partner.z)
-        swirl = abs(partner.circulation) / (2 * np.pi * far)
-        assert math.hypot(v - 2.0, w + 0.3) < 1.3 * swirl
-
-
 def test_slopes_of_the_axis():
     near, far = (OBLIQUE.vortices(x, 8.0) for x in (500.0, 600.0))
     for first, second in zip(near, far, strict=True):

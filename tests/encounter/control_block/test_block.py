@@ -292,21 +292,6 @@ def test_predicted_variances_with_losses_agree_with_flights(block, samples, run,
     np.testing.assert_allclose(found, predicted, rtol=0.1)
 
 
-def test_a_few_lost_estimates_raise_the_load_much(block):
-    """The residual without losses is small: 3 % in runs of 3 add half of its variance.
-
-    A load that the estimate does not reduce has the variance pi of the gust in place of that of the
-    residual: both samples that a control averages are lost in the inner part of a run.
-    """
-    rms = example()["rms"]
-    gust, residual = rms(block, 0.0)[2] ** 2, rms(block, 1.0)[2] ** 2
-    found = rms(with_losses(block, 0.03, 3), 1.0)[2] ** 2
-    assert found / residual > 1.4
-    # runs so long that their ends do not count
-    found = rms(with_losses(block, 0.03, 100), 1.0)[2] ** 2
-    assert found == pytest.approx(0.97 * residual + 0.03 * gust, rel=0.03)
-
-
 def test_lost_estimates_are_counted(tmp_path, samples):
     """The chain of flights of which 5 % are lost in runs of 4, within 4 standard errors."""
     transition = with_losses({}, 0.05, 4)["loss_transition"]

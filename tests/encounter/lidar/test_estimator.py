@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.cases import drifting_pair_images, vortex_pair_images
-from benchmarks.realtime import UNFORESEEN
+from benchmarks.cases import vortex_pair_images
 from lidar_mi.encounter.lidar.estimate import SKIPPED
 from lidar_mi.encounter.lidar.estimator import Estimator
 from lidar_mi.encounter.lidar.slab_winds import FirstImage
 from lidar_mi.schema.reading import load_experiment
-from tests.support.vortex_pairs import uneven, vector
+from tests.support.vortex_pairs import vector
 
 DT = 0.1
 
@@ -69,24 +68,3 @@ def test_the_wind_is_by_the_most_accurate_method(images):
     found = estimator.pair_of(first, images.second, take=(False, False))
     assert found.wind is None and not found.seconds
     assert found.pair.reasons == (SKIPPED,) and found.flags == (f"wind: {SKIPPED}",)
-
-
-@pytest.mark.slow
-def test_the_next_slab_starts_from_the_last_one():
-    """Half a pixel on, with other texture: as accurate as from nothing."""
-    near, far = (Estimator(load_experiment("wake_sensor")) for _ in range(2))
-    last, errors = None, {"near": [], "far": []}
-    for seed, y in ((1, 0.0), (2, 0.25)):
-        vortices = [replace(v, y=v.y + y) for v in uneven()]
-        slab = drifting_pair_images(vortices, (0.5, 0.0), 0.03, seed, columns=130, rows=90)
-        found = near.pair_of(FirstImage(slab.first, DT, 0.03, expected=last), slab.second)
-        last = replace(found.pair, covariance=found.pair.covariance + np.diag(UNFORESEEN**2))
-        far.forget()
-        for name, one in {
-            "near": found,
-            "far": far.pair_of(FirstImage(slab.first, DT, 0.03), slab.second),
-        }.items():
-            off = one.wind["v"] - slab.v.interp(y=one.wind["y"], z=one.wind["z"])
-            errors[name].append(float(off.std()))
-    assert found.wind.attrs["from_start"] == 1 and found.pair.from_start
-    assert errors["near"][1] < 1.05 * errors["far"][1]

@@ -58,21 +58,6 @@ def here(drifting):
 
 
 @pytest.mark.slow
-def test_each_wind_starts_from_the_last_one(here, drifting):
-    """Over a drift of two core radii: errors as from nothing, known to 3 %."""
-    near, far = [], []
-    for (wind, flags, seconds), images in zip(here, drifting[0], strict=True):
-        assert not flags and set(seconds) == {"wind"} and seconds["wind"] > 0
-        alone = InThisProcess(ImageMethod.VARIATIONAL, WINDOWS)
-        nothing = wind_of(alone, images).wind
-        for found, errors in ((wind, near), (nothing, far)):
-            true = images.v.interp(y=found["y"], z=found["z"])
-            errors.append(float(((found["v"] - true) ** 2).mean()))
-    assert [found.wind.attrs["from_start"] for found in here] == [0, 1, 1, 1, 1]
-    assert np.mean(near[1:]) < 1.06**2 * np.mean(far[1:])
-
-
-@pytest.mark.slow
 def test_a_process_of_its_own_finds_the_same(here, drifting):
     winds = InOwnProcess(ImageMethod.VARIATIONAL, WINDOWS)
     for (one, *_), (other, _, seconds) in zip(here, winds_of(winds, drifting), strict=True):

@@ -109,32 +109,6 @@ def test_solid_rotation_about_an_axis_in_the_plane(tmp_path, depth):
 
 
 @pytest.mark.slow
-def test_mass_in_a_wind_without_divergence(tmp_path):
-    """Of the blobs, which are away from the edges; in-plane advection does not keep it."""
-
-    def cells(x, y, z):
-        k, (a, b, c) = 2 * np.pi / 20, (12.0, -5.0, -7.0)
-        x, y, z = (k * (axis + shift) for axis, shift in ((x, 1.3), (y, -2.1), (z, 0.7)))
-        return {
-            "u": a * np.cos(x) * np.sin(y) * np.sin(z),
-            "v": b * np.sin(x) * np.cos(y) * np.sin(z),
-            "w": c * np.sin(x) * np.sin(y) * np.cos(z),
-        }
-
-    def compact(x, y, z):
-        return np.exp(-((x - 0.5) ** 2 + (y - 1) ** 2 + (z - 1) ** 2) / (2 * 1.5**2))
-
-    file = written(tmp_path, compact, cells)
-    change = {}
-    for second in ("advect_3d", "advect"):
-        truth = lm.make_truth(experiment(tmp_path, file, second=second, depth="volume"))
-        before, after = (float(field.sum()) for field in truth.smooth)
-        change[second] = after / before - 1
-    assert abs(change["advect_3d"]) < 1e-4
-    assert abs(change["advect"]) > 1e-2
-
-
-@pytest.mark.slow
 def test_without_wind_along_x_it_is_in_plane_advection(tmp_path):
     """Of air that is uniform along x, without and with texture."""
 
@@ -178,29 +152,6 @@ def test_texture_moves_with_the_wind_in_the_plane(tmp_path):
     assert float(wind["v"].mean()) == pytest.approx(3, abs=1e-9)
     # of x^2 in 2.5 m, linear between planes: the mean lies 0.5^2 / 6 higher
     assert float(wind["w"].mean()) == pytest.approx(1.25**2 / 3 + STEP**2 / 6, abs=0.002)
-
-
-@pytest.mark.slow
-def test_the_state_that_the_simulation_stored_is_nearer(tmp_path):
-    """Wind along x is a quarter of what in-plane advection lacks; the rest is not of the wind."""
-    wake = {"time": "40 s", "x": "20.5 m", "extinction": {}, "texture": {"rms": 0}}
-    thin = {"range": "500 m", "thickness": "0.1 m"}  # the stored state is that of one plane
-    images = {
-        second: lm.make_truth(
-            lm.load_experiment("wake_changing", wake=wake | given, scan=thin)
-        ).image(1)
-        for second, given in (
-            ("stored", {"file": "wake_slab_40s.nc", "second": "40.1 s"}),
-            ("advect_3d", {"second": "advect_3d"}),
-            ("advect", {"second": "advect"}),
-        )
-    }
-    edge = {"y": slice(16, -16), "z": slice(16, -16)}
-    off = {
-        second: float((image - images["stored"]).isel(edge).std())
-        for second, image in images.items()
-    }
-    assert 0.5 < (off["advect_3d"] / off["advect"]) ** 2 < 0.8
 
 
 @pytest.mark.slow

@@ -31,24 +31,6 @@ def air(**keys):
     return call(clear_air, experiment(**keys))
 
 
-@pytest.mark.parametrize(
-    "micrometres, fit",
-    # Bucholtz 1995 (Appl. Opt. 34, 2765), table 3: the volume scattering coefficient at 288.15 K
-    # and 1013.25 hPa is A l^-(B + C l + D / l) / km at l um, below and above 0.5 um; his King
-    # factors are others, by less than 0.5 %
-    [
-        (0.355, (7.68246e-4, 3.55212, 1.35579, 0.11563)),
-        (0.532, (10.21675e-4, 3.99668, 1.10298e-3, 2.71393e-2)),
-        (1.064, (10.21675e-4, 3.99668, 1.10298e-3, 2.71393e-2)),
-    ],
-)
-def test_extinction_at_sea_level(micrometres, fit):
-    a, b, c, d = fit
-    rayleigh = 1e-3 * a * micrometres ** -(b + c * micrometres + d / micrometres)
-    found = air(wavelength=f"{micrometres} um").extinction
-    assert found == pytest.approx(rayleigh, rel=5e-3)
-
-
 def test_backscatter_at_sea_level():
     """355 nm: 2.759e-26 cm^2 a molecule (Bodhaine et al. 1999) and 2.547e25 molecules per m^3; the
     backscatter is 8.0e-6 / m / sr to 1 %."""

@@ -110,25 +110,6 @@ def test_a_vortex_is_that_of_quadrature():
             assert found[number, gate] == pytest.approx(expected, abs=1e-3)
 
 
-def test_bright_air_counts_more():
-    """Echoes that grow along the gate, in a sheared wind."""
-    scan = stare_scan(0.0, 0.0, 1.0, 1)
-    middle = LIDAR.ranges[40]
-    found, *_ = gate_moments(
-        lambda x, y, z, t: (0 * y, 0.01 * y, 0 * y),
-        scan,
-        LIDAR,
-        signal=lambda x, y, z, t: np.exp((y - middle) / 20),
-    )
-    moments = [
-        scipy.integrate.quad(
-            lambda r, n=n: r**n * np.exp(r / 20) * range_weight(np.array(r), LIDAR), -150, 150
-        )[0]
-        for n in (0, 1)
-    ]
-    assert found[0, 40] - 0.01 * middle == pytest.approx(0.01 * moments[1] / moments[0], rel=1e-3)
-
-
 def test_the_weight_is_normalised_and_a_window_without_a_pulse():
     total, _ = scipy.integrate.quad(lambda r: float(range_weight(np.array(r), LIDAR)), -200, 200)
     assert total == pytest.approx(1, abs=1e-9)

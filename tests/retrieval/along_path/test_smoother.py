@@ -102,12 +102,6 @@ def test_recursion_is_the_solution_at_once(component, missing, rejected):
     np.testing.assert_allclose(stderr, error, rtol=1e-5)
 
 
-def test_far_away_nothing_is_known():
-    found = field(seen())
-    mean, stderr = found.at(np.array([-5000.0]), np.zeros(1), np.zeros(1), np.zeros(1))
-    assert abs(mean[0]) < 1e-6 and stderr[0] == pytest.approx(STATISTICS.sigma)
-
-
 def test_slabs_without_vectors_say_nothing():
     slabs = seen()
     blind = [(x, t, replace(v, wind=np.full_like(v.wind, np.nan))) for x, t, v in slabs]

@@ -10,7 +10,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import brentq
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.channels.assumption import assumption_error
@@ -118,31 +117,6 @@ def test_bound_of_a_fringe_is_the_closed_form(v_los):
     for free in (("v_los", "level"), NUISANCE, ("v_los", "level", "temperature")):
         found = cramer_rao(fringe(64), 1e6, v_los=v_los, free=free)["v_los"]
         assert found == pytest.approx(expected, rel=1e-9)
-
-
-def test_bound_of_two_filters_is_error_propagation_of_their_ratio():
-    """var v = (1 / A + 1 / B) / (d ln(A / B) / dv)^2."""
-    receiver = edges()
-
-    def signals(v):
-        return mean_and_jacobian(receiver, parameter_vector(receiver, v, 1e5))[0][0].numpy()
-
-    for v in (0.0, 80.0):
-        slope = np.log(signals(v + 0.01) / signals(v - 0.01)) / 0.02
-        expected = math.sqrt((1 / signals(v)).sum()) / abs(slope[0] - slope[1])
-        assert cramer_rao(receiver, 1e5, v_los=v)["v_los"] == pytest.approx(expected, rel=1e-6)
-
-
-def test_fit_of_two_filters_is_the_speed_of_their_ratio():
-    receiver, counts = edges(), np.array([2011.0, 2743.0])
-
-    def excess(v):
-        mean = mean_and_jacobian(receiver, parameter_vector(receiver, v))[0][0].numpy()
-        return math.log(mean[0] / mean[1] * counts[1] / counts[0])
-
-    fit = fit_channels(torch.tensor(counts), receiver)
-    assert float(fit.v_los) == pytest.approx(brentq(excess, -400, 400), abs=1e-5)
-    assert math.isnan(float(fit.chi_square))
 
 
 @pytest.mark.parametrize("v_los", [-860.0, -300.0, 0.0, 51.0, 444.0])

@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.flags import CombinedFlag, Flag
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors, scan_wind
 from lidar_mi.retrieval.combined.combine import combine
-from lidar_mi.retrieval.combined.vectors import wind_from_triples
 from lidar_mi.retrieval.common_error import with_common_error
 
 Y, Z = np.arange(-3, 3.1, 1.0), np.arange(-2, 2.1, 1.0)
@@ -321,21 +319,6 @@ def test_errors_are_as_stated():
             assert abs(held - fraction) < 4 * math.sqrt(fraction * (1 - fraction) / count)
 
 
-@pytest.mark.parametrize(
-    ("draws", "coverage"), [(15, 0.12), pytest.param(200, 0.05, marks=pytest.mark.slow)]
-)
-def test_errors_are_as_stated_where_the_statistics_of_u_are_estimated(draws, coverage):
-    """As above, to 4 sigma; in the long test intervals hold what they say to 5 points.
-
-    Whether u is rough or smooth is known here; test_combine_ensemble.py has flows of all kinds.
-    """
-    reduced = reduced_errors({"u_exponent": 1.0}, draws)
-    for values in reduced.transpose(1, 0, 2):
-        assert values.var() == pytest.approx(1, abs=4 * math.sqrt(4 / values.size))
-        assert (abs(values) < 1).mean() == pytest.approx(0.683, abs=coverage)
-        assert (abs(values) < 2).mean() == pytest.approx(0.954, abs=coverage / 2)
-
-
 def test_statistics_of_u_are_estimated():
     """Most probable values within a factor of 2.5 of 2 m/s and 12 m, in the median of 9 draws."""
     random = np.random.default_rng(6)
@@ -353,49 +336,6 @@ def test_uniform_wind_is_known_to_the_mean_of_all_lines():
     assert 0.063 < float(found.u_stderr.min()) < 0.2
     assert float(abs(found.u - 4).max()) < 0.6
     assert found.attrs["u_std"] < 0.5
-
-
-def test_a_vortex_pair():
-    """The paper's conclusion: u from lines and images together; v and w of lines are useless.
-
-    Lamb-Oseen vortices with 2 m/s of axial flow in their cores, errors as in
-    docs/accuracy_doppler.md.
-    """
-    random = np.random.default_rng(0)
-    y, z = np.arange(-40, 40.1, 1.0), np.arange(-28, 28.1, 1.0)
-    pair = [Vortex(circulation=s * 458.0, core_radius=3.0, y=s * 15.0, z=0.0) for s in (1, -1)]
-    grid_y, grid_z = np.meshgrid(y, z)
-    v, w = velocity(pair, grid_y, grid_z)
-    axial = sum(2 * np.exp(-((grid_y - s * 15) ** 2 + grid_z**2) / 50) for s in (1, -1))
-    fields = {name: (("z", "y"), f) for name, f in (("u", axial), ("v", v), ("w", w))}
-    wind = xr.Dataset(fields, coords={"y": y, "z": z})
-    overlap = [
-        np.linalg.cholesky(np.clip(1 - abs(a[:, None] - a) / 4, 0, None) + 1e-12 * np.eye(len(a)))
-        for a in (z, y)
-    ]
-    noise = (0.7 * overlap[0] @ random.standard_normal(axial.shape) @ overlap[1].T for _ in "vw")
-    flow = crossflow(wind.v + next(noise), wind.w + next(noise), 0.7, 0.0, y, z, template=4)
-    flow["w_stderr"] = flow.v_stderr
-    scan = scan_wind(
-        wind,
-        DopplerScan(azimuth_half="20 deg", elevation_half="13 deg"),
-        DopplerLidar(range=76),
-        0.5,
-        1,
-        150.0,
-    )
-    found = combine(flow, scan)
-    inside = found.flag == 0
-    rms = {c: float(np.sqrt((((found[c] - wind[c]) ** 2).where(inside)).mean())) for c in "uvw"}
-    alone = wind_from_triples(scan)
-    truth = {c: wind[c].interp(y=alone.y, z=alone.z) for c in "uvw"}
-    lone = {c: float(np.sqrt(((alone[c] - truth[c]) ** 2).mean())) for c in "uvw"}
-    assert rms["u"] == pytest.approx(0.4, abs=0.1) and lone["u"] == pytest.approx(3, abs=1)
-    assert lone["v"] == pytest.approx(13, abs=3)
-    for c in "vw":
-        assert rms[c] < 1.01 * float(np.sqrt((((flow[c] - wind[c]) ** 2).where(inside)).mean()))
-        # statistics of u that differ in what they say of v and w may add a little
-        assert float((found[f"{c}_stderr"] / flow[f"{c}_stderr"]).max()) < 1.03
 
 
 # what the platform does not know

@@ -71,20 +71,6 @@ def sights(std=0.05, seed=1, distance=60.0):
     )
 
 
-def test_vectors_of_one_time():
-    """That of the first image. A third of a core between nodes: 0.02 m/s; without, 0.5 m/s."""
-    flow = vectors()
-    found, _ = at_common_time(flow, sights(), 0.0, DRIFT)
-    true = wind(*np.meshgrid(Y, Z), 0.0)
-    valid = (found["flag"] == 0).values
-    before = [np.abs(flow[n].values - t)[valid].max() for n, t in zip("vw", true, strict=True)]
-    after = [np.abs(found[n].values - t)[valid].max() for n, t in zip("vw", true, strict=True)]
-    assert max(after) < 0.02 and min(before) > 0.5
-    np.testing.assert_array_equal(found["time"], 0.0)
-    # what came from beyond the images, half a node
-    assert 0.95 < valid.mean() < 1
-
-
 def test_both_lidars_at_one_time():
     """u is 0: what lines and vectors of other times leave of a pair appears as u."""
     flow, scan = vectors(), sights(std=0.01)

@@ -11,7 +11,6 @@ import torch
 from lidar_mi.errors import InputError
 from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.cross_correlation import correlate, cross_correlation
-from lidar_mi.retrieval.images.windows import Windows
 from tests.support.flows import plane_waves, texture
 
 
@@ -140,22 +139,6 @@ def test_subpixel_shift_has_little_bias(fraction, axis):
         assert error.numel() > 0.999 * displacement.numel()
         assert abs(float(error.mean())) < 0.03
         assert float(error.std()) < (0.1 if name == axis else 0.2)
-
-
-@pytest.mark.parametrize("dy, dz", [(2.0, 1.0), (1.3, -0.6)])
-def test_gaussian_blob(dy, dz):
-    """A blob's correlation peak is nearly Gaussian: right sign and size to 0.05 px."""
-    y, z = np.meshgrid(np.arange(48.0), np.arange(40.0))
-
-    def blob(cy, cz):
-        return torch.as_tensor(1 + np.exp(-((y - cy) ** 2 + (z - cz) ** 2) / (2 * 2.0**2)))
-
-    found = cross_correlation(blob(23.5, 19.5), blob(23.5 + dy, 19.5 + dz))
-    windows = Windows((40, 48))
-    i, j = windows.starts(0).index(16), windows.starts(1).index(20)  # centres 19.5 and 23.5
-    assert abs(float(found.dy[i, j]) - dy) < 0.05
-    assert abs(float(found.dz[i, j]) - dz) < 0.05
-    assert found.flag[i, j] == 0
 
 
 def test_beyond_the_search_range_is_flagged_not_clipped():

@@ -144,7 +144,8 @@ def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
 
 @pytest.mark.parametrize("moved", [0.7, 1.35])
 def test_short_waves_do_not_bias_displacements_to_whole_pixels(moved):
-    """Texture down to waves of 2 px; read by a cubic spline through pixels, 0.7 became 0.77."""
+    """Texture down to waves of 2 px; a cubic spline through
+    pixels makes 0.77 of 0.7."""
     z, y = grid(80, 110)
     random = np.random.default_rng(11)
     vector = random.uniform(-3.0, 3.0, (400, 2))
@@ -354,14 +355,6 @@ def test_images_without_texture_give_no_valid_vector(kind, noise):
     }[kind]
     found = variational(*pair, noise=noise, stride=4)
     assert bool((found.flag != 0).all())
-
-
-@pytest.mark.parametrize("noise", [None, 0.01])
-def test_one_image_given_twice_is_at_rest(noise):
-    image, _ = shifted_pair()
-    found = variational(image, image.clone(), noise=noise, stride=4)
-    assert float(found.d.abs().max()) < 1e-4
-    assert bool(found.covariance.isfinite().all())
 
 
 def test_tiny_images():

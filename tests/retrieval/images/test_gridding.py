@@ -46,16 +46,6 @@ def test_displacement_of_a_known_shift(offset):
         assert float(wind[f"displacement_{axis}"].std()) < 0.01 * SPACING
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("px", [0.1, 0.4])
-def test_values_between_scattered_beams(px):
-    """To 1 % of the contrast, for structure of 3 px."""
-    places = scattered(px)
-    found = on_nodes(scan(places, texture(WAVES, *places)))["Y"].values
-    error = (found - texture(WAVES, *NODES))[3:-3, 3:-3]
-    assert np.sqrt((error**2).mean()) < 0.01 * 0.2
-
-
 def test_linear_fields_and_times_are_exact():
     places = scattered(0.3)
     field = 2 + 0.03 * places[0] - 0.02 * places[1]

@@ -5,15 +5,7 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.images.windows import (
-    Windows,
-    averaged,
-    box_sum,
-    candidates,
-    linear_weights,
-    separable,
-    window_sums,
-)
+from lidar_mi.retrieval.images.windows import Windows, averaged, box_sum
 
 
 @pytest.mark.parametrize("size", range(1, 14))
@@ -44,17 +36,6 @@ def test_regions_lie_inside_and_templates_in_their_middle(template, search, stri
         np.testing.assert_array_equal(windows.centres(axis), starts + (template - 1) / 2)
 
 
-def test_window_sums_are_weighted_sums():
-    random = torch.Generator().manual_seed(4)
-    fields = torch.randn(2, 31, 150, generator=random, dtype=torch.float64)
-    kernels = [torch.randn(7, generator=random, dtype=torch.float64) for _ in range(2)]
-    for axis, step in ((1, 1), (1, 3), (2, 2), (2, 1)):
-        found = window_sums(fields, kernels, step, axis)
-        pieces = fields.unfold(axis, 7, step)
-        for sums, kernel in zip(found, kernels, strict=True):
-            torch.testing.assert_close(sums, pieces @ kernel)
-
-
 def test_averaged_is_a_gaussian_mean_of_known_values():
     random = torch.Generator().manual_seed(5)
     for shape, least in (
@@ -75,21 +56,6 @@ def test_averaged_is_a_gaussian_mean_of_known_values():
             torch.testing.assert_close(found.flatten()[place], expected)
 
 
-def test_separable_and_linear_weights_are_those_of_numpy():
-    random = torch.Generator().manual_seed(6)
-    known = torch.tensor([1.0, 3.0, 5.0], dtype=torch.float64)
-    places = torch.tensor([0.0, 1.5, 4.0, 9.0], dtype=torch.float64)
-    values = torch.randn(3, dtype=torch.float64, generator=random)
-    expected = np.interp(places.numpy(), known.numpy(), values.numpy())
-    np.testing.assert_allclose((linear_weights(known, places) @ values).numpy(), expected)
-    field = torch.randn(2, 3, 4, 5, generator=random)
-    matrices = [torch.randn(m, n, generator=random) for m, n in ((6, 3), (7, 4), (2, 5))]
-    expected = torch.einsum("nijk,ai,bj,ck->nabc", field, *matrices)
-    torch.testing.assert_close(separable(field, matrices), expected)
-    expected = torch.einsum("njk,bj,ck->nbc", field[:, 0], *matrices[1:])
-    torch.testing.assert_close(separable(field[:, 0], matrices[1:]), expected)
-
-
 def test_windows_of_volumes_divide_the_margin_of_the_stride():
     """Templates lie inside, search regions need not."""
     windows = Windows((10, 12, 17), 8, 16, 4)
@@ -99,22 +65,6 @@ def test_windows_of_volumes_divide_the_margin_of_the_stride():
     volume = torch.arange(10 * 12 * 17, dtype=torch.float64).reshape(10, 12, 17)
     found = windows.of_templates(volume)
     assert found[0, 1, 2] == volume[1:9, 4:12, 8:16].mean()
-
-
-def test_template_mean_and_candidates_are_the_right_pixels():
-    """The pixel's own index as its value shows which pixels were taken."""
-    windows = Windows((20, 30), 4, 9, 2)
-    image = torch.arange(600, dtype=torch.float64).reshape(20, 30)
-    means = windows.of_templates(image)
-    region_means = windows.of_regions(image)
-    corners = candidates(image[: 20 - 3, : 30 - 3], windows)
-    for i, z in enumerate(windows.starts(0)):
-        for j, y in enumerate(windows.starts(1)):
-            assert means[i, j] == image[z : z + 4, y : y + 4].mean()
-            first_z, first_y = z - windows.lead, y - windows.lead
-            region = image[first_z : first_z + 9, first_y : first_y + 9]
-            assert region_means[i, j] == pytest.approx(float(region.mean()), rel=1e-14)
-            assert torch.equal(corners[:, :, i, j], region[:6, :6])
 
 
 def test_unravel_gives_shifts_and_the_rim():

@@ -95,14 +95,6 @@ def test_an_ambiguous_order_is_told(lines):
     assert "ambiguous" in text and "nominal gap" in text
 
 
-@pytest.mark.slow
-def test_second_and_third_harmonic_are_always_ambiguous():
-    """Wavelengths of 3 to 2: orders that differ by 3 and 2 have the same fractions."""
-    found = both((line(LASER, 2), line(1.5 * LASER, 2)), tolerance=1e-6)
-    steps = np.diff([gap for gap, _ in found.gaps])
-    assert steps == pytest.approx(3 * LASER / 2, rel=1e-3)
-
-
 def test_file_and_speeds(lines, tmp_path):
     """The file holds it; speeds with it are right to the scale of the true gap."""
     both(lines).to_dataset().to_netcdf(tmp_path / "etalon.nc")

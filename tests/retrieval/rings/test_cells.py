@@ -63,20 +63,6 @@ def test_cells_know_their_pixels_about_any_centre():
         assert float(spread[cell]) == pytest.approx(inside.var(), abs=1e-8 * inside.mean())
 
 
-def test_an_annulus_has_the_mean_of_its_pixels():
-    rng = np.random.default_rng(3)
-    images = torch.as_tensor(rng.random((2, 40, 30)))
-    cells = annular_sectors((40, 30), (10.0, 44.0), 120.0, 1)
-    mean = cells.means(images)
-    y, x = np.mgrid[:40, :30]
-    true = (x - 10.0) ** 2 + (y - 44.0) ** 2
-    for k, ring in enumerate(np.unique(true // 120)):
-        inside = true // 120 == ring
-        assert cells.count[k] == inside.sum()
-        assert float(cells.r2[k]) == pytest.approx(true[inside].mean())
-        np.testing.assert_allclose(mean[:, k], images.numpy()[:, inside].mean(1), rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("step", "sectors", "message"),
     [(0.0, 16, "step: 0.0 px"), (math.nan, 16, "step: nan px"), (9.0, 0, "sectors: 0 is not")],

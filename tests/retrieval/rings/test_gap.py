@@ -64,20 +64,6 @@ def test_third_line_resolves_the_order():
     assert found.gap_std == pytest.approx(0.01 / np.sqrt((per_gap**2).sum()), rel=1e-6)
 
 
-def test_standard_error_holds():
-    """Normalised errors of 400 draws (seed 3): variance 1 within 4 standard deviations of it."""
-    rng = np.random.default_rng(3)
-    lines, std = (ARGON, THORIUM), np.array([4e-3, 2e-3])
-    errors = []
-    for _ in range(400):
-        gap = GAP + rng.uniform(-3e-6, 3e-6)
-        e = (fractions(gap, lines) + std * rng.standard_normal(2)) % 1
-        found = gap_from_fractions(e, std, lines, GAP, 0.1e-3)
-        errors.append((found.gap - gap) / found.gap_std)
-    assert np.var(errors) == pytest.approx(1, abs=4 * np.sqrt(2 / 400))
-    assert np.mean(np.abs(errors) < 1.96) == pytest.approx(0.95, abs=4 * np.sqrt(0.0475 / 400))
-
-
 def two_lines(faint=0.1, seed=2):
     """Frame of an etalon of 0.885 mm; the spacing is in proportion to the wavelength."""
     frame = Frame(

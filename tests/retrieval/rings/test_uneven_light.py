@@ -10,7 +10,6 @@ import pytest
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.analysis import analyse_rings
-from lidar_mi.retrieval.rings.centre import ring_centre
 
 BACKGROUNDS = ("even", "slope", "steep", "quadratic", "bright corner", "vignetting", "uneven light")
 HIDING = ("nothing", "half", "dark half", "quadrant", "bar", "aperture")
@@ -147,12 +146,3 @@ def test_frames_without_their_centre(where):
         image = image.clip(max=120)
     with pytest.raises(InputError, match=r"centre: |saturated"):
         analyse_rings(np.random.default_rng(1).poisson(image) if where == "outside" else image)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("background", BACKGROUNDS)
-@pytest.mark.parametrize("hiding", ["half", "bar"])
-def test_the_start_of_the_centre(background, hiding):
-    """Within 2 px, a third of a ring's width."""
-    image, _, _, centre = frame(background, hiding, "hot pixels", "one", 5)
-    assert np.abs(np.subtract(ring_centre(image), centre)).max() < 2

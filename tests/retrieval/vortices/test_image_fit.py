@@ -254,7 +254,7 @@ def test_no_pair_without_evidence():
 
 
 def test_the_filter_takes_any_size():
-    """Paddings of unlike parity reach unlike corners of the spectrum: 81 x 61 px did not run."""
+    """Paddings of unlike parity reach unlike corners of the spectrum."""
     random = np.random.default_rng(4)
     for shape in ((61, 81), (60, 81), (41, 43), (62, 102)):
         spline, _ = band_limited(torch.as_tensor(random.standard_normal((2, *shape))), 0.5)
@@ -283,7 +283,7 @@ def test_bad_input_is_named():
 def test_noise_alone_keeps_no_fit_busy(monkeypatch):
     """Nothing in such images ends a search, and cores may spin up.
 
-    Followed round and round, the air took 50 000 steps, and minutes in images of the usual size.
+    Followed round and round, the air takes 50 000 steps.
     """
     steps = []
     monkeypatch.setattr(model, "wind", lambda *given: steps.append(1) or wind(*given))

@@ -123,7 +123,7 @@ def test_flags_outliers_and_unknown_errors():
 @pytest.mark.parametrize("noise", [0.5, 3.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_few_vectors_give_a_pair_or_a_reason(seed, noise):
-    """Where the air around takes the pair's part a step beyond all cores ended in a traceback."""
+    """Where the air around takes the pair's part, a step may lead beyond all cores."""
     few = vectors(noise, seed, 2.5, 14, 12, vortex_pair(20.0, 12.0, 1.5))
     pair = fit_vortices_to_wind(few)
     assert pair.success == (not pair.reasons)

@@ -4,22 +4,19 @@ Detects an error of 0.1 m in where a vector belongs (half a pixel is 0.25 m), of
 error that a plain correlation has, a wrong sign, axis, spacing or unit, and confident nonsense.
 """
 
-from functools import partial
-
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.optimize import least_squares
 
 from benchmarks.cases import CORE_RADIUS, DT, vortex_pair_images
-from lidar_mi.atmosphere.vortices.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortices.vortex import velocity
 from lidar_mi.errors import InputError
 from lidar_mi.flags import Flag
 from lidar_mi.retrieval.wind.bound import wind_bound
 from lidar_mi.retrieval.wind.methods import METHODS
 from lidar_mi.retrieval.wind.options import VectorValidation, WindowSizes
 from lidar_mi.retrieval.wind.pair import retrieve_wind
-from tests.support.flows import axes, data_array, origin, plane_waves, texture
+from tests.support.flows import axes, data_array, plane_waves, texture
 
 
 def moved(v, w, spacing_y=0.5, spacing_z=0.5, rows=60, columns=80):
@@ -83,57 +80,6 @@ def test_cc_of_a_vortex_pair(pairs):
     assert far == pytest.approx(0.65, rel=0.15)
     assert abs(bias) < 0.05
     assert good < 0.95 * everywhere and fraction > 0.95
-
-
-@pytest.mark.slow
-def test_ws_of_a_vortex_pair(pairs):
-    """No better than reporting no wind, but better than the 5.4 m/s of matching centres alone.
-
-    The median test finds most of the wrong matches; what it leaves tells something of the wind.
-    The standard errors say that this is little, and flag it.
-    """
-    everywhere, _, good, no_wind, _, fraction = scores(pairs, "ws", standard_errors=False)
-    assert 0.9 * no_wind < everywhere < 5.4
-    assert good < 0.75 * no_wind and 0.5 < fraction < 0.9
-    assert scores(pairs[:1], "ws")[-1] < 0.1
-
-
-def test_vortex_core_is_retrieved_at_its_position():
-    """A vortex in a wind of (10, -6) m/s: at mid-time its core is V dt/2 further on.
-
-    The core is found by fitting the closed form to the vectors. Right: within 0.1 m. Vectors left
-    at the template centres put it 0.5 m back in y and 0.3 m up in z; templates taken to be
-    centred on a pixel move it by half a pixel, 0.25 m in both.
-    """
-    mean = np.array([10.0, -6.0])
-    y, z = axes(120, 110)
-    grid = np.meshgrid(y, z)
-
-    swirl = partial(velocity, [Vortex(200.0, 3.0, 0.0, 0.0)])
-    waves = plane_waves(5, 3.0, 0.5)
-    first = texture(waves, *grid)
-    advected = grid[0] - mean[0] * DT, grid[1] - mean[1] * DT  # frame that goes with the vortex
-    second = texture(waves, *origin(swirl, *advected, DT))
-    dataset = retrieve_wind(*(data_array(i, y, z) for i in (first, second)), DT, "cc")
-    good = dataset.flag.values == 0
-    v, w = dataset.v.values[good], dataset.w.values[good]
-
-    def core(y, z):
-        def misfit(p):
-            model = velocity([Vortex(p[2], p[3], *p[:2])], y, z)
-            return np.concatenate([model[0] + p[4] - v, model[1] + p[5] - w])
-
-        return least_squares(misfit, [0.3, 0.3, 150.0, 3.5, 8.0, -4.0], loss="soft_l1").x
-
-    centre_z, centre_y = (g[good] for g in np.meshgrid(dataset.z, dataset.y, indexing="ij"))
-    right = core(dataset.y_vector.values[good], dataset.z_vector.values[good])
-    np.testing.assert_allclose(right[:2], mean * DT / 2, atol=0.1)
-    np.testing.assert_allclose(right[4:], mean, atol=0.1)
-    assert right[2] == pytest.approx(200.0, rel=0.05)
-    late = core(centre_y, centre_z)
-    np.testing.assert_allclose(late[:2], 0.0, atol=0.1)
-    half = core(dataset.y_vector.values[good] + 0.25, dataset.z_vector.values[good] + 0.25)
-    assert (np.abs(half[:2] - mean * DT / 2) > 0.15).all()
 
 
 @pytest.mark.parametrize("v, w", [(6.0, 0.0), (-6.0, 0.0), (0.0, 4.0), (0.0, -4.0)])
@@ -337,23 +283,6 @@ def burst(number, noise, seed=7):
         rendered = texture(waves, grid[0] - 3 * k * DT, grid[1] + 2 * k * DT)
         rendered += noise * random.standard_normal(rendered.shape)
         yield data_array(rendered, y, z)
-
-
-def test_more_images_of_a_burst_lower_the_error():
-    """N images in uniform wind hold N (N^2 - 1) / 6 times the information of two: 10 for four.
-
-    The standard error falls by sqrt(10) where noise alone limits it; half of that is asked for, as
-    the prior helps the pair more.
-    """
-    first, second, *more = burst(4, 0.1)
-    stderr, error = [], []
-    for rest in ([], more):
-        wind = retrieve_wind(first, second, DT, "variational", noise=0.1, more=rest)
-        assert wind.attrs["images"] == 2 + len(rest)
-        stderr.append(float(wind["v_stderr"].median()))
-        error.append(rms(np.stack([wind["v"] - 3, wind["w"] + 2])))
-    assert stderr[1] < 0.63 * stderr[0]
-    assert error[1] < 0.63 * error[0]
 
 
 def test_a_burst_needs_a_method_that_takes_it():
