@@ -60,6 +60,7 @@ FLOORS = {
     "assessment": (("metrics",), ("figures",), ("report",)),
     "experiment": (("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (
+        ("likelihood",),
         ("extinction", "images", "rings"),
         ("correlation", "channels", "combined", "ground_winds"),
         ("flow", "defects"),

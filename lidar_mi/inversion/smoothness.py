@@ -3,7 +3,7 @@
 import numpy as np
 import scipy
 
-from lidar_mi.retrieval.reml import most_likely
+from lidar_mi.retrieval.likelihood.reml import most_likely
 
 
 def strength(information: np.ndarray, score: np.ndarray) -> float:
@@ -12,9 +12,9 @@ def strength(information: np.ndarray, score: np.ndarray) -> float:
     A profile of logarithms is b + s w with a free level b and a random walk w of unit steps. With
     Gaussian estimates of the information I, the combinations of the walk that are independent a
     priori and in the data have squares of the expectation 1 + s^2 g, of which
-    `retrieval.reml.most_likely` finds s^2. The level takes no part: it is fitted (Patterson and
-    Thompson 1971, Biometrika 58, 545). The estimate without prior, of which the score is I times,
-    need not exist.
+    `reml.most_likely` finds s^2. The level takes no part: it is fitted (Patterson and Thompson
+    1971, Biometrika 58, 545). The estimate without prior, of which the score is I times, need not
+    exist.
     """
     count = len(score)
     walk = np.tril(np.ones((count, count - 1)), -1)

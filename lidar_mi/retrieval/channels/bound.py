@@ -13,7 +13,7 @@ from lidar_mi.retrieval.channels.model import (
     parameter_vector,
     variance,
 )
-from lidar_mi.retrieval.fisher import fisher_matrix, standard_deviations
+from lidar_mi.retrieval.likelihood.scoring import fisher_matrix, standard_deviations
 from lidar_mi.retrieval.rings.model import PixelNoise
 
 

@@ -19,7 +19,13 @@ from lidar_mi.retrieval.channels.model import (
     parameter_vector,
     variance,
 )
-from lidar_mi.retrieval.fisher import Fits, Limits, fisher_matrix, scoring, standard_deviations
+from lidar_mi.retrieval.likelihood.scoring import (
+    Fits,
+    Limits,
+    fisher_matrix,
+    scoring,
+    standard_deviations,
+)
 from lidar_mi.retrieval.rings.model import PixelNoise
 
 ITERATIONS = 60

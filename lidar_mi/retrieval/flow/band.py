@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch.nn.functional import pad
 
-from lidar_mi.retrieval.flow.block_banded import Factor, factor
 from lidar_mi.retrieval.flow.flow_spline import REACH, Mesh
 
 
@@ -102,10 +101,6 @@ class Band:
     rows: int
     columns: int
 
-    def factor(self, form: torch.Tensor) -> Factor:
-        """Factor of the matrices of quadratic forms, bands of shape (..., 2, 2, 7, Z, 4, Y)."""
-        return factor(self.columns_of(form))
-
     def columns_of(self, form: torch.Tensor) -> torch.Tensor:
         """The blocks A[k + j, k] of forms (..., 2, 2, 7, Z, 4, Y): (knots y, ..., 4 n, n)."""
         knots, batch = self.rows, form.shape[:-6]
@@ -118,11 +113,6 @@ class Band:
             columns.diagonal(-shift, -3, -1).copy_(form[..., REACH + shift, rows])
         # (.., shift y, component there, knot z there, component here, knot z here)
         return columns.flatten(-2).flatten(-4, -2)
-
-    def solve(self, root: Factor, right: torch.Tensor) -> torch.Tensor:
-        """Coefficients that solve the systems, of some right hand sides (n, ..., 2, Z, Y) each."""
-        solution = root.solve(right.movedim((0, -1), (-1, 0)).flatten(-3, -2))
-        return solution.unflatten(-2, (2, self.rows)).movedim((0, -1), (-1, 0))
 
     def form_of(self, columns: torch.Tensor) -> torch.Tensor:
         """The transpose of `columns_of`: a form from its blocks."""

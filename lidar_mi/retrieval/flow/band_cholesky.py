@@ -1,8 +1,7 @@
 """Cholesky factor of one quadratic form of a plane flow's coefficients, by LAPACK, and its inverse.
 
 With the coefficients in the order (knot along y, knot along z, component) a form (see `band.Band`)
-is a band matrix. Its factor takes a third of the operations of that of blocks
-(`block_banded.factor`). Other devices have `cyclic_reduction`.
+is a band matrix. Other devices have `cyclic_reduction`.
 """
 
 from dataclasses import dataclass
@@ -12,8 +11,10 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import as_strided
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
+from torch.linalg import LinAlgError  # type: ignore[attr-defined]  # not in torch's own list
 
 from lidar_mi.retrieval.flow.flow_spline import REACH
+from lidar_mi.retrieval.threads import mapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,20 @@ def cholesky(form: torch.Tensor) -> BandCholesky | None:
     (factor,) = get_lapack_funcs(("pbtrf",), (lower,))
     lower, info = factor(lower, lower=True, overwrite_ab=True)
     return None if info else BandCholesky(lower, form.shape[3], form.shape[5])
+
+
+def factored(forms: torch.Tensor) -> list[BandCholesky]:
+    """Factors of forms, bands (n, 2, 2, 7, Z, 4, Y), in double precision.
+
+    Raises
+    ------
+    torch.linalg.LinAlgError
+        A form is not positive definite.
+    """
+    roots = [root for root in mapped(cholesky, forms.double()) if root]
+    if len(roots) < len(forms):
+        raise LinAlgError("the quadratic form of a flow is not positive definite")
+    return roots
 
 
 def solved_near(

@@ -20,6 +20,7 @@ import torch
 
 from lidar_mi.retrieval.flow.flow_spline import Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
+from lidar_mi.retrieval.flow.posterior import Response
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.images.band_limit import (
     even_fast_len,
@@ -30,11 +31,8 @@ from lidar_mi.retrieval.images.band_limit import (
 )
 from lidar_mi.retrieval.images.spline import Spline, filter_of, finite, spectrum_of, transform_sizes
 from lidar_mi.retrieval.images.windows import averaged, separable, working
-from lidar_mi.retrieval.reml import most_likely
+from lidar_mi.retrieval.likelihood.reml import most_likely
 from lidar_mi.retrieval.symmetric import eigenvalues
-
-Response = Callable[[torch.Tensor], torch.Tensor]
-"""From gradients of the log-likelihood (n, components, knots) to the flow's changes."""
 
 _DRAWS = {2: 4, 3: 2}
 """Random fields of each component, by dimensions: a mean square over all places is known to 2 %."""

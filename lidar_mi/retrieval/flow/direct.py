@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from functools import reduce
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
-from torch.linalg import LinAlgError  # type: ignore[attr-defined]  # not in torch's own list
 
-from lidar_mi.retrieval.flow import cyclic_reduction
+from lidar_mi.retrieval.flow import band_cholesky, cyclic_reduction
 from lidar_mi.retrieval.flow.band import Band, along_y, along_z, form, spread
 from lidar_mi.retrieval.flow.band_cholesky import BandCholesky, cholesky, solved_near
-from lidar_mi.retrieval.flow.block_banded import Factor
 from lidar_mi.retrieval.flow.flow_spline import REACH, Mesh
 from lidar_mi.retrieval.flow.likelihood import Linear
+from lidar_mi.retrieval.flow.posterior import Root
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.windows import working
@@ -27,16 +26,6 @@ _SINGLE = 1e-3
 _INVERSE = 1e-3
 # Products with a form until conjugate gradients from a similar one are given up.
 _MOST_PRODUCTS = 12
-
-
-class Root(Protocol):
-    """Factor of a form: what every solver gives."""
-
-    def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Coefficients that solve the system, of right hand sides (..., 2, Z, Y)."""
-
-    def covariance(self) -> torch.Tensor:
-        """The inverse within the band, as a form is held: (2, 2, 7, Z, 4, Y)."""
 
 
 class Posterior(NamedTuple):
@@ -70,7 +59,7 @@ class Posterior(NamedTuple):
 
     def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
         """The prior's precision times coefficients (n, 2, Z, Y)."""
-        return torch.stack([_band(self.prior.mesh).apply(self.stiff, flow) for flow in flows])
+        return _band(self.prior.mesh).apply(self.stiff, flows)
 
     def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
         """Coefficients by gradients (n, 2, Z, Y), with the prior's precision times a strength."""
@@ -97,7 +86,7 @@ def factored(forms: torch.Tensor) -> Sequence[Root]:
         One is not positive definite.
     """
     if by_lapack(forms):
-        return [_in_double(form) for form in forms]
+        return band_cholesky.factored(forms)
     return cyclic_reduction.factored(working(forms))
 
 
@@ -185,33 +174,17 @@ def solved_in_single(
         residual = gradient - _band(mesh).apply(whole, step)
         if bool(residual.norm() <= _SINGLE * gradient.norm()):
             return coefficients + step
-    return coefficients + _in_double(whole).solve(gradient)
+    return coefficients + factored(whole[None])[0].solve(gradient)
 
 
 def factor_in_single(form: torch.Tensor) -> Root:
     """Factor of a form in single precision; in double where there is none, and on other devices."""
-    if not by_lapack(form):
-        return factored(form[None])[0]
-    return cholesky(form.float()) or _in_double(form)
-
-
-def _in_double(form: torch.Tensor) -> BandCholesky:
-    root = cholesky(form.double())
-    if root is None:
-        raise LinAlgError("the quadratic form of a flow is not positive definite")
-    return root
+    single = cholesky(form.float()) if by_lapack(form) else None
+    return single or factored(form[None])[0]
 
 
 def _band(mesh: Mesh) -> Band:
     return Band(*(axis.knots for axis in mesh.axes))
-
-
-def in_single(band: Band, form: torch.Tensor) -> Factor | None:
-    """A factor in single precision, if there is one."""
-    try:
-        return band.factor(form.float())
-    except LinAlgError:
-        return None
 
 
 def prior_and_gradient(

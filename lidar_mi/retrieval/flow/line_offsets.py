@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_mi.retrieval.flow.components import Response
 from lidar_mi.retrieval.flow.flow_spline import Mesh
 from lidar_mi.retrieval.flow.likelihood import Images, Linear, path
+from lidar_mi.retrieval.flow.posterior import Response
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.spline import splines_of_values_and_slopes
 from lidar_mi.retrieval.images.windows import working

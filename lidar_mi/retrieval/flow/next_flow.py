@@ -11,7 +11,6 @@ from lidar_mi.retrieval.flow.band import spread
 from lidar_mi.retrieval.flow.direct import (
     Posterior,
     PriorTerm,
-    Root,
     factor_in_single,
     form_of_slopes,
     prior_term_of,
@@ -27,6 +26,7 @@ from lidar_mi.retrieval.flow.likelihood import (
     linearised_there,
     path,
 )
+from lidar_mi.retrieval.flow.posterior import Root
 from lidar_mi.retrieval.flow.prior import Prior
 from lidar_mi.retrieval.flow.settings import VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement

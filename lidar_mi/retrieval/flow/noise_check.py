@@ -6,9 +6,10 @@ images have no slopes, and a flow absorbs nothing, shows their covariance in two
 
 import torch
 
-from lidar_mi.retrieval.flow.components import Response, normal_fields
+from lidar_mi.retrieval.flow.components import normal_fields
 from lidar_mi.retrieval.flow.flow_spline import Mesh
 from lidar_mi.retrieval.flow.likelihood import Images, Linear
+from lidar_mi.retrieval.flow.posterior import Response
 from lidar_mi.retrieval.images.band_limit import even_fast_len
 from lidar_mi.retrieval.images.windows import Windows, averaged
 

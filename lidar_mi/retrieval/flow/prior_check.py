@@ -6,14 +6,14 @@ a known distribution where the prior holds (in the manner of Stein 1981, Ann. St
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 
 from lidar_mi.retrieval.flow.components import normal_fields
 from lidar_mi.retrieval.flow.flow_spline import Mesh, interpolated
 from lidar_mi.retrieval.flow.likelihood import Linear
-from lidar_mi.retrieval.flow.prior import Prior
+from lidar_mi.retrieval.flow.posterior import Posterior
 
 WEAKER = 0.25
 """Strength of the prior of the second fit, over that of the first."""
@@ -22,24 +22,6 @@ _DRAWS = 4
 _LEAST = 0.05
 """Of the ratio, which the noise of the difference may make negative."""
 _FIRST_SEED = 11
-
-
-class Fit(Protocol):
-    """The linear maps of a fit: what every solver gives."""
-
-    @property
-    def coefficients(self) -> torch.Tensor:
-        """Of the flow, (components, knots ...)."""
-
-    @property
-    def prior(self) -> Prior:
-        """Of the flow."""
-
-    def prior_gradient(self, flows: torch.Tensor) -> torch.Tensor:
-        """The prior's precision times coefficients (n, components, knots ...)."""
-
-    def fitted(self, gradients: torch.Tensor, strength: float = 1.0) -> torch.Tensor:
-        """Coefficients by gradients (n, ...), with the prior's precision times a strength."""
 
 
 class PriorCheck(NamedTuple):
@@ -65,7 +47,7 @@ class PriorCheck(NamedTuple):
         return interpolated(factor, self.mesh.places, [place.to(factor) for place in places])
 
 
-def prior_check(fit: Fit, linear: Linear, mesh: Mesh) -> PriorCheck:
+def prior_check(fit: Posterior, linear: Linear, mesh: Mesh) -> PriorCheck:
     """The ratio of the prior's bias to its expectation, by fits with P and P / 4.
 
     With the information H of the images, C = (H + P)^-1 and C_w = (H + P / 4)^-1, both fits of one

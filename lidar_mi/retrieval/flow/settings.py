@@ -60,8 +60,6 @@ class StripSettings:
         they are too large by up to 24 %.
     solved_core, solved_overlap : int
         The same for the preconditioner.
-    solved_at_once : int
-        Strips of the preconditioner that one thread works on together.
     tolerance : float
         Residual over the first one at which conjugate gradients end: each round solves again.
     loose : float
@@ -79,7 +77,6 @@ class StripSettings:
     final_overlap: int = 12
     solved_core: int = 14
     solved_overlap: int = 4
-    solved_at_once: int = 4
     tolerance: float = 1e-3
     loose: float = 2e-2
     steps: int = 200

@@ -10,12 +10,10 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.retrieval.flow.band import Band, spread
-from lidar_mi.retrieval.flow.block_banded import Factor
 from lidar_mi.retrieval.flow.direct import (
     covariance_near,
     data_form,
     factored,
-    in_single,
     prior_and_gradient,
     prior_form,
     rounding,
@@ -51,13 +49,13 @@ class Strip(NamedTuple):
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, with the posterior's precision there.
 
-    `stiff` is the prior's part of it, `both` all of it: bands. `images` is the
+    `stiff` is the prior's part of it, `whole` all of it: bands. `images` is the
     likelihood that they are of, and its mesh.
     """
 
     coefficients: torch.Tensor
     stiff: torch.Tensor
-    both: torch.Tensor
+    whole: torch.Tensor
     prior: Prior
     images: tuple[Linear, Mesh]
     settings: VariationalSettings
@@ -75,7 +73,7 @@ class Posterior(NamedTuple):
         """Coefficients by gradients (n, 2, Z, Y), with the prior's precision times a strength."""
         inverse = self.inverse
         if strength != 1:
-            inverse = _inverse(self.both + (strength - 1) * self.stiff, self.prior, self.settings)
+            inverse = _inverse(self.whole + (strength - 1) * self.stiff, self.prior, self.settings)
         return inverse(gradients, self.settings.strips.tolerance)
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -116,7 +114,7 @@ class Posterior(NamedTuple):
     def _alone(self, strip: Strip) -> torch.Tensor:
         """The bands (2, ...) of prior and posterior as if image and prior ended with a strip."""
         cells, last = strip.cells, self.prior.mesh.axes[0].cells
-        bands = torch.stack([band[:, :, :, strip.knots] for band in (self.stiff, self.both)])
+        bands = torch.stack([band[:, :, :, strip.knots] for band in (self.stiff, self.whole)])
         # splines at the strip's ends reach into three cells beyond
         if cells.start:
             beyond = self._of(slice(max(0, cells.start - REACH), cells.start))
@@ -147,11 +145,6 @@ def strips(cells: int, core: int, overlap: int) -> list[Strip]:
     ]
 
 
-def _grouped(cut: list[Strip], at_once: int) -> list[list[Strip]]:
-    """Strips that one thread works on at once."""
-    return [cut[i : i + at_once] for i in range(0, len(cut), at_once)]
-
-
 def solved(
     linear: Linear,
     mesh: Mesh,
@@ -167,11 +160,11 @@ def solved(
     Methods, chapter 2).
     """
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
-    both = data_form(linear, mesh) + stiff
-    inverse = _inverse(both, prior, settings)
+    whole = data_form(linear, mesh) + stiff
+    inverse = _inverse(whole, prior, settings)
     # a loose solution suffices: the next round takes another step
     (change,) = inverse(gradient[None], settings.strips.tolerance)
-    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, inverse)
+    return Posterior(coefficients + change, stiff, whole, prior, (linear, mesh), settings, inverse)
 
 
 Inverse = Callable[[torch.Tensor, float], torch.Tensor]
@@ -182,40 +175,26 @@ def _band(prior: Prior) -> Band:
     return Band(*(axis.knots for axis in prior.mesh.axes))
 
 
-def _inverse(both: torch.Tensor, prior: Prior, settings: VariationalSettings) -> Inverse:
-    solver, whole = settings.strips, _band(prior)
+def _inverse(whole: torch.Tensor, prior: Prior, settings: VariationalSettings) -> Inverse:
+    solver, band = settings.strips, _band(prior)
     cut = strips(prior.mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
-    some = _grouped(cut, solver.solved_at_once)
-    roots = mapped(lambda part: _root(both, part), some)
-
-    def inverse(part: tuple[list[Strip], Factor], right: torch.Tensor) -> torch.Tensor:
-        members, root = part
-        band = Band(root.root.shape[-1] // 2, whole.columns)
-        rights = torch.stack([right[..., s.knots, :] for s in members], 1).to(root.root)
-        return band.solve(root, rights).to(right)
+    roots = factored(torch.stack([whole[:, :, :, strip.knots] for strip in cut]))
+    parts = list(zip(cut, roots, strict=True))
 
     def preconditioned(right: torch.Tensor) -> torch.Tensor:
         total = torch.zeros_like(right)
-        solved = mapped(lambda part: inverse(part, right), list(zip(some, roots, strict=True)))
-        for members, parts in zip(some, solved, strict=True):
-            for strip, part in zip(members, parts.unbind(1), strict=True):
-                total[..., strip.knots, :] += part
+        solved = mapped(lambda part: part[1].solve(right[..., part[0].knots, :]), parts)
+        for strip, solution in zip(cut, solved, strict=True):
+            total[..., strip.knots, :] += solution
         return total
 
     def solved_to(right: torch.Tensor, tolerance: float) -> torch.Tensor:
+        # a strong prior needs double precision, whatever the gradients are in
         return conjugate_gradients(
-            lambda c: whole.apply(both, c), right, preconditioned, tolerance, solver.steps
-        )
+            lambda c: band.apply(whole, c), right.to(whole), preconditioned, tolerance, solver.steps
+        ).to(right)
 
     return solved_to
-
-
-def _root(both: torch.Tensor, part: list[Strip]) -> Factor:
-    """Factor of the matrices of some strips, in single precision if there is one."""
-    forms = torch.stack([both[:, :, :, strip.knots] for strip in part])
-    band = Band(forms.shape[-3], forms.shape[-1])
-    # a preconditioner need not be exact
-    return in_single(band, forms) or band.factor(forms)
 
 
 def _before(mesh: Mesh, prior: Prior, settings: VariationalSettings) -> torch.Tensor:

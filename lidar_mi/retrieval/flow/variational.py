@@ -7,7 +7,6 @@ What else makes the images differ is estimated from what the fit leaves (`compon
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol
 
 import torch
 
@@ -15,51 +14,20 @@ from lidar_mi.flags import Flag
 from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
 from lidar_mi.retrieval.flow import direct, iterative, strips
 from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.flow.components import Response, differences, without_texture
+from lidar_mi.retrieval.flow.components import differences, without_texture
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
-from lidar_mi.retrieval.flow.likelihood import Linear, linearised, prepared
+from lidar_mi.retrieval.flow.likelihood import linearised, prepared
 from lidar_mi.retrieval.flow.line_offsets import LineOffsets, line_offsets
 from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
 from lidar_mi.retrieval.flow.noise_check import variance_by_coloured_noise
 from lidar_mi.retrieval.flow.other_motions import better_elsewhere
+from lidar_mi.retrieval.flow.posterior import Posterior, Solver
 from lidar_mi.retrieval.flow.prior import Prior, first_prior, refined
-from lidar_mi.retrieval.flow.prior_check import Fit, prior_check
+from lidar_mi.retrieval.flow.prior_check import prior_check
 from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.images.displacement import Displacement
 from lidar_mi.retrieval.images.quality import check_between
 from lidar_mi.retrieval.images.windows import Windows, image_pair, working
-
-
-class Posterior(Fit, Protocol):
-    """A flow after a Gauss-Newton step, with its distribution: what every solver gives."""
-
-    @property
-    def response(self) -> Response | None:
-        """Change of the coefficients by a gradient of the log-likelihood, if it is affordable."""
-
-    def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """By kind of motion: prior less posterior variance, and its square in the flow.
-
-        They are equal at the largest evidence (MacKay's fixed point).
-        """
-
-    def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of the flow (components, components, ...) at a mesh, after the images and before."""
-
-
-class Solver(Protocol):
-    """One Gauss-Newton step of the flow; the number of the iteration seeds random draws."""
-
-    def __call__(
-        self,
-        linear: Linear,
-        mesh: Mesh,
-        coefficients: torch.Tensor,
-        prior: Prior,
-        settings: VariationalSettings,
-        iteration: int,
-    ) -> Posterior:
-        """From the likelihood about the flow of these coefficients, on a mesh of the pixels."""
 
 
 def variational(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.fisher import fisher_matrix, standard_deviations
+from lidar_mi.retrieval.likelihood.scoring import fisher_matrix, standard_deviations
 from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, parameter_vector, pixel_waves
 from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
 

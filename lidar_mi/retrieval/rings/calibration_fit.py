@@ -21,7 +21,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import brentq
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.fisher import fisher_matrix
+from lidar_mi.retrieval.likelihood.scoring import fisher_matrix
 from lidar_mi.retrieval.rings.analysis import analyse_rings
 from lidar_mi.retrieval.rings.calibration import Calibration
 from lidar_mi.retrieval.rings.centre import gradient_centre

@@ -18,8 +18,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.likelihood.scoring import inverse_of
 
 OUTLIER = 6.0  # standard deviations of a cell
 ITERATIONS = 12
@@ -108,9 +110,7 @@ def _fitted(
     """Weighted least squares sector by sector: model, parameters, their errors for variance 1."""
     weighted = columns * weight[..., None]
     matrix = np.einsum("sqk,sql->skl", weighted, columns)
-    size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1e-300))
-    outer = size[:, :, None] * size[:, None, :]
-    inverse = np.linalg.pinv(matrix / outer, 1e-8, hermitian=True) / outer
+    inverse = inverse_of(torch.from_numpy(matrix), 1e-8).numpy()
     linear = np.einsum("skl,sql,sq->sk", inverse, weighted, value, optimize=True)
     std = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2), 0.0))
     return np.einsum("sqk,sk->sq", columns, linear), linear, std

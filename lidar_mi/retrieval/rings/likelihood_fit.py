@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.fisher import fisher_matrix, standard_deviations
+from lidar_mi.retrieval.likelihood.scoring import fisher_matrix, standard_deviations
 from lidar_mi.retrieval.rings.bound import free_names, prior_information
 from lidar_mi.retrieval.rings.cells import annular_sectors
 from lidar_mi.retrieval.rings.centre import gradient_centre

@@ -14,7 +14,7 @@ from functools import cached_property
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.fisher import fisher_matrix
+from lidar_mi.retrieval.likelihood.scoring import fisher_matrix
 from lidar_mi.retrieval.rings.bound import free_names, prior_information
 from lidar_mi.retrieval.rings.likelihood_fit import MISFIT, RingFit, annular_waves
 from lidar_mi.retrieval.rings.mean_image import Waves, mean_and_jacobian, reach

@@ -14,8 +14,10 @@ import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.likelihood.scoring import inverse_of
 from lidar_mi.retrieval.rings.alignment import ALL_AROUND, LEAST, shape_columns
 from lidar_mi.retrieval.rings.frames import inside
 from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
@@ -246,12 +248,9 @@ class _System:
         turned = self.columns.transpose(0, 2, 1)
         self.matrix, self.score = turned @ self.columns, (turned @ residual[..., None])[..., 0]
         whole = self.matrix.sum(0)
-        # px and orders differ by powers of ten: the pseudo-inverse needs a unit diagonal
-        size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-        self.inverse = np.linalg.pinv(whole / np.outer(size, size), 1e-10, hermitian=True)
-        self.inverse /= np.outer(size, size)
+        self.inverse = inverse_of(torch.from_numpy(whole), 1e-10).numpy()
         used = keep * root > 0
-        cells = used.sum() - 5 * used.any(1).sum() - len(size)
+        cells = used.sum() - 5 * used.any(1).sum() - len(whole)
         self.variance = float((residual**2).sum() / max(cells, 1))
         self.width = self._width()
 

@@ -1,8 +1,4 @@
-"""Fisher scoring of images of rings: the maximum of their likelihood, many images at once.
-
-Weighted least squares whose weights come from the mean of the step before. Where it has converged
-the score is 0, so that it *is* the maximum of the likelihood times the priors.
-"""
+"""Scoring of images of rings: the maximum of their likelihood, many images at once."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_mi.retrieval.fisher import Fits, Limits, fisher_matrix, scoring
+from lidar_mi.retrieval.likelihood.scoring import Fits, Limits, fisher_matrix, scoring
 from lidar_mi.retrieval.rings.bound import prior_information
 from lidar_mi.retrieval.rings.mean_image import Waves, mean_and_jacobian, reach
 from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
@@ -104,10 +100,6 @@ def _scoring(
     names: Sequence[str],
     number: int,
 ) -> Scored:
-    """Weighted least squares, the weights from the mean of the step before.
-
-    The fit that has converged is the maximum of the likelihood times the priors.
-    """
     fits = Fits("images", number, ("rings that the model describes", _FEWEST))
     columns = [PARAMETERS.index(name) for name in names]
     parameters = parameters.clone()

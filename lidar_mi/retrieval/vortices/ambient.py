@@ -18,6 +18,7 @@ from scipy.linalg import lapack
 from lidar_mi.retrieval.ground_winds.turbulence_covariance import correlations
 from lidar_mi.retrieval.images.band_limit import even_fast_len
 from lidar_mi.retrieval.images.windows import linear_weights, separable
+from lidar_mi.retrieval.likelihood.scoring import inverse_of
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
 GRADIENT = 0.1
@@ -224,7 +225,7 @@ def in_ambient_wind(
     # turbulence is that relative to the place of the pair, whose air the mean wind is
     here = blocks.at_pair(calm.parameters)
     # as the parameters follow: what they leave of stiffness and force
-    followed = _solve(normal, torch.cat([coupling, gradient[:, None]], 1))
+    followed = inverse_of(normal) @ torch.cat([coupling, gradient[:, None]], 1)
     free = stiffness - coupling.T @ followed[:, :-1]
     push = force - coupling.T @ followed[:, -1]
     variances = _variances(blocks, here, free, push)
@@ -238,7 +239,7 @@ def in_ambient_wind(
     absorbed = -explained[:, :-1].T
     reduced = normal + absorbed @ coupling.T
     reduced = (reduced + reduced.T) / 2
-    step = -_solve(reduced, gradient + absorbed @ force)
+    step = -inverse_of(reduced) @ (gradient + absorbed @ force)
     eddies = absorbed.T @ step - explained[:, -1]
 
     shaped = absorbed.view(len(columns), 2, *blocks.shape)
@@ -259,7 +260,7 @@ def in_ambient_wind(
         parameters=moved,
         misfit=misfit._replace(residual=misfit.valid * remains, jacobian=projected),
         weight=weight,
-        normal=reduced,
+        fisher=reduced,
     )
     lengths = variances.new_tensor(LENGTHS)
     return Ambient(
@@ -273,9 +274,8 @@ def in_ambient_wind(
 
 def ambient_errors(ambient: Ambient) -> AmbientErrors:
     """Errors of a fit by its ambient wind, and the test for a further vortex."""
-    (_, misfit, weight, normal, *_), known = ambient.solution, ambient.elimination
-    one = torch.eye(len(normal), dtype=torch.float64, device=normal.device)
-    inverse = _solve(normal, one)
+    (_, misfit, weight, fisher, *_), known = ambient.solution, ambient.elimination
+    inverse = inverse_of(fisher)
     of_pair = torch.tensordot(known.dt * inverse[:10].to(misfit.jacobian), misfit.jacobian, 1)
     response = torch.stack([of_pair * weight * part for part in misfit.slope], 1)
     if misfit.residual.ndim == 3:
@@ -483,14 +483,6 @@ def _before_relative(forces: torch.Tensor, here: torch.Tensor) -> torch.Tensor:
     """Forces (2 n, m) on winds in blocks, of forces on these less the wind at the pair."""
     parts = forces.unflatten(0, (2, -1))
     return (parts - here[:, None] * parts.sum(1, keepdim=True)).flatten(0, 1)
-
-
-def _solve(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """Solution with a symmetric matrix whose units differ by powers of ten."""
-    scale = matrix.diagonal().clamp(min=1e-300).rsqrt()
-    inverse = torch.linalg.pinv(matrix * scale * scale[:, None], hermitian=True)
-    inverse = inverse * scale * scale[:, None]
-    return inverse @ right
 
 
 # They depend on the grid alone and are stored for the next slabs.

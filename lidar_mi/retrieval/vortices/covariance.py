@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from lidar_mi.retrieval.images.windows import averaged
+from lidar_mi.retrieval.likelihood.scoring import inverse_of
 from lidar_mi.retrieval.vortices.ambient import ALONG, AmbientErrors
 from lidar_mi.retrieval.vortices.model_error import (
     ModelError,
@@ -12,7 +13,7 @@ from lidar_mi.retrieval.vortices.model_error import (
     of_change,
     spread_of,
 )
-from lidar_mi.retrieval.vortices.robust_fit import Solution
+from lidar_mi.retrieval.vortices.robust_fit import Solution, score_of
 
 # Width (px) of the Gaussian over which squared residuals are averaged.
 _NEAR = 12.0
@@ -49,7 +50,7 @@ def model_error_of(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
     # residuals lack the part of the departure that the parameters have followed
-    follow = (_responses(solution), _inverse(solution)) if before is not None else None
+    follow = (_responses(solution), inverse_of(solution.fisher)) if before is not None else None
 
     def of_forces(even: torch.Tensor | float, tested: bool) -> ModelError:
         change, response = None, follow and Response(*follow, even)
@@ -84,7 +85,7 @@ def parameter_covariance(
     spread = _noise_spread(solution, residual_error).double() * excess
     spread = spread + spread_of(_responses(solution), departure).double()
     # the sandwich: its errors hold although the weights are not the inverse covariance
-    inverse = _inverse(solution)
+    inverse = inverse_of(solution.fisher)
     covariance = (inverse @ spread @ inverse)[:10, :10] + ambient
     attenuation = _attenuation(solution)
     # a bias of unknown size: fully correlated between the parameters
@@ -147,13 +148,6 @@ def _neighbours(field: torch.Tensor, axis: int) -> list[torch.Tensor]:
     return [field.narrow(axis, first, number) for first in range(4)]
 
 
-def _inverse(solution: Solution) -> torch.Tensor:
-    # m^2/s and logarithms differ by powers of ten
-    scale = solution.normal.diagonal().sqrt()
-    inverse = torch.linalg.pinv(solution.normal / scale / scale[:, None], hermitian=True)
-    return inverse / scale / scale[:, None]
-
-
 def change_by_flow(solution: Solution, flow: torch.Tensor) -> np.ndarray:
     """Change (10,) of the parameters by a small flow that the model does not have.
 
@@ -165,8 +159,8 @@ def change_by_flow(solution: Solution, flow: torch.Tensor) -> np.ndarray:
     misfit = solution.misfit
     flow = flow if misfit.slope.ndim == 3 else flow[:, None]
     change = (misfit.slope * flow.to(misfit.slope)).sum(0)
-    force = misfit.jacobian.flatten(1) @ (solution.weight * change).flatten()
-    return (_inverse(solution) @ force.double())[:10].cpu().numpy()
+    score = score_of(misfit._replace(residual=change), solution.weight)
+    return -(inverse_of(solution.fisher) @ score)[:10].cpu().numpy()
 
 
 def _noise_spread(solution: Solution, error: ModelError) -> torch.Tensor:
@@ -187,19 +181,14 @@ def _noise_spread(solution: Solution, error: ModelError) -> torch.Tensor:
         (columns * (weight**2 * part).flatten()) @ columns.T
         for part in (misfit.variance, misfit.variance * ratio)
     )
-    scale = solution.normal.diagonal()
+    scale = solution.fisher.diagonal()
     excess = float((observed.diagonal() / scale).sum() / (stated.diagonal() / scale).sum())
     return observed if excess > 1 else stated
 
 
 def _remaining_step(solution: Solution) -> torch.Tensor:
     """The remaining step (10,) of a fit that interpolation noise has stopped."""
-    misfit, weight = solution.misfit, solution.weight
-    force = -misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()
-    force = force.double()
-    scale = solution.normal.diagonal().sqrt()
-    scaled = torch.linalg.pinv(solution.normal / scale / scale[:, None], hermitian=True)
-    return (scaled @ (force / scale) / scale)[:10]
+    return (inverse_of(solution.fisher) @ solution.score)[:10]
 
 
 def far_from_minimum(solution: Solution, covariance: np.ndarray) -> bool:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lidar_mi.retrieval.likelihood.scoring import inverse_of
 from lidar_mi.retrieval.vortices.acceptance import Limits, within
 from lidar_mi.retrieval.vortices.ambient import Ambient, AmbientWind, in_ambient_wind
 from lidar_mi.retrieval.vortices.covariance import model_error_of
@@ -166,7 +167,7 @@ def fit_near(
             return None
         # where air changes, the weights of the estimates below lead elsewhere
         if not close and (
-            _curvature_error(plain.normal, plain.parameters - theta, misfit, make)
+            _curvature_error(plain.fisher, plain.parameters - theta, misfit, make)
             > _CURVATURE_ERROR
         ):
             theta = plain.parameters
@@ -195,7 +196,7 @@ def fit_near(
             return None
         change = _change(white, ambient.wind) * make.dt
         far = float(change.square().mean().sqrt()) / min(make.spacing)
-        curved = _curvature_error(solution.normal, step, misfit, make)
+        curved = _curvature_error(solution.fisher, step, misfit, make)
         if far < _AMBIENT and curved < _CURVATURE_ERROR:
             error = model_error_of(ambient.solution, lags, changes=True)
             remaining = residual_after(misfit, step) + (misfit.slope * change).sum(0)
@@ -234,11 +235,8 @@ def _linear_power(misfit: Misfit, variance: float) -> float:
 def agrees(start: VortexPairFit, fit: VortexPairFit) -> bool:
     """Whether a fit agrees with the start within both errors."""
     off = fit.parameters - start.parameters
-    spread = fit.covariance + start.covariance
-    scale = np.sqrt(np.diagonal(spread))
-    inverse = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
-    square = float((off / scale) @ inverse @ (off / scale))
-    return square < _REJECTED**2 * len(off)
+    inverse = inverse_of(torch.as_tensor(fit.covariance + start.covariance)).numpy()
+    return float(off @ inverse @ off) < _REJECTED**2 * len(off)
 
 
 def _displacement_error(start: VortexPairFit, make: Builder) -> float:

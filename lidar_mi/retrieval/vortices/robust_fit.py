@@ -1,16 +1,16 @@
-"""Weighted nonlinear least squares with a bounded influence of outliers (Levenberg-Marquardt)."""
+"""Nonlinear least squares with a bounded influence of outliers (`likelihood.scoring`)."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 
+from lidar_mi.retrieval.likelihood.scoring import damped_scoring, damped_step, fisher_matrix
+
 # Residuals beyond so many standard deviations have the influence of those at it (Huber, 1964),
 # which loses 0.1 % of the information with normal noise.
 _HUBER = 3.0
-_LARGEST_DAMPING = 1e4
-# Squared standard errors from the minimum that a fit may stop at.
-_NEAR = 0.1
 
 
 class Misfit(NamedTuple):
@@ -40,14 +40,19 @@ class Misfit(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Result of a fit: parameters (p,), the misfit there, its weights, sum of w J J^T."""
+    """Result of a fit: parameters (p,), the misfit there, its weights, the Fisher matrix."""
 
     parameters: torch.Tensor
     misfit: Misfit
     weight: torch.Tensor
-    normal: torch.Tensor
+    fisher: torch.Tensor
     cost: float
     converged: bool
+
+    @property
+    def score(self) -> torch.Tensor:
+        """Sum of -w J r, (p,)."""
+        return score_of(self.misfit, self.weight)
 
 
 def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
@@ -59,11 +64,9 @@ def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
 
 def without_step(misfit: Misfit, flow_variance: float) -> torch.Tensor:
     """The residuals that a linear step to the minimum would leave."""
-    normal, force = _normal(misfit, weights(misfit, flow_variance))
-    step = _step(normal, force, 1e-6)
-    if step is None:
-        return misfit.residual
-    return residual_after(misfit, step)
+    weight = weights(misfit, flow_variance)
+    step = damped_step(_fisher(misfit, weight), score_of(misfit, weight))
+    return misfit.residual if step is None else residual_after(misfit, step)
 
 
 def residual_after(misfit: Misfit, step: torch.Tensor) -> torch.Tensor:
@@ -80,17 +83,16 @@ def stepped(
     step with the weights of the residuals before it and the first iteration's matrix.
     """
     weight = weights(misfit, flow_variance)
-    normal, force = _normal(misfit, weight)
-    step, remaining = torch.zeros_like(force), misfit
-    for iteration in range(iterations):
-        if iteration:
-            force = _force(remaining, weights(remaining, flow_variance))
-        correction = _step(normal, force, 1e-6)
+    fisher = _fisher(misfit, weight)
+    step, remaining = torch.zeros_like(fisher[0]), misfit
+    for _ in range(iterations):
+        correction = damped_step(fisher, score_of(remaining, weight))
         if correction is None:
             return None
         step = step + correction
         remaining = misfit._replace(residual=residual_after(misfit, step))
-    return _solution(parameters + step, remaining, flow_variance, True)
+        weight = weights(remaining, flow_variance)
+    return _solution(parameters + step, remaining, weight, True)
 
 
 def fit(
@@ -118,66 +120,38 @@ def fit(
     tolerance : float
         Stop at a step of so many standard errors, squared.
     """
-    damping = 1e-4
-    misfit = evaluate(parameters)
-    for _ in range(iterations):
-        weight = weights(misfit, flow_variance)
-        normal, force = _normal(misfit, weight)
-        while True:
-            step = _step(normal, force, damping)
-            if step is not None and allowed(parameters, step):
-                tried = evaluate(parameters + step)
-                # in squared standard errors; a damped step is short without being near
-                if float(step @ normal @ step) < tolerance and damping < 1:
-                    return _solution(parameters + step, tried, flow_variance, True)
-                # of the same residuals: others would change the cost by themselves
-                both = misfit.valid & tried.valid
-                before, after = (
-                    float((weight * m.residual.square())[both].sum()) for m in (misfit, tried)
-                )
-                # derivatives are approximate: a cost that rises by less than the noise is accepted
-                if after <= before + tolerance and bool(both.any()):
-                    break
-            damping = 8 * max(damping, 1e-4)
-            if damping > _LARGEST_DAMPING:
-                # no step lowers the cost: converged if the step would have been short
-                step = _step(normal, force, 1e-6)
-                near = step is not None and float(step @ normal @ step) < _NEAR
-                return _solution(parameters, misfit, flow_variance, near)
-        damping /= 8
-        parameters, misfit = parameters + step, tried
-    return _solution(parameters, misfit, flow_variance, False)
+
+    def at(parameters: torch.Tensor) -> Solution:
+        misfit = evaluate(parameters)
+        return _solution(parameters, misfit, weights(misfit, flow_variance), False)
+
+    def moved(last: Solution, step: torch.Tensor) -> Solution | None:
+        return at(last.parameters + step) if allowed(last.parameters, step) else None
+
+    def rise(last: Solution, tried: Solution) -> float:
+        # of the same residuals: others would change the cost by themselves
+        both = last.misfit.valid & tried.misfit.valid
+        before, after = (
+            float((last.weight * one.misfit.residual.square())[both].sum()) for one in (last, tried)
+        )
+        return after - before if bool(both.any()) else math.inf
+
+    solution, converged = damped_scoring(at(parameters), moved, rise, iterations, tolerance)
+    return solution._replace(converged=converged)
 
 
-def _normal(misfit: Misfit, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Sums of w J J^T and of -w J r."""
-    columns = misfit.jacobian.flatten(1)
-    weighted = columns * weight.flatten()
-    return (weighted @ columns.T).double(), _force(misfit, weight)
-
-
-def _force(misfit: Misfit, weight: torch.Tensor) -> torch.Tensor:
-    """Sum of -w J r."""
+def score_of(misfit: Misfit, weight: torch.Tensor) -> torch.Tensor:
+    """Sum of -w J r, (p,)."""
     return -(misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()).double()
 
 
-def _step(normal: torch.Tensor, force: torch.Tensor, damping: float) -> torch.Tensor | None:
-    diagonal = normal.diagonal()
-    if not bool((diagonal > 0).all()):
-        return None
-    # in proportion to the diagonal, as every parameter has a unit of its own (Marquardt)
-    root, info = torch.linalg.cholesky_ex(normal + damping * torch.diag(diagonal))
-    if int(info):
-        return None
-    step = torch.cholesky_solve(force[:, None], root)[:, 0]
-    return step if bool(torch.isfinite(step).all()) else None
+def _fisher(misfit: Misfit, weight: torch.Tensor) -> torch.Tensor:
+    return fisher_matrix(misfit.jacobian.flatten(1), weight.flatten()).double()
 
 
 def _solution(
-    parameters: torch.Tensor, misfit: Misfit, flow_variance: float, converged: bool
+    parameters: torch.Tensor, misfit: Misfit, weight: torch.Tensor, converged: bool
 ) -> Solution:
-    weight = weights(misfit, flow_variance)
-    normal, _ = _normal(misfit, weight)
     number = max(1, int(misfit.valid.sum()))
     cost = float((weight * misfit.residual.square()).sum()) / number
-    return Solution(parameters, misfit, weight, normal, cost, converged)
+    return Solution(parameters, misfit, weight, _fisher(misfit, weight), cost, converged)

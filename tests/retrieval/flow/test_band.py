@@ -3,11 +3,11 @@
 Detects a wrong block, shift or derivative.
 """
 
+import pytest
 import torch
 
 from lidar_mi.retrieval.flow.band import Band, form, spread
-from lidar_mi.retrieval.flow.band_cholesky import cholesky, solved_near
-from lidar_mi.retrieval.flow.block_banded import factor
+from lidar_mi.retrieval.flow.band_cholesky import cholesky, factored, solved_near
 from lidar_mi.retrieval.flow.direct import covariance_near
 from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
 
@@ -16,26 +16,6 @@ AXES = Axis(23, 4.0), Axis(38, 5.0)
 
 def pixels():
     return [torch.arange(axis.size, dtype=torch.float64) for axis in AXES]
-
-
-def test_block_banded_is_its_dense_matrix():
-    random = torch.Generator().manual_seed(1)
-    blocks, matrices, n = 6, 2, 5
-    dense = torch.zeros(matrices, blocks, n, blocks, n, dtype=torch.float64)
-    columns = torch.zeros(blocks, matrices, 3, n, n, dtype=torch.float64)
-    for k in range(blocks):
-        for j in range(min(3, blocks - k)):
-            part = torch.randn(matrices, n, n, generator=random, dtype=torch.float64)
-            part = part + part.mT + 30 * torch.eye(n) if j == 0 else part
-            columns[k, :, j] = part
-            dense[:, k + j, :, k] = part
-            dense[:, k, :, k + j] = part.mT
-    dense = dense.reshape(matrices, blocks * n, blocks * n)
-    root = factor(columns.flatten(2, 3))
-    right = torch.randn(blocks, matrices, n, 3, generator=random, dtype=torch.float64)
-    flat = right.movedim(0, 1).flatten(1, 2)
-    found = root.solve(right).movedim(0, 1).flatten(1, 2)
-    torch.testing.assert_close(found, torch.linalg.solve(dense, flat))
 
 
 def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
@@ -57,7 +37,6 @@ def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
     dense += 0.1 * torch.eye(len(dense), dtype=torch.float64)
     for a in (0, 1):
         band[a, a, 3, :, 0] += 0.1
-    root = knots.factor(band)
     inverse = torch.linalg.inv(dense).unflatten(0, (2, -1)).unflatten(2, (2, -1))
     places = torch.tensor([0.0, 3.3, 21.5]), torch.tensor([2.0, 17.7, 36.9, 37.0])
     few = Mesh(AXES, [place.double() for place in places])
@@ -68,8 +47,7 @@ def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
     )
     several = torch.stack([some, some.flip(-1), 2 * some])
     solved = torch.linalg.solve(dense, several.flatten(1).T).T
-    for found in (alone.solve(several), knots.solve(root, several)):
-        torch.testing.assert_close(found.flatten(1), solved)
+    torch.testing.assert_close(alone.solve(several).flatten(1), solved)
     products = knots.apply(band, several).flatten(1)
     torch.testing.assert_close(products, several.flatten(1) @ dense)
     of_band = spread(alone.covariance(), few)
@@ -79,16 +57,18 @@ def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
             torch.testing.assert_close(of_band[a, b], expected)
     # from the factor of another form, which is no longer asked for more than it is worth
     similar = cholesky(1.3 * band)
-    near = solved_near(similar, band + 0.2 * band * (band > 0), some, 1e-9, 100)
-    changed = knots.factor(band + 0.2 * band * (band > 0))
-    torch.testing.assert_close(near, knots.solve(changed, some[None])[0], rtol=1e-6, atol=1e-9)
-    assert solved_near(similar, band + 0.2 * band * (band > 0), some, 1e-9, 1) is None
+    changed = band + 0.2 * band * (band > 0)
+    near = solved_near(similar, changed, some, 1e-9, 100)
+    torch.testing.assert_close(near, cholesky(changed).solve(some), rtol=1e-6, atol=1e-9)
+    assert solved_near(similar, changed, some, 1e-9, 1) is None
 
 
 def test_a_form_that_is_not_positive_has_no_factor():
     mesh = Mesh(AXES, pixels())
     band = form(-torch.ones(2, 2, 23, 38, dtype=torch.float64), mesh)
     assert cholesky(band) is None
+    with pytest.raises(torch.linalg.LinAlgError, match="not positive definite"):
+        factored(band[None])
 
 
 def test_a_covariance_is_of_single_precision_only_where_that_suffices():

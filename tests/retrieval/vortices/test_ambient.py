@@ -121,7 +121,7 @@ def test_generalised_least_squares(monkeypatch):
     changed = (got.solution.parameters[:10] - found.parameters).numpy()
     stderr = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(changed[:8], step[:8], atol=2e-3 * stderr[:8].max())
-    inverse = torch.linalg.inv(got.solution.normal)
+    inverse = torch.linalg.inv(got.solution.fisher)
     np.testing.assert_allclose(inverse[:8, :8], covariance[:8, :8], rtol=5e-3, atol=1e-5)
     # noise and turbulence together are all of it
     flat = got.solution.misfit.jacobian.flatten(1)

@@ -68,7 +68,7 @@ def test_solution_is_the_m_estimator(outliers):
     assert found.converged
     np.testing.assert_allclose(found.parameters, expected.x, atol=1e-4)
     # the decay within 4 standard errors, which outliers of 40 would otherwise exceed
-    stderr = np.sqrt(np.diag(np.linalg.inv(found.normal.numpy())))
+    stderr = np.sqrt(np.diag(np.linalg.inv(found.fisher.numpy())))
     assert (np.abs(found.parameters.numpy() - [2.0, 1.2, 0.3]) < 4 * stderr).all()
 
 
@@ -79,7 +79,7 @@ def test_normal_matrix_and_cost_without_outliers():
     jacobian = found.misfit.jacobian.flatten(1).numpy()
     size = np.abs(found.misfit.residual.flatten().numpy()) / NOISE
     weighted = jacobian * np.minimum(1, 3 / size) / NOISE**2
-    np.testing.assert_allclose(found.normal, weighted @ jacobian.T, rtol=1e-9)
+    np.testing.assert_allclose(found.fisher, weighted @ jacobian.T, rtol=1e-9)
     assert found.cost == pytest.approx(1, abs=4 * np.sqrt(2 / X.size))
 
 

@@ -11,7 +11,14 @@ import torch
 from scipy.optimize import minimize
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.fisher import Fits, Limits, fisher_matrix, scoring, standard_deviations
+from lidar_mi.retrieval.likelihood.scoring import (
+    Fits,
+    Limits,
+    fisher_matrix,
+    inverse_of,
+    scoring,
+    standard_deviations,
+)
 
 FITS = Fits("counts", 5, ("a level", "steps that end"))
 X = torch.linspace(-1.0, 1.0, 40, dtype=torch.float64)
@@ -71,6 +78,8 @@ def test_deviations_of_units_far_apart_and_of_what_is_not_determined():
     scale = torch.tensor([1e-9, 1e7], dtype=torch.float64)
     found = standard_deviations((scale[:, None] * unit * scale)[None])[0]
     torch.testing.assert_close(found * scale, torch.full_like(scale, (4 / 3) ** 0.5))
+    inverse = inverse_of(scale[:, None] * unit * scale)
+    torch.testing.assert_close(scale[:, None] * inverse * scale, torch.linalg.inv(unit))
     twins = torch.ones(1, 2, 2, dtype=torch.float64)
     assert standard_deviations(twins).isnan().all()
 

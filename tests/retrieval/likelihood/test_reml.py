@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from lidar_mi.retrieval.reml import most_likely
+from lidar_mi.retrieval.likelihood.reml import most_likely
 
 UNLIMITED = np.array([np.inf, np.inf])
 

@@ -1,0 +1,1 @@
+"""One fit of a likelihood with priors: scoring, damped scoring, variance components."""
