@@ -42,6 +42,8 @@ _AROUND, _CLIPPED = 8.0, 4.0
 _ORDINATES, _LEAKED = 10, 2
 # Longest period, px, of which lines of one kind resolve the air.
 _THINNED = 4
+# Largest mean square of second differences between samples that are interpolated, over that at one.
+_BETWEEN = 0.5
 
 
 class Sampling(NamedTuple):
@@ -143,15 +145,14 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
         said += remarks
         known = [np.where(h, np.nan, v) for v, h in zip(values, hidden, strict=True)]
         for axis, name in enumerate(names):
-            period, phase = _period(known, axis, false_alarm)
+            period, start = _period(known, axis, false_alarm)
             if not period:
                 continue
             said.append(f"a period of {period:.3g} px along {name}")
-            whole = round(period)
-            if abs(period - whole) < 0.02 * whole and whole <= _THINNED:
-                steps[axis], first[axis] = whole, phase
-            else:
+            if start is None:
                 spoilt = True
+            else:
+                steps[axis], first[axis] = round(period), start
     if max(steps) == 1 and not spoilt:
         gridded = np.all([_gridded(r, ~h) for r, h in zip(ranks, hidden, strict=True)], 0)
         if gridded.any():
@@ -327,15 +328,20 @@ def _statistics(lines: np.ndarray) -> list[np.ndarray]:
     return means
 
 
-def _period(images: Sequence[np.ndarray], axis: int, false_alarm: float) -> tuple[float, int]:
-    """The longest period of the lines' statistics, px, 0 without one; and the line to begin with.
+def _period(
+    images: Sequence[np.ndarray], axis: int, false_alarm: float
+) -> tuple[float, int | None]:
+    """The longest period of the lines' statistics, px, 0 without one; and the first sample.
+
+    None: the lines of no kind are samples that resolve the air. Of longer periods than fields and
+    mosaics have, two lines, they are where lines between them are interpolated linearly.
 
     All that is periodic must be at rest: a lattice in the air is not.
     """
     lines = [np.moveaxis(v, axis, 0).reshape(v.shape[axis], -1) for v in images[:2]]
     size = len(lines[0]) - 2
     if size < LARGEST_PERIOD:
-        return 0.0, 0
+        return 0.0, None
     frequency = np.fft.rfftfreq(size)
     use = frequency >= 1 / LARGEST_PERIOD
     limit = false_alarm / use.sum() / 5 / images[0].ndim
@@ -355,20 +361,24 @@ def _period(images: Sequence[np.ndarray], axis: int, false_alarm: float) -> tupl
             continue
         off = np.abs(np.angle(one * np.conj(two)))
         if (off[strong] > np.maximum(3 / np.sqrt(ratio[strong]), 0.1)).any():
-            return 0.0, 0
+            return 0.0, None
         # the window spreads a peak over its neighbours
         peak = strong & (ratio == ndimage.maximum_filter1d(ratio, 2 * _LEAKED + 1))
         if peak.any():
             best = np.flatnonzero(peak)[0]
             periods.append((1 / _refined(one, best, size), pair[0] if number == 0 else None))
     if not periods:
-        return 0.0, 0
+        return 0.0, None
     period, energy = max(periods, key=lambda entry: entry[0])
     whole = round(period)
-    if energy is None or whole > _THINNED:
-        return period, 0
+    if abs(period - whole) > 0.02 * whole or whole > _THINNED:
+        return period, None
+    if energy is None:
+        return period, 0 if whole == 2 else None
     # between samples that are interpolated linearly there is no second difference
     means = [np.mean(energy[start::whole]) for start in range(whole)]
+    if whole > 2 and min(means) > _BETWEEN * max(means):
+        return period, None
     return period, (int(np.argmax(means)) + 1) % whole
 
 
