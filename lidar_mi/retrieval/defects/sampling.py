@@ -373,13 +373,18 @@ def _period(images: Sequence[np.ndarray], axis: int, false_alarm: float) -> tupl
 
 
 def _level(power: np.ndarray) -> np.ndarray:
-    """Of a periodogram about each ordinate: the larger of the means to both sides."""
+    """Of a periodogram about each ordinate: the larger of the means to both sides.
+
+    The one to the left next to the end: a periodogram that goes on beyond it, mirrored, would
+    repeat a peak there.
+    """
     reach = _ORDINATES + _LEAKED
-    wide = np.pad(power, reach, mode="reflect")
+    wide = np.pad(power, (reach, 0), mode="reflect")
     sums = np.cumsum(np.r_[0.0, wide])
     at = np.arange(len(power)) + reach
     left = sums[at - _LEAKED] - sums[at - reach]
-    right = sums[at + reach + 1] - sums[at + _LEAKED + 1]
+    right = np.zeros_like(left)
+    right[:-reach] = sums[2 * reach + 1 :] - sums[reach + _LEAKED + 1 : -_ORDINATES]
     return np.maximum(np.maximum(left, right) / _ORDINATES, 1e-300)
 
 
