@@ -107,7 +107,8 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
       phase in all images: interpolated (Gallagher 2005, Proc. Canadian Conf. Computer and Robot
       Vision, 65-72), interlaced, mosaics, blocks of a codec. Without one an ordinate of the
       periodogram over the mean of its neighbours has an F distribution (Fisher 1929, Proc. R. Soc.
-      Lond. A 125, 54-59). Lines of one kind are used alone where the period is whole and at most 4.
+      Lond. A 125, 54-59). Lines of one kind are used alone where the period is 2, or 3 or 4
+      and lines between them are interpolated linearly.
 
     Areas at an image's largest value are left to the test of saturation.
 
