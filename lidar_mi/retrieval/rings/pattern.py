@@ -338,10 +338,9 @@ def lines_at(profile: Profile, spacing: float, noise: float, most: int = LINES) 
         tried = sorted(
             map(profile.fitted, _starts(best, further, most)), key=lambda p: p.unexplained
         )
-        for candidate in tried:
-            if _plausible(candidate, profile, noise):
-                chosen = candidate
-                break
+        # three lines that were chosen stay where two are the start of others
+        better = (c for c in tried if c.unexplained < chosen.unexplained)
+        chosen = next((c for c in better if _plausible(c, profile, noise)), chosen)
         best = next((candidate for candidate in tried if len(candidate.fraction) < most), tried[0])
         further = profile.matched(best)
         if best.height.min() <= 0:

@@ -56,6 +56,14 @@ def test_components_that_cross_the_next_order(kind, splitting):
     check_frame(analyse_rings(image), fraction, splitting)
 
 
+@pytest.mark.parametrize("seed", [11, 13])
+def test_components_a_width_apart(seed):
+    """One wide line between two that do not exist explains the frame ten times worse."""
+    image, fraction = zeeman("three, unequal", 0.08, seed)
+    rings = analyse_rings(image)
+    np.testing.assert_allclose(np.sort(rings.fraction), np.sort(fraction), atol=5e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_zeeman_series(kind):
