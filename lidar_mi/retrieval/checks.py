@@ -26,10 +26,8 @@ def checked_stack(
     Where image 1 is not finite either, as outside of the beams of a resampled scan, unknown noise
     is replaced by the median, which has no effect.
 
-    Raises
-    ------
-    InputError
-        Naming image and axis: not an image, other dims, units, spacing, size or places.
+    Raises InputError: naming image and axis: not an image, other dims, units, spacing, size or
+    places.
     """
     stack = [checked_image(f"{name}{n}", image, axes) for n, image in enumerate(stack, 1)]
     others = {f"{name}{n}": image for n, image in enumerate(stack[1:], 2)}

@@ -29,19 +29,15 @@ def with_common_error(
 ) -> xr.Dataset:
     """Vectors whose stated errors include one that is common to all of them.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        From `lidar_mi.retrieval.wind.pair.retrieve_wind`.
-    stderr : float
-        Of v and of w, m/s: the standard error of the pointing between the scans (rad) times the
+    wind: from `lidar_mi.retrieval.wind.pair.retrieve_wind`.
+    stderr: of v and of w, m/s: the standard error of the pointing between the scans (rad) times the
         range over the time between the scans.
-    offset : {"known", "free"}
-        Whether a combination with other measurements may estimate the common error (free) or only
-        states it.
-    rotation : float
-        Standard error of the image's rotation about ``centre`` (y, z in m), rad/s: that of the
-        roll between the scans (rad) over the time between them.
+    offset {"known", "free"}: whether a combination with other measurements may estimate the common
+        error (free) or only states it.
+    rotation: standard error of the image's rotation about ``centre`` (y, z in m), rad/s: that of
+        the roll between the scans (rad) over the time between them.
+
+    Raises InputError: an error that is not a number of 0 or more.
 
     Returns
     -------
@@ -49,11 +45,6 @@ def with_common_error(
         With `v_common_stderr` and `w_common_stderr` (m s-1) and `rotation_common_stderr` (rad s-1),
         which are part of `v_stderr` and `w_stderr`, the correlation of both, and the errors of a
         fitted pair; attribute ``pointing_offset``.
-
-    Raises
-    ------
-    InputError
-        An error that is not a number of 0 or more.
     """
     for name, value, units in (("stderr", stderr, "m/s"), ("rotation", rotation, "rad/s")):
         if not 0 <= value < np.inf:

@@ -19,10 +19,7 @@ _DIVISOR: ContextVar[int] = ContextVar("divisor", default=1)
 def device_of(name: str | torch.device) -> torch.device:
     """The device of a name, of which `AUTO` is one.
 
-    Raises
-    ------
-    RuntimeError
-        No name of a device.
+    Raises RuntimeError: no name of a device.
     """
     if name == AUTO:
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -37,10 +34,7 @@ def divisor() -> int:
 def within_memory(compute: Callable[[], T]) -> T:
     """Result of a function, repeated with smaller tiles where the device's memory is full.
 
-    Raises
-    ------
-    InputError
-        The memory is full with the smallest tiles, too.
+    Raises InputError: the memory is full with the smallest tiles, too.
     """
     reason = ""
     for number in _DIVISORS:

@@ -38,17 +38,12 @@ _TIME_STEP = 0.5
 class Basis:
     """Principal components of a component of the wind in a plane, for turbulence of variance 1.
 
-    Attributes
-    ----------
-    component : {"v", "w"}
-    length, resolution, shape
-        Of `Statistics`.
-    axes : two ndarrays, shapes (ny,) and (nz,)
-        y and z of the lattice's nodes, m.
-    weights : ndarray, shape (nodes, states)
-        From covariances with the nodes to values per state.
-    variance, reach : ndarray, shape (states,)
-        Of each principal component, and its correlation length along the path, m.
+    component {"v", "w"}
+    length, resolution, shape: of `Statistics`.
+    axes (two ndarrays, shapes (ny,) and (nz,)): y and z of the lattice's nodes, m.
+    weights (nodes, states): from covariances with the nodes to values per state.
+    variance, reach (states,): of each principal component, and its correlation length along the
+        path, m.
     """
 
     component: str
@@ -133,18 +128,11 @@ def basis(
 class Observation:
     """How the vectors of a slab depend on the state, and their information on it.
 
-    Attributes
-    ----------
-    used : ndarray, shape (nz, ny)
-        Vectors over the lattice that are not rejected.
-    gain : ndarray, shape (states, used)
-        From the vectors to the information on the state, H' R^-1.
-    information : ndarray, shape (states, states)
-        H' R^-1 H.
-    forward : ndarray, shape (used, states)
-        H, from the state to the vectors.
-    precision : ndarray, shape (used, used)
-        R^-1, of the vectors' errors, (m/s)^-2.
+    used (nz, ny): vectors over the lattice that are not rejected.
+    gain (states, used): from the vectors to the information on the state, H' R^-1.
+    information (states, states): H' R^-1 H.
+    forward (used, states): H, from the state to the vectors.
+    precision (used, used): R^-1, of the vectors' errors, (m/s)^-2.
     """
 
     used: np.ndarray
@@ -194,18 +182,12 @@ def _forward(basis: Basis, places: bytes) -> np.ndarray:
 class PathField:
     """A component of the wind along the path, as known from all slabs.
 
-    Attributes
-    ----------
-    x, time : ndarray, shape (slabs,)
-        m, ascending, and s.
-    mean : ndarray, shape (slabs, states)
-    covariance : ndarray, shape (slabs, states, states)
-    cross : ndarray, shape (slabs - 1, states, states)
-        Covariance of each slab's state with that of the next one.
-    swept_speed : float
-        Rms speed at which eddies are swept past a place, m/s.
-    inflation : ndarray, shape (slabs,)
-        Factor of the variances about each slab, see `smoothed`.
+    x, time (slabs,): m, ascending, and s.
+    mean (slabs, states)
+    covariance (slabs, states, states)
+    cross (slabs - 1, states, states): covariance of each slab's state with that of the next one.
+    swept_speed: rms speed at which eddies are swept past a place, m/s.
+    inflation (slabs,): factor of the variances about each slab, see `smoothed`.
     """
 
     basis: Basis

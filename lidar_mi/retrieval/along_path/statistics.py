@@ -41,16 +41,10 @@ _WHITE = 0.03
 class Statistics:
     """Statistics of the air and of the vectors before a slab is observed.
 
-    Attributes
-    ----------
-    sigma, length : float
-        Rms of a component (m/s) and length (m) of von Karman's turbulence.
-    resolution : float
-        Standard deviation of the mean that a vector is, m.
-    scale : float
-        True over stated errors of the vectors.
-    shape : {"gaussian", "falling"}
-        Of the mean.
+    sigma, length: rms of a component (m/s) and length (m) of von Karman's turbulence.
+    resolution: standard deviation of the mean that a vector is, m.
+    scale: true over stated errors of the vectors.
+    shape {"gaussian", "falling"}: of the mean.
     """
 
     sigma: float

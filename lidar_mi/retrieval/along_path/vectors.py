@@ -22,20 +22,13 @@ _LEAST_INDEPENDENT = 1e-3
 class SlabVectors:
     """v and w of a slab on a grid of windows that do not overlap.
 
-    Attributes
-    ----------
-    y, z : ndarray, shapes (ny,) and (nz,)
-        m.
-    wind, stderr : ndarray, shape (2, nz, ny)
-        v and w, and the independent part of their standard errors, m/s; NaN where rejected.
-    window : float
-        Size of the windows, m: errors are correlated over it.
-    common : ndarray, shape (2,)
-        Standard error of v and w that all vectors of the slab share, m/s.
-    rotation : float
-        Standard error of a rotation of all vectors, rad/s.
-    centre : (float, float)
-        y and z about which they turn, m.
+    y, z (ndarray, shapes (ny,) and (nz,)): m.
+    wind, stderr (2, nz, ny): v and w, and the independent part of their standard errors, m/s; NaN
+        where rejected.
+    window: size of the windows, m: errors are correlated over it.
+    common (2,): standard error of v and w that all vectors of the slab share, m/s.
+    rotation: standard error of a rotation of all vectors, rad/s.
+    centre: y and z about which they turn, m.
     """
 
     y: np.ndarray
@@ -59,10 +52,7 @@ def counting(wind: xr.Dataset) -> xr.Dataset:
     Vectors between them add nearly no information, and their errors are not independent. `wind` is
     of `retrieve_wind` or `combine`; the result has an attribute `window` (m).
 
-    Raises
-    ------
-    InputError
-        No standard errors, or windows of unknown size.
+    Raises InputError: no standard errors, or windows of unknown size.
     """
     for name in ("v", "w", "v_stderr", "w_stderr", "flag"):
         if name not in wind:

@@ -47,10 +47,7 @@ def _eddies(length: float) -> tuple[np.ndarray, np.ndarray]:
 class Mean(NamedTuple):
     """A mean in the plane of y and z as a mixture of Gaussians.
 
-    Attributes
-    ----------
-    variance, weight : ndarray, shape (gaussians,)
-        Of each, m^2 along each axis, and its fraction.
+    variance, weight (gaussians,): of each, m^2 along each axis, and its fraction.
     """
 
     variance: np.ndarray
@@ -105,17 +102,11 @@ def covariance(
     deviations s_1 and s_2 in the plane of y and z multiply the spectrum by exp(-k^2 (s_1^2 +
     s_2^2)/2) there.
 
-    Parameters
-    ----------
-    component : {"u", "v", "w"}
-    x, y, z : array_like
-        From one place to the other, m; broadcast.
-    length : float
-        L, m.
-    mean : Mean
-        Of both winds together, see `mean_of`; default: they are not averaged.
-    swept : float
-        Variance along each axis of an unknown displacement of all air between both times, m^2.
+    component {"u", "v", "w"}
+    x, y, z: from one place to the other, m; broadcast.
+    length: L, m.
+    mean: of both winds together, see `mean_of`; default: they are not averaged.
+    swept: variance along each axis of an unknown displacement of all air between both times, m^2.
 
     Returns
     -------

@@ -32,10 +32,7 @@ def assumption_error(
     in front of the receiver and, by default, the model's middle temperature; ``by`` is in K, or a
     fraction. The ``free`` ones of `lidar_mi.retrieval.channels.model.PARAMETERS` are fitted.
 
-    Raises
-    ------
-    InputError
-        Numbers out of range, a parameter that is free.
+    Raises InputError: numbers out of range, a parameter that is free.
     """
     if assumed in free or assumed not in ("temperature", "aerosol"):
         raise InputError(f"assumed: {assumed!r} is not allowed; expected one that is not free")

@@ -22,11 +22,8 @@ def free_indices(
 ) -> tuple[list[int], torch.Tensor]:
     """Places of the free parameters in `PARAMETERS`, and the information of their priors.
 
-    Raises
-    ------
-    InputError
-        A name that the model does not have, v_los not among them, more unknowns than channels and
-        priors determine, a prior of what is not free.
+    Raises InputError: a name that the model does not have, v_los not among them, more unknowns than
+    channels and priors determine, a prior of what is not free.
     """
     for name in (*free, *prior):
         if name not in model.parameters:

@@ -37,20 +37,14 @@ SIGNIFICANT = 5.0  # standard deviations, the least signal
 class ChannelFit(NamedTuple):
     """Retrieved values, tensors of shape (images,), float64.
 
-    Attributes
-    ----------
-    v_los, v_los_std : torch.Tensor
-        m/s, positive toward the instrument; the standard deviation from the Fisher matrix, with
-        all other free parameters unknown.
-    level : torch.Tensor
-        Electrons of the light in front of the receiver.
-    temperature, aerosol : torch.Tensor
-        K and a fraction; where they are free. A fraction near 0 may come out below it.
-    std : torch.Tensor, shape (images, 4)
-        Standard deviations of all `PARAMETERS`; 0 where one was not free.
-    chi_square : torch.Tensor
-        Squared misfit over its expectation, 1 where model and noise are right; NaN where there are
-        no more channels than unknowns.
+    v_los, v_los_std: m/s, positive toward the instrument; the standard deviation from the Fisher
+        matrix, with all other free parameters unknown.
+    level: electrons of the light in front of the receiver.
+    temperature, aerosol: K and a fraction; where they are free. A fraction near 0 may come out
+        below it.
+    std (images, 4): standard deviations of all `PARAMETERS`; 0 where one was not free.
+    chi_square: squared misfit over its expectation, 1 where model and noise are right; NaN where
+        there are no more channels than unknowns.
     """
 
     v_los: torch.Tensor

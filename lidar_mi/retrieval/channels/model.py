@@ -31,29 +31,19 @@ class ChannelModel:
 
     Arrays and numbers are converted to tensors.
 
-    Parameters
-    ----------
-    molecules : tensor (temperatures, channels, K) or (channels, K), complex
-        M_n of each channel for each of the ``temperatures``, as fractions of the light.
-    aerosol : tensor (channels, K), complex
-        P_n.
-    period : float
-        Speed that moves the line by the period of the transmission, m/s.
-    temperatures : array (temperatures,)
-        K, ascending, a few nodes: harmonics between them follow the polynomial through all. One
-        node, or none given: the temperature is not a parameter.
-    background : tensor (channels,) or ()
-        Electrons of every channel that are not the laser's, known.
-    pixels : tensor (channels,) or ()
-        Pixels read out and added in every channel.
-    limits : (float, float), optional
-        Least and largest speed, m/s, between which the signals are those of one speed; default:
+    molecules (tensor (temperatures, channels, K) or (channels, K), complex): M_n of each channel
+        for each of the ``temperatures``, as fractions of the light.
+    aerosol (tensor (channels, K), complex): P_n.
+    period: speed that moves the line by the period of the transmission, m/s.
+    temperatures (temperatures,): K, ascending, a few nodes: harmonics between them follow the
+        polynomial through all. One node, or none given: the temperature is not a parameter.
+    background (tensor (channels,) or ()): electrons of every channel that are not the laser's,
+        known.
+    pixels (tensor (channels,) or ()): pixels read out and added in every channel.
+    limits: least and largest speed, m/s, between which the signals are those of one speed; default:
         half the period to either side.
 
-    Raises
-    ------
-    InputError
-        Shapes that do not belong together, numbers out of range.
+    Raises InputError: shapes that do not belong together, numbers out of range.
     """
 
     molecules: torch.Tensor

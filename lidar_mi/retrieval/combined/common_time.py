@@ -46,17 +46,10 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
     from the difference between vorticity of either sign, which has these errors as well. Noise also
     gives vorticity to air outside the vortices; its effect on c is added.
 
-    Parameters
-    ----------
-    crossflow : xr.Dataset, dims (z, y)
-        As for `lidar_mi.retrieval.combined.combine.combine`.
-    crossflow_std : float, optional
-        Standard error of v and w, m/s, in place of the data set's own.
+    crossflow (z, y): as for `lidar_mi.retrieval.combined.combine.combine`.
+    crossflow_std: standard error of v and w, m/s, in place of the data set's own.
 
-    Raises
-    ------
-    InputError
-        Fewer than three valid vectors side by side.
+    Raises InputError: fewer than three valid vectors side by side.
     """
     valid = (crossflow["flag"] == 0).transpose("z", "y").values
     v, w = (crossflow[n].transpose("z", "y").values.astype(float) for n in ("v", "w"))
@@ -160,29 +153,19 @@ def at_common_time(
     are read between the nodes by cubic splines; their standard errors, which
     correlate as windows overlap, linearly.
 
-    Parameters
-    ----------
-    crossflow : xr.Dataset, dims (z, y)
-        With `time`, s, of every vector.
-    scan : xr.Dataset, dim line
-        With `time`, s, of every line, from the same zero; absent: 0 for all.
-    time : float
-        s
-    drift : (float, float)
-        c along y and z, m/s.
-    drift_std : (float, float)
-        Its standard errors, m/s. Times time - t and the gradient of the wind they are an error of
-        every vector and line, which is added to the stated ones in quadrature.
+    crossflow (z, y): with `time`, s, of every vector.
+    scan (line): with `time`, s, of every line, from the same zero; absent: 0 for all.
+    time: s
+    drift: c along y and z, m/s.
+    drift_std: its standard errors, m/s. Times time - t and the gradient of the wind they are an
+        error of every vector and line, which is added to the stated ones in quadrature.
+
+    Raises InputError: numbers that are not finite, vectors without times.
 
     Returns
     -------
     crossflow, scan : xr.Dataset
         Vectors that come from beyond the images, or from next to flagged ones, are flagged.
-
-    Raises
-    ------
-    InputError
-        Numbers that are not finite, vectors without times.
     """
     if not any(drift) and not any(drift_std):
         return crossflow, scan

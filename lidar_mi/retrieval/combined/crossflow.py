@@ -48,10 +48,7 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
 
     With ``std``, vectors whose only flag is an unknown error are valid.
 
-    Raises
-    ------
-    InputError
-        No valid vector, or an error that is not known.
+    Raises InputError: no valid vector, or an error that is not known.
     """
     for name in ("v", "w", "flag"):
         if name not in wind:

@@ -22,11 +22,8 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
     Direction times wind: the platform's velocity along the line less the measured one, which is
     positive toward the instrument. That velocity is one for all lines, (axis), or each line's own.
 
-    Raises
-    ------
-    InputError
-        A variable is missing, has another shape, a direction is no unit vector, or a range is not
-        above 0.
+    Raises InputError: a variable is missing, has another shape, a direction is no unit vector, or a
+    range is not above 0.
     """
     for name in _NAMES:
         if name not in scan:
@@ -88,17 +85,11 @@ def solve_lines(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least squares for one wind measured along several lines, many times at once.
 
-    Parameters
-    ----------
-    directions : (n, k, 3) array
-        Unit vectors.
-    along : (n, k) array
-        Wind along them, m/s.
-    std : (n, k) array
-        Standard errors, m/s.
-    shared : (n, k, k) array, optional
-        Covariance of the errors of different lines, (m/s)^2, 0 on the diagonal. It is not used for
-        the wind, but enters its covariance.
+    directions (n, k, 3): unit vectors.
+    along (n, k): wind along them, m/s.
+    std (n, k): standard errors, m/s.
+    shared (n, k, k): covariance of the errors of different lines, (m/s)^2, 0 on the diagonal. It is
+        not used for the wind, but enters its covariance.
 
     Returns
     -------
@@ -142,23 +133,17 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     that their altitude is below a tenth of the median one's, both over their longest side, have no
     vector: at the rim of lines that are not on a grid they have errors of tens of lines.
 
-    Parameters
-    ----------
-    scan : xr.Dataset, dim line
-        `v_los`, `v_los_std`, `range`, `direction` (line, axis), `platform_velocity` (axis), as
-        from `lidar_mi.instrument.doppler_scan.scan_wind`; also `origin` (line, axis; m) and
-        `v_los_covariance` (line, other_line; m2 s-2) of errors common to lines.
+    scan (line): `v_los`, `v_los_std`, `range`, `direction` (line, axis), `platform_velocity`
+        (axis), as from `lidar_mi.instrument.doppler_scan.scan_wind`; also `origin` (line, axis; m)
+        and `v_los_covariance` (line, other_line; m2 s-2) of errors common to lines.
+
+    Raises InputError: fewer than three lines, all of them in one plane, a variable missing.
 
     Returns
     -------
     xr.Dataset, dim vector
         `u`, `v`, `w` (m s-1), their standard errors and correlations, `x`, `y`, `z` (m), `lines`
         (vector, corner), `flag` (bits of `VectorFlag`).
-
-    Raises
-    ------
-    InputError
-        Fewer than three lines, all of them in one plane, a variable missing.
     """
     along = wind_along_lines(scan)
     tangents = _tangents(scan)
@@ -190,17 +175,10 @@ def wind_from_neighbours(scan: xr.Dataset, count: int = 9) -> xr.Dataset:
     `misfit` (squared misfit over its degrees of freedom) is 1 then, and more where it is not. The
     standard errors contain the lines' noise only.
 
-    Parameters
-    ----------
-    scan : xr.Dataset
-        As for `wind_from_triples`; the result is the same, too.
-    count : int
-        Lines per vector, itself included: 3 or more.
+    scan: as for `wind_from_triples`; the result is the same, too.
+    count: lines per vector, itself included: 3 or more.
 
-    Raises
-    ------
-    InputError
-        As there; ``count`` less than 3 or more than there are.
+    Raises InputError: as there; ``count`` less than 3 or more than there are.
     """
     along = wind_along_lines(scan)
     tangents = _tangents(scan)

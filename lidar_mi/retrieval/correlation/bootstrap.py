@@ -102,24 +102,16 @@ def bootstrap_covariance(
     `clear`, as windows then pass the tests of texture by chance, and where the known motion is
     recovered in less than half of them.
 
-    Parameters
-    ----------
-    images : sequence of torch.Tensor, shape (z, y), or (x, z, y) of volumes
-        The two images.
-    displacement : Displacement
-        Retrieved from them.
-    retrieve : callable
-        (image1, image2, stride=...) -> Displacement, the method with its options.
-    centred : bool
-        Windows are deformed, and vectors belong to their centres, not half their displacement
+    images (shape (z, y), or (x, z, y) of volumes): the two images.
+    displacement: retrieved from them.
+    retrieve: (image1, image2, stride=...) -> Displacement, the method with its options.
+    centred: windows are deformed, and vectors belong to their centres, not half their displacement
         further on.
-    textured : torch.Tensor of bool, shape windows.count, optional
-        Windows whose errors count, as those of windows without texture say nothing of their
-        neighbours; default: all.
-    clear : torch.Tensor of bool, shape windows.count, optional
-        Windows that pass thresholds of texture half as high again; default: all.
-    noise : float or torch.Tensor, optional
-        Standard deviation of the images' noise. Where it is known of each pixel, the residual's
+    textured (shape windows.count): windows whose errors count, as those of windows without texture
+        say nothing of their neighbours; default: all.
+    clear (shape windows.count): windows that pass thresholds of texture half as high again;
+        default: all.
+    noise: standard deviation of the images' noise. Where it is known of each pixel, the residual's
         level and the errors are taken to vary as the residual does with it,
         `noise_map.variance_of_residual`.
 

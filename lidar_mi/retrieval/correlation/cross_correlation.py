@@ -52,10 +52,7 @@ def cross_correlation(
     Pixels are those of `windows.Windows`. Peaks below ``min_correlation`` are flagged; the
     algorithms are those of `correlate`. The `score` is the correlation at the integer peak.
 
-    Raises
-    ------
-    InputError
-        Sizes, algorithm or threshold out of range; images that differ in size.
+    Raises InputError: sizes, algorithm or threshold out of range; images that differ in size.
     """
     check_between("min_correlation", min_correlation, -1, 1)
     image_pair(image1, image2)
@@ -85,17 +82,14 @@ def correlate(
 ) -> torch.Tensor:
     """Normalised correlation of every template with all candidates of its search region.
 
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y)
-        Finite; the coefficient does not depend on their scale and offset.
-    template, search, stride : int
-        Pixels, see `windows.Windows`.
-    algorithm : {"auto", "dense", "fft"}
-        "dense" multiplies the whole images at each shift and sums over boxes: its cost does not
-        depend on the template and hardly on the stride. "fft" transforms each window: its cost
-        scales with the number of windows and hardly depends on the number of shifts. Both give the
-        same numbers; "auto" takes the cheaper one.
+    image1, image2 (z, y): finite; the coefficient does not depend on their scale and offset.
+    template, search, stride: pixels, see `windows.Windows`.
+    algorithm {"auto", "dense", "fft"}: "dense" multiplies the whole images at each shift and sums
+        over boxes: its cost does not depend on the template and hardly on the stride. "fft"
+        transforms each window: its cost scales with the number of windows and hardly depends on the
+        number of shifts. Both give the same numbers; "auto" takes the cheaper one.
+
+    Raises InputError: as `cross_correlation`.
 
     Returns
     -------
@@ -103,11 +97,6 @@ def correlate(
         Between -1 and 1; [p, q, i, j] belongs to the shift (p - lead, q - lead) px in (z, y) of
         window (i, j). Zero where template or candidate has no contrast beyond the rounding of
         the images' own numbers. All of it is held in memory; `cross_correlation` works by tiles.
-
-    Raises
-    ------
-    InputError
-        As `cross_correlation`.
     """
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)

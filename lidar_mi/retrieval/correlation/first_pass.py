@@ -27,13 +27,8 @@ _SMALLEST = 8
 class Grid(NamedTuple):
     """Places one pixel apart that contain the windows' centres: pixels, or half way between.
 
-    Attributes
-    ----------
-    shape : tuple of int
-    offset : float
-        Of the first place from the first pixel, 0 or 1/2 px.
-    like : torch.Tensor
-        Empty, of the type and device to work in.
+    offset: of the first place from the first pixel, 0 or 1/2 px.
+    like: empty, of the type and device to work in.
     """
 
     shape: tuple[int, ...]

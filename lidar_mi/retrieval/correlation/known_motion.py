@@ -21,13 +21,9 @@ _GAUSSIAN, _SQUARE = MultipassSettings().sigma, 12**-0.5
 class Advected(NamedTuple):
     """An image whose air has moved.
 
-    Attributes
-    ----------
-    image : torch.Tensor, shape (z, y), or (x, z, y) of a volume
-    slopes : torch.Tensor, shape (axes, ...)
-        Of the image at the places that its air came from, per px.
-    inside : torch.Tensor of bool
-        Where there is any air.
+    image (shape (z, y), or (x, z, y) of a volume)
+    slopes (axes, ...): of the image at the places that its air came from, per px.
+    inside: where there is any air.
     """
 
     image: torch.Tensor

@@ -57,24 +57,19 @@ def multipass(
     A Gaussian window with a standard deviation sigma of a third of the template weights the
     pixels; displacement that curves over it is underestimated by sigma^2 / 2 times its Laplacian.
 
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y), or (x, z, y) of volumes
-        On one device, where the result stays too.
-    template, search, stride : int
-        Pixels, see `windows.Windows`. The first pass covers displacements up to search - template -
-        1/2 px where an image is large enough for search regions of twice the size, else (and in
-        volumes) half of that.
-    min_correlation : float
-        Vectors whose deformed windows correlate less are flagged; -1 to 1.
-    noise : float or torch.Tensor, optional
-        Standard deviation of the images' white noise. A map does not weight the pixels; standard
+    image1, image2 (shape (z, y), or (x, z, y) of volumes): on one device, where the result stays
+        too.
+    template, search, stride: pixels, see `windows.Windows`. The first pass covers displacements up
+        to search - template - 1/2 px where an image is large enough for search regions of twice the
+        size, else (and in volumes) half of that.
+    min_correlation: vectors whose deformed windows correlate less are flagged; -1 to 1.
+    noise: standard deviation of the images' white noise. A map does not weight the pixels; standard
         errors are those of the mean in a window. Default: from the images' spectra.
-    settings : MultipassSettings, optional
-        Default: those of images or of volumes.
-    partly : bool
-        Whether windows that hold non-finite pixels have a displacement from the others, if these
-        are more than half of the weight. They are flagged all the same.
+    settings: default: those of images or of volumes.
+    partly: whether windows that hold non-finite pixels have a displacement from the others, if
+        these are more than half of the weight. They are flagged all the same.
+
+    Raises InputError: sizes, threshold or noise out of range; images that differ in size.
 
     Returns
     -------
@@ -83,11 +78,6 @@ def multipass(
         taken into account. `score` is the weighted correlation of the deformed windows. The
         covariance is from the images' noise, or the fit's residual where that is more, and from
         the displacement's curvature over the window.
-
-    Raises
-    ------
-    InputError
-        Sizes, threshold or noise out of range; images that differ in size.
     """
     check_between("min_correlation", min_correlation, -1, 1)
     image_pair(image1, image2, (2, 3))
@@ -155,11 +145,8 @@ def travelled(d: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
     middle. The series is cut after G^4, which leaves 0.1 % of that, and is not applied where
     |G| > 3/2.
 
-    Parameters
-    ----------
-    d : torch.Tensor, shape (components, ...)
-    gradient : torch.Tensor, shape (components, components, ...)
-        [i, j] is the derivative of component i along axis j.
+    d (components, ...)
+    gradient (components, components, ...): [i, j] is the derivative of component i along axis j.
     """
     g = gradient.flatten(2).permute(2, 0, 1)
     chord = d.flatten(1).T[..., None]

@@ -28,33 +28,23 @@ def median_outliers(
     A vector's difference to the median of its neighbours, over the median of the neighbours' own
     differences plus `epsilon`; all components together must not exceed `threshold`.
 
-    Parameters
-    ----------
-    d : torch.Tensor, shape (components, ...)
-        Displacements in pixels; NaN where there is none.
-    size : int
-        Neighbourhood of `size` vectors along each axis, 3 or 5.
-    spacing : int
-        Vectors from one neighbour to the next. Vectors whose windows nearly coincide have common
-        errors, which the test does not detect: it expects windows to overlap by half or less.
-    threshold : float
-        2 in the paper.
-    epsilon : float
-        Expected noise of a displacement, px.
-    continued : bool
-        Beyond the rim the field is continued by point reflection. Else only the neighbours inside
-        are used; most of them lie on one side, which rejects the rim in a shear of more than 0.2
-        px per neighbour.
+    d (components, ...): displacements in pixels; NaN where there is none.
+    size: neighbourhood of `size` vectors along each axis, 3 or 5.
+    spacing: vectors from one neighbour to the next. Vectors whose windows nearly coincide have
+        common errors, which the test does not detect: it expects windows to overlap by half or
+        less.
+    threshold: 2 in the paper.
+    epsilon: expected noise of a displacement, px.
+    continued: beyond the rim the field is continued by point reflection. Else only the neighbours
+        inside are used; most of them lie on one side, which rejects the rim in a shear of more than
+        0.2 px per neighbour.
+
+    Raises InputError: size not 3 or 5; spacing below 1; threshold or epsilon not positive.
 
     Returns
     -------
     torch.Tensor of bool
         False also where the vector or all but two of its neighbours are missing.
-
-    Raises
-    ------
-    InputError
-        size not 3 or 5; spacing below 1; threshold or epsilon not positive.
     """
     if size not in (3, 5):
         raise InputError(f"median_size: {size!r} is not 3 or 5")

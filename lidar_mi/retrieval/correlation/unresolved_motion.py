@@ -18,20 +18,12 @@ from lidar_mi.retrieval.images.windows import Windows, averaged, linear_weights,
 class Residuals(NamedTuple):
     """Differences of images matched by vectors, of the given pair and of one of known motion.
 
-    Attributes
-    ----------
-    given : torch.Tensor, shape (z, y), or (x, z, y) of volumes
-        Image 2 less image 1 advected by its vectors.
-    added : torch.Tensor
-        What the image of known motion has in addition to that motion.
-    known : torch.Tensor
-        That image less image 1 advected by the vectors from it.
-    level : torch.Tensor
-        Rms of `given` around.
-    slopes : torch.Tensor, shape (axes, ...)
-        Of image 1 advected by the vectors of the given pair.
-    use : torch.Tensor of bool
-        Pixels that are known, between valid vectors.
+    given (shape (z, y), or (x, z, y) of volumes): image 2 less image 1 advected by its vectors.
+    added: what the image of known motion has in addition to that motion.
+    known: that image less image 1 advected by the vectors from it.
+    level: rms of `given` around.
+    slopes (axes, ...): of image 1 advected by the vectors of the given pair.
+    use: pixels that are known, between valid vectors.
     """
 
     given: torch.Tensor
@@ -45,14 +37,9 @@ class Residuals(NamedTuple):
 class Motion(NamedTuple):
     """The known motion on pixels, and its averages over windows.
 
-    Attributes
-    ----------
-    within : torch.Tensor, shape (axes, ...)
-        The wind less its mean over a window, px.
-    response : float
-        Part of it that vectors lack: 1 if they are means over windows, 0 if they follow it.
-    by_errors : torch.Tensor, shape (axes, ...)
-        The vectors' random errors less their mean over a window, px.
+    within (axes, ...): the wind less its mean over a window, px.
+    response: part of it that vectors lack: 1 if they are means over windows, 0 if they follow it.
+    by_errors (axes, ...): the vectors' random errors less their mean over a window, px.
     """
 
     within: torch.Tensor
@@ -63,12 +50,8 @@ class Motion(NamedTuple):
 class Unresolved(NamedTuple):
     """Displacement that the vectors lack, and the leverage of the images' differences.
 
-    Attributes
-    ----------
-    covariance : torch.Tensor, shape (axes, axes, *windows.count)
-        Of that displacement, px^2.
-    leverage : float
-        Variance of differences of the images over that of their residuals, 1 or more.
+    covariance (axes, axes, *windows.count): of that displacement, px^2.
+    leverage: variance of differences of the images over that of their residuals, 1 or more.
     """
 
     covariance: torch.Tensor
@@ -98,17 +81,12 @@ def unresolved(
     not vary with the slopes. b >= 1, as the first window has removed what a second would remove. k
     is the visible fraction, see `_visible`.
 
-    Parameters
-    ----------
-    windows : Windows
-        Of the vectors.
-    valid : torch.Tensor of bool, shape windows.count
-    width : float
-        Standard deviation of the local means, px.
-    centred : bool
-        Whether windows are deformed, see `known_motion.of_windows`.
-    fewest : float
-        Windows that do not overlap from which anything is estimated: of fewer, M and no leverage.
+    windows: of the vectors.
+    valid (shape windows.count)
+    width: standard deviation of the local means, px.
+    centred: whether windows are deformed, see `known_motion.of_windows`.
+    fewest: windows that do not overlap from which anything is estimated: of fewer, M and no
+        leverage.
     """
     use, slopes = residuals.use, residuals.slopes
     lost = motion.response * motion.within

@@ -37,10 +37,7 @@ def weight_shift(
     positive weight; pixels are those of `windows.Windows`. The `score` is the mismatch sqrt(J) of
     the best candidate.
 
-    Raises
-    ------
-    InputError
-        Sizes out of range; images that differ in size.
+    Raises InputError: sizes out of range; images that differ in size.
     """
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)

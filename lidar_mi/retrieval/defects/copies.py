@@ -42,13 +42,9 @@ _CLIPPED = 4.0
 class Copy(NamedTuple):
     """What of the difference of two images, warped to mid-time, is a copy at rest.
 
-    Attributes
-    ----------
-    fraction, stderr : float
-        Of the other image's structure in image 2 (> 0) or in image 1 (< 0), after the flow has
-        taken its part, and its standard error from the scatter over the images.
-    degrees : int
-        Of freedom of that.
+    fraction, stderr: of the other image's structure in image 2 (> 0) or in image 1 (< 0), after the
+        flow has taken its part, and its standard error from the scatter over the images.
+    degrees: of freedom of that.
     """
 
     fraction: float = 0.0
@@ -104,13 +100,8 @@ def copy_at_rest(
     (White 1980, Econometrica 48, 817-838). Where they differ by more than `_UNLIKE` standard
     errors, the directed one counts alone. To second order in d over the size of the structure.
 
-    Parameters
-    ----------
-    images : sequence of torch.Tensor, shape (z, y) or (x, z, y)
-        Two.
-    displacement : Displacement
-        A field fitted to the images as a whole.
-    windows : Windows
+    images (shape (z, y) or (x, z, y)): two.
+    displacement: a field fitted to the images as a whole.
     """
     difference, mean, known, d = residual(images[:2], displacement, windows)
     dims = windows.dims
@@ -168,17 +159,10 @@ def without_copy(
 
     A copy of fraction a is subtracted and the fit repeated, until none is left.
 
-    Parameters
-    ----------
-    estimate : callable
-        From two images to the field.
-    displacement : Displacement
-        Of the images as they are.
-    images : sequence of torch.Tensor, shape (z, y) or (x, z, y)
-        Two.
-    windows : Windows
-    field : callable
-        From vectors to those by which images are warped.
+    estimate: from two images to the field.
+    displacement: of the images as they are.
+    images (shape (z, y) or (x, z, y)): two.
+    field: from vectors to those by which images are warped.
 
     Returns
     -------

@@ -30,12 +30,8 @@ _UNLIKE = 0.4
 class Standing(NamedTuple):
     """The fraction by which a pattern at rest makes displacements too small.
 
-    Attributes
-    ----------
-    fraction : float
-        0 where no pattern was detected.
-    stderr : float
-        From the scatter over the images.
+    fraction: 0 where no pattern was detected.
+    stderr: from the scatter over the images.
     """
 
     fraction: float = 0.0
@@ -49,10 +45,7 @@ class Standing(NamedTuple):
     def corrected(self, displacement: Displacement) -> Displacement:
         """Displacements without their bias, and with its uncertainty.
 
-        Parameters
-        ----------
-        displacement : Displacement
-            With a covariance.
+        displacement: with a covariance.
         """
         if not self.fraction or self.spoils or displacement.covariance is None:
             return displacement
@@ -89,14 +82,8 @@ def standing(
     ratio counts if it exceeds its standard error, from the scatter of the blocks, by Student's t
     at the rate of false alarms, and 0.015.
 
-    Parameters
-    ----------
-    images : sequence of torch.Tensor, shape (z, y)
-        The first two of them count. Of volumes none is found.
-    displacement : Displacement
-        A field fitted to the images as a whole.
-    windows : Windows
-    false_alarm : float
+    images (z, y): the first two of them count. Of volumes none is found.
+    displacement: a field fitted to the images as a whole.
     """
     if windows.dims > 2:
         return Standing()

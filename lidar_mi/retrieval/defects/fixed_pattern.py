@@ -45,14 +45,9 @@ _LEFT = 0.1, 0.16
 class FixedPattern(NamedTuple):
     """What is at rest all over the images.
 
-    Attributes
-    ----------
-    gain : torch.Tensor, shape broadcast to (z, y)
-        Of columns and rows, 1 where there is none.
-    columns, rows, pixels : float
-        Standard deviation of the gains; 0 where no pattern was detected.
-    spoils : bool
-        What is not removed is strong enough to make errors larger than stated.
+    gain (shape broadcast to (z, y)): of columns and rows, 1 where there is none.
+    columns, rows, pixels: standard deviation of the gains; 0 where no pattern was detected.
+    spoils: what is not removed is strong enough to make errors larger than stated.
     """
 
     gain: torch.Tensor
@@ -72,13 +67,8 @@ class FixedPattern(NamedTuple):
     ) -> "FixedPattern":
         """The pattern with that of the pixels of images from which this one is `removed`.
 
-        Parameters
-        ----------
-        images : sequence of torch.Tensor, shape (z, y)
-            The first two of them count.
-        d : torch.Tensor, shape (2, z, y)
-            The motion, px.
-        false_alarm : float
+        images (z, y): the first two of them count.
+        d (2, z, y): the motion, px.
         """
         relative = [_relative(image) for image in images[:2]]
         pixels = _pixels(relative, d, false_alarm)
@@ -108,12 +98,7 @@ def fixed_pattern(
     of the profiles. Motion and gains are estimated iteratively. Gains that are alike over more
     than the local mean are not found.
 
-    Parameters
-    ----------
-    images : sequence of torch.Tensor, shape (z, y)
-        The first two of them count.
-    windows : Windows
-    false_alarm : float
+    images (z, y): the first two of them count.
     """
     images = images[:2]
     relative = [_relative(image) for image in images]

@@ -29,11 +29,7 @@ def illumination(
     of its slopes against the scatter of the blocks exceeds what the rate of false alarms allows,
     and where it explains 0.3 of their variance. A factor alone is left to the methods.
 
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y)
-        Brightness, not below 0.
-    false_alarm : float
+    image1, image2 (z, y): brightness, not below 0.
 
     Returns
     -------

@@ -13,15 +13,9 @@ from lidar_mi.retrieval.images.windows import Windows, working
 class CleanImages(NamedTuple):
     """Two or more images, as they are and without their defects; tensors (z, y).
 
-    Attributes
-    ----------
-    raw : list of torch.Tensor
-    defects : AtRest
-        Pixels and gains that do not move with the air.
-    gains : list of torch.Tensor
-        Illumination of each image over that of the first.
-    filled : list of torch.Tensor
-        At the illumination of the first, smooth values in place of defects.
+    defects: pixels and gains that do not move with the air.
+    gains: illumination of each image over that of the first.
+    filled: at the illumination of the first, smooth values in place of defects.
     """
 
     raw: list[torch.Tensor]

@@ -47,18 +47,11 @@ _SOFT = 1.5
 class AtRest(NamedTuple):
     """What does not move with the air, in all images or in one; bool in the images' shape.
 
-    Attributes
-    ----------
-    clipped : torch.Tensor
-        Saturated pixels, of each image.
-    saturated : torch.Tensor
-        Areas of them of at least half a template, see `saturation.saturated_areas`.
-    structure : torch.Tensor
-        That of `at_rest`.
-    stray : torch.Tensor
-        Pixels of each image that no other has anything of, see `at_rest`.
-    pattern : FixedPattern
-        All over the images, without these pixels.
+    clipped: saturated pixels, of each image.
+    saturated: areas of them of at least half a template, see `saturation.saturated_areas`.
+    structure: that of `at_rest`.
+    stray: pixels of each image that no other has anything of, see `at_rest`.
+    pattern: all over the images, without these pixels.
     """
 
     clipped: torch.Tensor
@@ -96,15 +89,9 @@ class AtRest(NamedTuple):
     ) -> torch.Tensor:
         """The flags of vectors, with the reasons by their names.
 
-        Parameters
-        ----------
-        displacement : Displacement
-        images : sequence of torch.Tensor
-            As they are.
-        windows : Windows
-        masked : bool
-            Whether the vectors are from `masked` images. If not, pixels where the template lies in
-            image 2 count as well, and saturated areas count in all of the search region.
+        images: as they are.
+        masked: whether the vectors are from `masked` images. If not, pixels where the template lies
+            in image 2 count as well, and saturated areas count in all of the search region.
         """
         flag = displacement.flag
         bad = non_finite(images, windows)
@@ -194,10 +181,7 @@ def at_rest(
     place stands out. Bright air that stands still
     amid moving air counts as structure at rest.
 
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y)
-    windows : Windows
+    image1, image2 (z, y)
 
     Returns
     -------

@@ -49,18 +49,12 @@ _BETWEEN = 0.5
 class Sampling(NamedTuple):
     """Structure of the sampling of two or more images.
 
-    Attributes
-    ----------
-    hidden : torch.Tensor of bool, shape (images, ...)
-        Pixels that show no air, or that of another image.
-    spoilt : bool
-        Nothing tells the air from the sampling.
-    steps, first : tuple of int
-        Along each axis, so many pixels are one sample, or one of each kind; the first of them.
-    middle : tuple of float
-        From its first pixel to the place of a sample, px.
-    said : str
-        By name, with the period; empty: none.
+    hidden (images, ...): pixels that show no air, or that of another image.
+    spoilt: nothing tells the air from the sampling.
+    steps, first: along each axis, so many pixels are one sample, or one of each kind; the first of
+        them.
+    middle: from its first pixel to the place of a sample, px.
+    said: by name, with the period; empty: none.
     """
 
     hidden: torch.Tensor
@@ -112,10 +106,7 @@ def sampling(images: Sequence[torch.Tensor], false_alarm: float = FALSE_ALARM) -
 
     Areas at an image's largest value are left to the test of saturation.
 
-    Parameters
-    ----------
-    images : sequence of torch.Tensor, shape (z, y) or (x, z, y)
-    false_alarm : float
+    images (shape (z, y) or (x, z, y))
     """
     values = [image.detach().cpu().numpy() for image in images]
     names = "xzy"[-values[0].ndim :]

@@ -24,10 +24,7 @@ def saturated(image: torch.Tensor, false_alarm: float = FALSE_ALARM) -> torch.Te
     An image of which half has the largest value is not saturated but empty. Pixels that saturated
     and were then corrected, each by a gain of its own, differ and are not found.
 
-    Parameters
-    ----------
-    image : torch.Tensor, shape (z, y), or (x, z, y) of a volume
-    false_alarm : float
+    image (shape (z, y), or (x, z, y) of a volume)
 
     Returns
     -------
@@ -50,11 +47,7 @@ def saturated_areas(clipped: torch.Tensor, windows: Windows) -> torch.Tensor:
     They are saturated in all images, or in one that no other has a saturated pixel for within the
     search. The remainder is texture that is cut off at its brightest spots.
 
-    Parameters
-    ----------
-    clipped : torch.Tensor of bool, shape (images, ...)
-        `saturated` pixels of each image.
-    windows : Windows
+    clipped (images, ...): `saturated` pixels of each image.
 
     Returns
     -------

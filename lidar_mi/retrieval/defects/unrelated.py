@@ -58,16 +58,9 @@ def unrelated(
     count as unrelated. Windows unrelated over less than half a region (24 px with windows of 8
     px) may count as related.
 
-    Parameters
-    ----------
-    images : sequence of torch.Tensor, shape (z, y), or (x, z, y) of volumes
-        The first two of them are used.
-    windows : Windows
-    wide : bool
-        Whether the displacement may be twice that of the windows, as in `coarse_windows`.
-    noise : float or torch.Tensor, optional
-        Standard deviation of the images' white noise; default: from their spectra.
-    false_alarm : float
+    images (shape (z, y), or (x, z, y) of volumes): the first two of them are used.
+    wide: whether the displacement may be twice that of the windows, as in `coarse_windows`.
+    noise: standard deviation of the images' white noise; default: from their spectra.
 
     Returns
     -------

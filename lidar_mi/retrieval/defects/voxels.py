@@ -24,11 +24,7 @@ def outstanding(volume: torch.Tensor, false_alarm: float = FALSE_ALARM) -> torch
     the air is of such voxels. A cluster is found up to 12 voxels among the 26. Corners of constant
     areas of 3^3 voxels, as saturated ones, do not stand out.
 
-    Parameters
-    ----------
-    volume : torch.Tensor, shape (x, z, y)
-        Not finite where nothing is known.
-    false_alarm : float
+    volume (x, z, y): not finite where nothing is known.
 
     Returns
     -------

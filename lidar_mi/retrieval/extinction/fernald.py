@@ -36,35 +36,25 @@ def fernald(
         b(r) = Z / (Z_c / b_c + 2 S_p int_r^r_c Z dr'),
         Z = r^2 P exp(2 (S_p - S_m) int_r^r_c b_m dr').
 
-    Parameters
-    ----------
-    signal : (ranges,) array
-        Signal P of each range with background subtracted and corrected for overlap, above 0, in any
-        unit.
-    ranges : (ranges,) array
-        m, ascending.
-    molecular_backscatter : (ranges,) array or float
-        b_m, m^-1 sr^-1, 0 or more.
-    lidar_ratio : float
-        S_p, sr.
-    reference_backscatter : float
-        Backscatter of particles at the reference range, m^-1 sr^-1; 0: molecules alone.
-    reference : int
-        Index of the reference range; default: the farthest, from which the solution is stable.
-    molecular_lidar_ratio : float
-        S_m, sr.
+    signal (ranges,): signal P of each range with background subtracted and corrected for overlap,
+        above 0, in any unit.
+    ranges (ranges,): m, ascending.
+    molecular_backscatter (ranges,): b_m, m^-1 sr^-1, 0 or more.
+    lidar_ratio: S_p, sr.
+    reference_backscatter: backscatter of particles at the reference range, m^-1 sr^-1; 0: molecules
+        alone.
+    reference: index of the reference range; default: the farthest, from which the solution is
+        stable.
+    molecular_lidar_ratio: S_m, sr.
+
+    Raises InputError: ranges that do not ascend, signal or lidar ratios not above 0, backscatter
+    below 0, or none at the reference range, an index out of range.
 
     Returns
     -------
     (ranges,) array
         Extinction S_p (b - b_m) of particles, m^-1: noise may make it negative. Infinite beyond the
         range at which an outward solution diverges.
-
-    Raises
-    ------
-    InputError
-        Ranges that do not ascend, signal or lidar ratios not above 0, backscatter below 0, or
-        none at the reference range, an index out of range.
 
     Notes
     -----

@@ -21,12 +21,8 @@ from lidar_mi.retrieval.threads import mapped
 class BandCholesky:
     """Lower Cholesky factor of a form, in the form's precision.
 
-    Attributes
-    ----------
-    lower : ndarray, shape (1 + bandwidth, coefficients)
-        Diagonals of the factor, as LAPACK's pbtrf stores them.
-    rows, columns : int
-        Knots along z and y.
+    lower (1 + bandwidth, coefficients): diagonals of the factor, as LAPACK's pbtrf stores them.
+    rows, columns: knots along z and y.
     """
 
     lower: np.ndarray
@@ -167,17 +163,11 @@ def solved_near(
 ) -> torch.Tensor | None:
     """Solution for a form near that of a factor, by conjugate gradients from that of the factor.
 
-    Parameters
-    ----------
-    root : BandCholesky
-        Of a similar form: the preconditioner.
-    form : torch.Tensor
-        A band (2, 2, 7, Z, 4, Y); products with it are in the factor's precision.
-    right : torch.Tensor, shape (2, Z, Y)
-    left : float
-        Of the right hand side, how much the residual may be.
-    most : int
-        Products with the form; None if these leave more.
+    root: of a similar form: the preconditioner.
+    form: a band (2, 2, 7, Z, 4, Y); products with it are in the factor's precision.
+    right (2, Z, Y)
+    left: of the right hand side, how much the residual may be.
+    most: products with the form; None if these leave more.
     """
     kind = root.lower.dtype
     lower = packed(form).astype(kind, copy=False)

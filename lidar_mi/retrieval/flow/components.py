@@ -59,16 +59,12 @@ _LEAST_MOTION = 0.015
 class Differences:
     """The model of the differences of images, with its amplitudes.
 
-    Attributes
-    ----------
-    images : Images
-        With the filter and the weights by which the noise is white.
-    unresolved : torch.Tensor, shape (...)
-        Variance of a component of the motion that the splines do not resolve, px^2.
-    amplitudes : mapping of str to float
-        Variance of each component over that of its unit: of the noise per squared intensity,
-        2 (1 - c) / c of a fraction 1 - c^2 of the texture that is replaced, px^2 of motion through
-        the plane, fraction of the variance that the prior's spectrum has beyond the splines.
+    images: with the filter and the weights by which the noise is white.
+    unresolved (...): variance of a component of the motion that the splines do not resolve, px^2.
+    amplitudes: variance of each component over that of its unit: of the noise per squared
+        intensity, 2 (1 - c) / c of a fraction 1 - c^2 of the texture that is replaced, px^2 of
+        motion through the plane, fraction of the variance that the prior's spectrum has beyond the
+        splines.
     """
 
     images: Images
@@ -99,18 +95,11 @@ def differences(
     What differs from the sum of the components by place, and by wavenumber, multiplies it: the
     variance of the ratio, less that of its sampling, says how freely (`_shrunk`).
 
-    Parameters
-    ----------
-    linear : Linear
-        Of the images, about the flow.
-    mesh : Mesh
-        Of the pixels.
-    coefficients : torch.Tensor
-        Of the flow.
-    template : int
-        px; half of it is the width over which amplitudes vary with the images.
-    response : callable, optional
-        See `Response`. Without it nothing counts as absorbed: in volumes it is 2 to 10 %.
+    linear: of the images, about the flow.
+    mesh: of the pixels.
+    coefficients: of the flow.
+    template: px; half of it is the width over which amplitudes vary with the images.
+    response: see `Response`. Without it nothing counts as absorbed: in volumes it is 2 to 10 %.
     """
     valid, spline = linear.valid, images.spline
     width = 0.5 * template
@@ -255,13 +244,9 @@ def without_texture(images: Images, template: int) -> torch.Tensor:
     is below that in most of what stands out of noise within two templates, and all where that holds
     of most: what the flow is elsewhere depends on the prior.
 
-    Parameters
-    ----------
-    images : Images
-        As prepared, with the noise as given or estimated. Not filtered: after the filter the least
-        rounding may be as large as the texture.
-    template : int
-        px, twice the standard deviation of the Gaussian mean of the tensor.
+    images: as prepared, with the noise as given or estimated. Not filtered: after the filter the
+        least rounding may be as large as the texture.
+    template: px, twice the standard deviation of the Gaussian mean of the tensor.
     """
     valid = images.usable.all(0)
     slopes = torch.gradient(finite(working(images.stack)), dim=(1, 2))

@@ -19,12 +19,8 @@ from lidar_mi.retrieval.flow.flow_spline import REACH
 class Round(NamedTuple):
     """Blocks eliminated at once: A[o, o] = L L^T of each, coupled to one before and one behind.
 
-    Attributes
-    ----------
-    root : torch.Tensor, shape (blocks, m, m)
-        L, lower triangular.
-    before, behind : torch.Tensor, shape (blocks, m, m)
-        L^-1 A[o, o - 1] and L^-1 A[o, o + 1]; 0 behind the last one.
+    root (blocks, m, m): L, lower triangular.
+    before, behind (blocks, m, m): L^-1 A[o, o - 1] and L^-1 A[o, o + 1]; 0 behind the last one.
     """
 
     root: torch.Tensor
@@ -35,10 +31,7 @@ class Round(NamedTuple):
 class CyclicFactor(NamedTuple):
     """Factor of one form, on the form's device.
 
-    Attributes
-    ----------
-    last : torch.Tensor, shape (1, m, m)
-        Lower Cholesky factor of the block that is left.
+    last (1, m, m): lower Cholesky factor of the block that is left.
     """
 
     rounds: list[Round]
@@ -164,10 +157,7 @@ def _merged(even: torch.Tensor, odd: torch.Tensor) -> torch.Tensor:
 def _blocks_of(columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Diagonal blocks of three knots along y each (blocks, ..., m, m), and those below.
 
-    Parameters
-    ----------
-    columns : torch.Tensor, shape (knots y, ..., 4 n, n)
-        Of `Band.columns_of`. Knots beyond the last one are 1.
+    columns (knots y, ..., 4 n, n): of `Band.columns_of`. Knots beyond the last one are 1.
     """
     n, knots, batch = columns.shape[-1], len(columns), columns.shape[1:-2]
     number = -(-knots // REACH)

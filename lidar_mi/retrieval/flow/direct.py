@@ -31,13 +31,9 @@ _MOST_PRODUCTS = 12
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, and the factor of the posterior's precision there.
 
-    Attributes
-    ----------
-    coefficients : torch.Tensor, shape (2, Z, Y)
-    whole, stiff : torch.Tensor, shape (2, 2, 7, Z, 4, Y)
-        That precision, and the prior's part of it: bands.
-    root, before : Root
-        Of both.
+    coefficients (2, Z, Y)
+    whole, stiff (2, 2, 7, Z, 4, Y): that precision, and the prior's part of it: bands.
+    root, before: of both.
     """
 
     coefficients: torch.Tensor

@@ -22,18 +22,13 @@ Linearly = Callable[[torch.Tensor], torch.Tensor]
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, with the terms of its posterior.
 
-    Attributes
-    ----------
-    curvature : torch.Tensor, shape (components, components, *prior.mesh.shape)
-        The information of the volumes, lumped to the prior's mesh.
-    single : Prior
-        The same in the precision of the voxels, which is enough for draws.
-    iteration : int
-        Seeds the draws.
-    informed : callable
-        The information of every voxel times coefficients (n, components, knots).
-    response : None
-        See `variational.Posterior`: of volumes it would take a solution for every random field.
+    curvature (components, components, *prior.mesh.shape): the information of the volumes, lumped to
+        the prior's mesh.
+    single: the same in the precision of the voxels, which is enough for draws.
+    iteration: seeds the draws.
+    informed: the information of every voxel times coefficients (n, components, knots).
+    response: see `variational.Posterior`: of volumes it would take a solution for every random
+        field.
     """
 
     coefficients: torch.Tensor

@@ -35,36 +35,21 @@ _FRACTION_WIDTH = 1.5
 class Images(NamedTuple):
     """The images that the flow is fitted to, and their noise.
 
-    Attributes
-    ----------
-    spline : Spline
-        Of the images for their differences, whose noise is white.
-    smooth : Spline
-        Of the images for their slopes, see `band_limit.Filter`.
-    usable : torch.Tensor of bool, shape (images, ...)
-        Away from non-finite pixels.
-    time : torch.Tensor, shape (images,)
-        From mid-time, in units of dt.
-    noise : float
-        Standard deviation of the images' white noise.
-    weight : torch.Tensor, shape of an image
-        Inverse-variance weight: mean variance of the noise over its own at each pixel.
-    given_weight : torch.Tensor, shape of an image
-        The same by the noise as given.
-    stack : torch.Tensor, shape (images, ...)
-        The images, with normalised intensity.
-    blur : float
-        Standard deviation of the Gaussian that blurred the images, px.
-    known_noise : float
-        The noise that was given; 0 if none was.
-    chosen : Filter
-        Of the images.
-    noise_known : bool
-        Whether that is the noise; else it is a lower limit.
-    noise_updated : bool
-        Whether noise and weight are those of `components.differences`.
-    all_usable : bool
-        Whether all pixels are usable.
+    spline: of the images for their differences, whose noise is white.
+    smooth: of the images for their slopes, see `band_limit.Filter`.
+    usable (images, ...): away from non-finite pixels.
+    time (images,): from mid-time, in units of dt.
+    noise: standard deviation of the images' white noise.
+    weight (shape of an image): inverse-variance weight: mean variance of the noise over its own at
+        each pixel.
+    given_weight (shape of an image): the same by the noise as given.
+    stack (images, ...): the images, with normalised intensity.
+    blur: standard deviation of the Gaussian that blurred the images, px.
+    known_noise: the noise that was given; 0 if none was.
+    chosen: of the images.
+    noise_known: whether that is the noise; else it is a lower limit.
+    noise_updated: whether noise and weight are those of `components.differences`.
+    all_usable: whether all pixels are usable.
     """
 
     spline: Spline
@@ -111,24 +96,15 @@ class Images(NamedTuple):
 class Linear(NamedTuple):
     """The log-likelihood linearised about a flow.
 
-    Attributes
-    ----------
-    slope : torch.Tensor, shape (components, ...)
-        The likeliest slopes of the air, mean of the warped images.
-    gradient : torch.Tensor, shape (components, ...)
-        Of the log-likelihood with respect to the flow at each pixel.
-    weight : torch.Tensor
-        Of the products of slopes in the information.
-    variance : float or torch.Tensor, shape ()
-        Of the noise.
-    smooth : torch.Tensor, shape (images, ...)
-        The images at mid-time, equal in brightness, after the filter of their slopes.
-    warped : torch.Tensor, shape (images, ...)
-        The same after that of their differences.
-    valid : torch.Tensor of bool
-        Where all of them are.
-    regular : torch.Tensor
-        Factor by which residuals count less in the fit, 1 but for outliers (Huber).
+    slope (components, ...): the likeliest slopes of the air, mean of the warped images.
+    gradient (components, ...): of the log-likelihood with respect to the flow at each pixel.
+    weight: of the products of slopes in the information.
+    variance (): of the noise.
+    smooth (images, ...): the images at mid-time, equal in brightness, after the filter of their
+        slopes.
+    warped (images, ...): the same after that of their differences.
+    valid: where all of them are.
+    regular: factor by which residuals count less in the fit, 1 but for outliers (Huber).
     """
 
     slope: torch.Tensor

@@ -32,22 +32,13 @@ _NAMES = "rows", "columns"
 class LineOffsets(NamedTuple):
     """Offsets of lines of two images, in units of the normalised images.
 
-    Attributes
-    ----------
-    axes : tuple of int
-        0: rows, 1: columns.
-    values : torch.Tensor, shape (lines,)
-        Of all rows of image 1, then of image 2; then of the columns.
-    flows : torch.Tensor, shape (n, components, knots)
-        Independent errors of the flow by those of the offsets.
-    images : list of torch.Tensor, shape (z, y)
-        Normalised, without the offsets.
-    fits : int
-        From which they were estimated in turn.
-    change : float
-        By the last one, rms over the standard errors.
-    suspected : bool
-        Whether the images that were fitted last look as if their lines had offsets.
+    axes: 0: rows, 1: columns.
+    values (lines,): of all rows of image 1, then of image 2; then of the columns.
+    flows (n, components, knots): independent errors of the flow by those of the offsets.
+    images (z, y): normalised, without the offsets.
+    fits: from which they were estimated in turn.
+    change: by the last one, rms over the standard errors.
+    suspected: whether the images that were fitted last look as if their lines had offsets.
     """
 
     axes: tuple[int, ...]

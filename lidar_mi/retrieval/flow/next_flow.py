@@ -48,29 +48,17 @@ _MISFIT, _ENERGY = 1.5, 2.0
 class Flow:
     """A retrieved flow, and what the retrieval of the next images of such air may start from.
 
-    Attributes
-    ----------
-    coefficients : torch.Tensor, shape (2, knots z, knots y)
-        Displacement in dt, px.
-    prior : Prior
-        Of largest evidence in a retrieval from scratch.
-    energy : float
-        Of the flow then, in the prior's units.
-    before : torch.Tensor, shape (2, 2, *windows.count)
-        Covariance of the flow a priori, px^2.
-    additional : torch.Tensor, shape (2, 2, *windows.count)
-        Covariance in addition to the posterior's, px^2: of motion that the splines do not resolve
-        (`components.differences`).
-    factor : torch.Tensor, shape (*windows.count)
-        Of the posterior covariance, by the error of the prior (`prior_check`).
-    images : Images
-        Their filter and noise.
-    local : torch.Tensor, shape (z, y)
-        Weight of each pixel by its misfit, over that by its noise as given.
-    misfit : float
-        Mean square of the residuals then, over that of the noise.
-    offset : (float, float)
-        Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
+    coefficients (2, knots z, knots y): displacement in dt, px.
+    prior: of largest evidence in a retrieval from scratch.
+    energy: of the flow then, in the prior's units.
+    before (2, 2, *windows.count): covariance of the flow a priori, px^2.
+    additional (2, 2, *windows.count): covariance in addition to the posterior's, px^2: of motion
+        that the splines do not resolve (`components.differences`).
+    factor (*windows.count): of the posterior covariance, by the error of the prior (`prior_check`).
+    images: their filter and noise.
+    local (z, y): weight of each pixel by its misfit, over that by its noise as given.
+    misfit: mean square of the residuals then, over that of the noise.
+    offset: along z and y, px: how far what was learnt of places (the prior's strength, `before`,
         `additional`, `factor`, `local`) has moved since.
     """
 
@@ -92,14 +80,9 @@ class Flow:
     ) -> "Flow":
         """The flow expected where its structure has moved and changed.
 
-        Parameters
-        ----------
-        shift : (float, float)
-            Along z and y, px; edges continue beyond.
-        change : torch.Tensor, shape (2, z, y)
-            Of the flow after this shift, px in dt, as by a model of both.
-        offset : (float, float), optional
-            See `Flow`. Default: the last one and the shift.
+        shift: along z and y, px; edges continue beyond.
+        change (2, z, y): of the flow after this shift, px in dt, as by a model of both.
+        offset: see `Flow`. Default: the last one and the shift.
         """
         axes, like = self.prior.mesh.axes, self.coefficients
         pixels = _of_pixels(axes, self.windows, like)
@@ -159,24 +142,14 @@ def flow_of(
 class ExpectedFlow:
     """The next flow before its second image is there; see `expected_flow`.
 
-    Attributes
-    ----------
-    start, placed : Flow
-        As expected, and with what was learnt where it is now.
-    mesh : Mesh
-        Of the pixels, in single precision.
-    images : Images
-        Of the first image alone.
-    places : torch.Tensor, shape (2, images, z, y)
-        Of the air at the pixels at mid-time in both images, px.
-    first : tuple of torch.Tensor, shape (1, z, y)
-        Value and slopes of the first image there.
-    root : Root
-        Factor of the precision of the flow, by the information that the first image shows.
-    covariance : torch.Tensor, shape (2, 2, *windows.count)
-        Of the flow by it, px^2.
-    information : torch.Tensor, shape (z, y)
-        On both components, see `information_near`.
+    start, placed: as expected, and with what was learnt where it is now.
+    mesh: of the pixels, in single precision.
+    images: of the first image alone.
+    places (2, images, z, y): of the air at the pixels at mid-time in both images, px.
+    first (1, z, y): value and slopes of the first image there.
+    root: factor of the precision of the flow, by the information that the first image shows.
+    covariance (2, 2, *windows.count): of the flow by it, px^2.
+    information (z, y): on both components, see `information_near`.
     """
 
     start: Flow
@@ -225,15 +198,9 @@ def next_flow(
     Filter, noise, weights and prior are those learnt from scratch; the errors follow the misfit.
     Images are read in single precision: places to 1e-5 px.
 
-    Parameters
-    ----------
-    start : Flow or ExpectedFlow
-        The expected one, or what was made of it and of the first image before.
-    stack : sequence of torch.Tensor, shape (z, y)
-        Two images of the windows' size.
-    noise : float or torch.Tensor, optional
-    min_correlation : float
-        As `variational` takes them.
+    start: the expected one, or what was made of it and of the first image before.
+    stack (z, y): two images of the windows' size.
+    min_correlation: as `variational` takes them.
     """
     ready = start if isinstance(start, ExpectedFlow) else expected_flow(start, stack[0], noise)
     start, placed, mesh = ready.start, ready.placed, ready.mesh

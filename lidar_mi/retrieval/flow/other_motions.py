@@ -43,15 +43,9 @@ def better_elsewhere(
     beside the flow are excluded with the certainty above: a pattern that repeats. Where texture is
     weak, they are not.
 
-    Parameters
-    ----------
-    images : Images
-        Two.
-    linear : Linear
-        Their likelihood about the flow.
-    d : torch.Tensor, shape (2, *windows.count)
-        The flow at the windows' centres, px.
-    windows : Windows
+    images: two.
+    linear: their likelihood about the flow.
+    d (2, *windows.count): the flow at the windows' centres, px.
     """
     size, step = windows.template, max(windows.stride, windows.template // 2)
     frame = Windows(windows.shape, size, windows.search, step)

@@ -82,16 +82,11 @@ DIVERGENT: dict[int, tuple[tuple[int, int], ...]] = {2: ((1, 0), (3, 2)), 3: ()}
 class Prior(NamedTuple):
     """Each kind of motion is white noise of variance 1 / strength.
 
-    Attributes
-    ----------
-    local : torch.Tensor, shape (kinds, *mesh.shape)
-        Strength of each kind; the same from place to place but for a factor.
-    mesh : Mesh
-        At half the spacing of the knots.
-    width : float
-        Over which the strength may vary, px.
-    spacing : tuple of float
-        Of the pixels along each axis, in any unit: rates are those in space.
+    local (kinds, *mesh.shape): strength of each kind; the same from place to place but for a
+        factor.
+    mesh: at half the spacing of the knots.
+    width: over which the strength may vary, px.
+    spacing: of the pixels along each axis, in any unit: rates are those in space.
     """
 
     local: torch.Tensor
@@ -184,10 +179,8 @@ class Prior(NamedTuple):
         from all places. Divergence is as likely as in a plane of isotropic turbulence before the
         images: `VariationalSettings.ratio`, known as from `VariationalSettings.modes` motions.
 
-        Parameters
-        ----------
-        informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
-            Of each kind of motion: prior less posterior variance, and its square in the flow.
+        informed, energy (kinds, *mesh.shape): of each kind of motion: prior less posterior
+            variance, and its square in the flow.
         """
         known, square = (self.local * self.cell * part for part in (informed, energy))
         around = self._number_around()
@@ -238,12 +231,8 @@ def _gamma_mean(known: torch.Tensor, square: torch.Tensor) -> torch.Tensor:
     (a + n / 2) / (b + S / 2), and a and b are those of the largest marginal likelihood (empirical
     Bayes; Berger 1985, Statistical Decision Theory, sect. 4.5).
 
-    Parameters
-    ----------
-    known : torch.Tensor
-        Motions n about each place that the images determine.
-    square : torch.Tensor
-        Sum S of their squares.
+    known: motions n about each place that the images determine.
+    square: sum S of their squares.
     """
     half, energy = (part.reshape(1, -1).float() / 2 for part in (known, square))
     energy = energy.clamp(min=1e-30)

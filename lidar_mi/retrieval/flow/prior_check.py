@@ -27,14 +27,9 @@ _FIRST_SEED = 11
 class PriorCheck(NamedTuple):
     """How wrong a prior is, and how much of the posterior variance is its.
 
-    Attributes
-    ----------
-    ratio : float
-        Mean square of the prior's bias over the one that it expects, of the whole image.
-    fraction : torch.Tensor, shape (*prior.mesh.shape)
-        Of the posterior variance, that of the bias as expected.
-    mesh : Mesh
-        That of the prior.
+    ratio: mean square of the prior's bias over the one that it expects, of the whole image.
+    fraction (*prior.mesh.shape): of the posterior variance, that of the bias as expected.
+    mesh: that of the prior.
     """
 
     ratio: float

@@ -44,18 +44,12 @@ class Candidate:
 class Detection:
     """Result of the matched filters of a scan.
 
-    Attributes
-    ----------
-    score : float
-        Largest normalised amplitude of all filters at all places.
-    false_alarm : float
-        Probability of such a score somewhere in a scan of turbulence and noise without a wake.
-    probability : float
-        Of a wake, if before the scan it is 1/2 and every place is equally likely.
-    candidates : list of Candidate
-        Starts of a fit, best first.
-    air : Air
-        Turbulence, from the windows' median.
+    score: largest normalised amplitude of all filters at all places.
+    false_alarm: probability of such a score somewhere in a scan of turbulence and noise without a
+        wake.
+    probability: of a wake, if before the scan it is 1/2 and every place is equally likely.
+    candidates: starts of a fit, best first.
+    air: turbulence, from the windows' median.
     """
 
     score: float
@@ -69,15 +63,10 @@ class Detection:
 class _Windows:
     """Windows around places of a scan, of cells in rows across the lines.
 
-    Attributes
-    ----------
-    offsets : (columns,) array
-        Of the gates from the middle, m.
-    values, usable : (windows, cells) arrays
-    centre, angle : (windows,) arrays
-        Of the middle, m and rad.
-    noise : (windows,) array
-        Mean variance of a cell, (m/s)^2.
+    offsets (columns,): of the gates from the middle, m.
+    values, usable (windows, cells)
+    centre, angle (windows,): of the middle, m and rad.
+    noise (windows,): mean variance of a cell, (m/s)^2.
     """
 
     offsets: np.ndarray

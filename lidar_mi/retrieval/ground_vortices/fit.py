@@ -43,13 +43,9 @@ _LEAST_TURBULENCE, _MOST_TURBULENCE = 0.01, 5.0  # m/s
 class Assumptions:
     """What a fit assumes.
 
-    Attributes
-    ----------
-    model : {"lamb_oseen", "burnham_hallock"}
-    ground : float, optional
-        Height of the ground above the lidar, m; None: no images.
-    core_radius : float
-        Likely core radius, m.
+    model {"lamb_oseen", "burnham_hallock"}
+    ground: height of the ground above the lidar, m; None: no images.
+    core_radius: likely core radius, m.
     """
 
     model: Model = "lamb_oseen"
@@ -69,16 +65,10 @@ class Air:
 class State:
     """What a fit determines.
 
-    Attributes
-    ----------
-    vortices : (n, 4) array
-        `OF_VORTEX`.
-    departures : (n, 2) array
-        Of their motion along y and z from induction and mean wind, m/s.
-    other_profile : (1,) array
-        Fraction of the other profile in that of both.
-    wind : (terms,) array
-        Polynomial in height.
+    vortices (n, 4): `OF_VORTEX`.
+    departures (n, 2): of their motion along y and z from induction and mean wind, m/s.
+    other_profile (1,): fraction of the other profile in that of both.
+    wind (terms,): polynomial in height.
     """
 
     vortices: np.ndarray
@@ -108,19 +98,12 @@ class State:
 class Fit:
     """A state at a time with its errors.
 
-    Attributes
-    ----------
-    covariance : (numbers, numbers) array
-    time, reference : float
-        s after the scan's start, and height (m) that the wind's polynomial is about.
-    air : Air
-        The likeliest turbulence.
-    misfit : float
-        Normalised square of the residuals and of the departures from the prior.
-    dof : int
-        Cells less numbers that the scan alone determines.
-    log_likelihood : float
-        Restricted, of the likeliest turbulence.
+    covariance (numbers, numbers)
+    time, reference: s after the scan's start, and height (m) that the wind's polynomial is about.
+    air: the likeliest turbulence.
+    misfit: normalised square of the residuals and of the departures from the prior.
+    dof: cells less numbers that the scan alone determines.
+    log_likelihood: restricted, of the likeliest turbulence.
     """
 
     state: State
@@ -191,12 +174,9 @@ def residuals(window: Window, fit: Fit, assumed: Assumptions) -> np.ndarray:
 class Problem:
     """The velocities of a window as a function of a state, and how likely they are.
 
-    Attributes
-    ----------
-    time, reference : float
-        At which the vortices are where the state says, s, and height (m) of the wind's polynomial.
-    uneven : (n, n) array or 0
-        Covariance of the swirl's departure from round vortices, (m/s)^2.
+    time, reference: at which the vortices are where the state says, s, and height (m) of the wind's
+        polynomial.
+    uneven (n, n): covariance of the swirl's departure from round vortices, (m/s)^2.
     """
 
     window: Window

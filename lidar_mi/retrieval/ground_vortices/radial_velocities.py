@@ -23,12 +23,8 @@ def by_radial_velocities(
 ) -> np.ndarray | None:
     """y, z (m) and circulation (m^2/s) of the vortices (n, 3); None: no extremes.
 
-    Parameters
-    ----------
-    assumed : Assumptions
-        Profile and core radius.
-    guess : (n, 4) array
-        Vortices as of a candidate of the detection, which say where to search.
+    assumed: profile and core radius.
+    guess (n, 4): vortices as of a candidate of the detection, which say where to search.
     """
     extremes = []
     for vortex in guess:

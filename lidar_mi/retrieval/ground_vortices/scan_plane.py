@@ -25,32 +25,19 @@ _LEAST_GATES = 4
 class PlaneScan:
     """One slice, its lines in the order of their angle.
 
-    Attributes
-    ----------
-    start : datetime64
-        Time of the first line.
-    time : (lines,) array
-        s after the start.
-    angle : (lines,) array
-        From the y axis upwards, rad; above pi/2: over the top.
-    ranges : (gates,) array
-        m.
-    velocity : (lines, gates) array
-        Away from the lidar, m/s; NaN: not usable.
-    variance : (lines, gates) array
-        Of the noise, (m/s)^2.
-    step : float
-        Angle from line to line, rad.
-    sweeps : bool
-        Whether the beam moves through this angle while it measures; else it stands.
-    clock : float
-        Resolution of the times if it is coarser than the lines, s; 0: finer.
-    azimuth : float
-        Of the y axis, degrees.
-    sweep : int
-        Its number in the data set.
-    stated : {"gates", "least", "none"}
-        Whether the noise is known for every gate, is the least one, or is estimated.
+    start (datetime64): time of the first line.
+    time (lines,): s after the start.
+    angle (lines,): from the y axis upwards, rad; above pi/2: over the top.
+    ranges (gates,): m.
+    velocity (lines, gates): away from the lidar, m/s; NaN: not usable.
+    variance (lines, gates): of the noise, (m/s)^2.
+    step: angle from line to line, rad.
+    sweeps: whether the beam moves through this angle while it measures; else it stands.
+    clock: resolution of the times if it is coarser than the lines, s; 0: finer.
+    azimuth: of the y axis, degrees.
+    sweep: its number in the data set.
+    stated {"gates", "least", "none"}: whether the noise is known for every gate, is the least one,
+        or is estimated.
     """
 
     start: np.datetime64
@@ -81,11 +68,8 @@ def plane_scans(lines: xr.Dataset, noise: float | None) -> tuple[list[PlaneScan]
 
     A slice is a part of a sweep in which the beam moves one way.
 
-    Raises
-    ------
-    InputError
-        A data set without lines of sight; lines that are not in one vertical plane; no slice of 8
-        lines and 4 gates with usable values.
+    Raises InputError: a data set without lines of sight; lines that are not in one vertical plane;
+    no slice of 8 lines and 4 gates with usable values.
     """
     for name in ("radial_velocity", "flag", "azimuth", "elevation", "range", "time"):
         if name not in lines.variables:

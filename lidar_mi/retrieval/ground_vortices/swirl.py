@@ -21,20 +21,12 @@ _REACH = 3.5  # standard deviations of the pulse
 class Lines:
     """Lines and gates of a part of a scan, and the quadrature along them.
 
-    Attributes
-    ----------
-    time, angle : (lines,) arrays
-        s and rad.
-    span : (lines,) array
-        Angle that the beam moves through, rad.
-    rate : (lines,) array
-        Time over angle of the moving beam, s/rad.
-    ranges : (gates,) array
-        m.
-    distance : (points,) array
-        m.
-    weight : (points, gates) array
-        Sums to 1 for every gate.
+    time, angle (lines,): s and rad.
+    span (lines,): angle that the beam moves through, rad.
+    rate (lines,): time over angle of the moving beam, s/rad.
+    ranges (gates,): m.
+    distance (points,): m.
+    weight (points, gates): sums to 1 for every gate.
     """
 
     time: np.ndarray
@@ -140,14 +132,9 @@ def radial_velocity(
     The distance q of a vortex from a line does not depend on the place along it, so that the
     velocity is q omega.
 
-    Parameters
-    ----------
-    places : (lines, nodes, 2) array
-        y and z of the vortex at the times of the lines' nodes, m.
-    strengths : (2,) array
-        Circulation and logarithm of the core radius.
-    departure : float
-        Fraction of the other profile.
+    places (lines, nodes, 2): y and z of the vortex at the times of the lines' nodes, m.
+    strengths (2,): circulation and logarithm of the core radius.
+    departure: fraction of the other profile.
 
     Returns
     -------

@@ -19,14 +19,10 @@ _WIND = 15.0  # m/s: spread of a component of the wind before the scan
 class Unfolded:
     """A scan without folds.
 
-    Attributes
-    ----------
-    velocity : (n,) array
-        m/s.
-    interval, variance : float
-        Twice the Nyquist velocity, m/s, and the variance of its error; 0 where it is stated.
-    folds : (n,) array
-        How many intervals were added.
+    velocity (n,): m/s.
+    interval, variance: twice the Nyquist velocity, m/s, and the variance of its error; 0 where it
+        is stated.
+    folds (n,): how many intervals were added.
     """
 
     velocity: np.ndarray

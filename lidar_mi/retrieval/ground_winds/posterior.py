@@ -34,20 +34,12 @@ _MOST_PLACES = 200
 class Level:
     """Lines at one height; neighbours in direction may be averaged to one number.
 
-    Attributes
-    ----------
-    design : (n, 3) array
-        Unit vectors of the lines: east, north, up.
-    places : (n, 3) array
-        Of the gates, m, in the frame that moves with the mean wind.
-    path : (m, 3) array
-        Places over which the wind is averaged, m.
-    starts : (k,) array of int
-        First line of each average.
-    velocity : (k,) array
-        Averages, away from the lidar, m/s.
-    noise : (k,) array
-        Variance of the noise of the averages relative to its mean.
+    design (n, 3): unit vectors of the lines: east, north, up.
+    places (n, 3): of the gates, m, in the frame that moves with the mean wind.
+    path (m, 3): places over which the wind is averaged, m.
+    starts (k,): first line of each average.
+    velocity (k,): averages, away from the lidar, m/s.
+    noise (k,): variance of the noise of the averages relative to its mean.
     """
 
     design: np.ndarray
@@ -68,14 +60,9 @@ class Level:
 class Evidence:
     """Posterior of the turbulence that levels share.
 
-    Attributes
-    ----------
-    weight : (models,) array
-        Probability of each length and noise fraction.
-    variance : (models,) array
-        Of a line's velocity about the mean wind, (m/s)^2, under each.
-    dof : int
-        Degrees of freedom: lines less three for each level.
+    weight (models,): probability of each length and noise fraction.
+    variance (models,): of a line's velocity about the mean wind, (m/s)^2, under each.
+    dof: degrees of freedom: lines less three for each level.
     """
 
     weight: np.ndarray
@@ -90,14 +77,9 @@ def evidence(levels: Sequence[Level], lengths: Sequence[float], noise: float) ->
     variance has the prior 1 / variance and is integrated out; its independent part is at least the
     variance of the noise, if that is known.
 
-    Parameters
-    ----------
-    levels : sequence of Level
-        Of more than two degrees of freedom in all.
-    lengths : sequence of float
-        m, equally likely.
-    noise : float
-        Mean variance of the stated noise, (m/s)^2; 0: unknown.
+    levels: of more than two degrees of freedom in all.
+    lengths: m, equally likely.
+    noise: mean variance of the stated noise, (m/s)^2; 0: unknown.
     """
     places = np.concatenate([level.places for level in levels])
     design = np.concatenate([level.design for level in levels])

@@ -51,12 +51,8 @@ class Profile:
 def profile_dataset(profiles: Sequence[Profile], about: Mapping[str, Any]) -> xr.Dataset:
     """All profiles on common heights, in the order of time.
 
-    Parameters
-    ----------
-    profiles : sequence of Profile
-        Heights that differ by less than 1 cm are one.
-    about : mapping
-        Attributes of the lines of sight.
+    profiles: heights that differ by less than 1 cm are one.
+    about: attributes of the lines of sight.
     """
     heights = np.unique(np.round(np.concatenate([p.heights for p in profiles]), 2))
     profiles = sorted(profiles, key=lambda p: p.time)

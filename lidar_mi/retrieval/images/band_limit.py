@@ -20,25 +20,17 @@ _SHELLS = 16
 class Filter(NamedTuple):
     """A filter by shells of wavenumber, and its effect on texture and noise.
 
-    Attributes
-    ----------
-    gain : torch.Tensor, shape (shells,)
-    level : float
-        Standard deviation of the white noise before the filter.
-    passed : float
-        Fraction of the variance of white noise that the filter lets pass.
-    excess : float
-        Variance of a displacement over that from noise-free slopes.
-    efficiency : float
-        Fraction of the information in the slopes that is left: 1 unless blur is corrected, which
-        amplifies the noise of short waves.
-    values, slopes : torch.Tensor, shape (shells,)
-        The same filter divided between the two factors that inform a displacement: differences of
-        the images, whose noise becomes white, and their slopes, which become the likeliest ones of
-        the texture (Wiener). Where blur is corrected both are `gain`.
-    noisy_slopes : float
-        Mean square of the slopes that noise alone makes in the mean of two images after the filter
-        of the slopes, summed over the axes, per px^2.
+    gain (shells,)
+    level: standard deviation of the white noise before the filter.
+    passed: fraction of the variance of white noise that the filter lets pass.
+    excess: variance of a displacement over that from noise-free slopes.
+    efficiency: fraction of the information in the slopes that is left: 1 unless blur is corrected,
+        which amplifies the noise of short waves.
+    values, slopes (shells,): the same filter divided between the two factors that inform a
+        displacement: differences of the images, whose noise becomes white, and their slopes, which
+        become the likeliest ones of the texture (Wiener). Where blur is corrected both are `gain`.
+    noisy_slopes: mean square of the slopes that noise alone makes in the mean of two images after
+        the filter of the slopes, summed over the axes, per px^2.
     """
 
     gain: torch.Tensor
@@ -180,16 +172,10 @@ def flat_if_better(
     Displacements from texture of spectral density S through a filter g have the variance
     sum(k^2 S g^4 N) / sum(k^2 S g^2)^2 in noise of the density N, the mismatch.
 
-    Parameters
-    ----------
-    spectrum : PowerSpectrum
-        Of the images.
-    mismatch : torch.Tensor, shape (shells,)
-        See `spline.band_limited`.
-    threshold : float
-        Standard errors by which a shell must exceed the mismatch to count as texture.
-    strain : float
-        Mean square of the strain in dt along any direction.
+    spectrum: of the images.
+    mismatch (shells,): see `spline.band_limited`.
+    threshold: standard errors by which a shell must exceed the mismatch to count as texture.
+    strain: mean square of the strain in dt along any direction.
 
     Returns
     -------
@@ -348,13 +334,9 @@ def faded(
     A Fourier transform is periodic. Were one side brighter than the other, a low-pass filter would
     ring from that step into the image.
 
-    Parameters
-    ----------
-    images : torch.Tensor, shape (number, ...)
-    sizes : sequence of int
-        Of the result along all axes but the first; `margin` pixels of it come before the image.
-    antisymmetric : bool
-        Mirrored about the edge's value as well, which keeps the slope.
+    images (number, ...)
+    sizes: of the result along all axes but the first; `margin` pixels of it come before the image.
+    antisymmetric: mirrored about the edge's value as well, which keeps the slope.
     """
     for axis, size in enumerate(sizes, 1):
         n = images.shape[axis]

@@ -21,12 +21,8 @@ from lidar_mi.retrieval.images.windows import Windows
 class VectorTimes(NamedTuple):
     """Of every vector, s, arrays of shape `windows.count`.
 
-    Attributes
-    ----------
-    difference : float or ndarray
-        From the view in image 1 to that in image 2; NaN where it is not positive.
-    middle : ndarray
-        Half way between the two, from image 1's reference time.
+    difference: from the view in image 1 to that in image 2; NaN where it is not positive.
+    middle: half way between the two, from image 1's reference time.
     """
 
     difference: float | np.ndarray
@@ -40,16 +36,13 @@ def checked_times(
 
     Pixels that have no time because they have no value take that of the nearest.
 
+    Raises InputError: not two images of times on the grid of the images, pixels with a value but no
+    time, pixels that are seen in image 2 before they are in image 1.
+
     Returns
     -------
     list of ndarray or None
         None: all pixels of an image have one time.
-
-    Raises
-    ------
-    InputError
-        Not two images of times on the grid of the images, pixels with a value but no time, pixels
-        that are seen in image 2 before they are in image 1.
     """
     if times is None:
         return None
@@ -95,16 +88,10 @@ def vector_times(
     with times averaged over the template as the displacement is. Exact where the wind is uniform
     over the template and times are linear over it.
 
-    Parameters
-    ----------
-    times : sequence of ndarray, optional
-        From `checked_times`.
-    dt : float
-        From reference time to reference time, s.
-    d : ndarray, shape (2, *windows.count)
-        px
-    centred : bool
-        The window's centre is the mid-place x, not the place x - d / 2 in image 1.
+    times: from `checked_times`.
+    dt: from reference time to reference time, s.
+    d (2, *windows.count): px
+    centred: the window's centre is the mid-place x, not the place x - d / 2 in image 1.
     """
     if times is None:
         return VectorTimes(dt, np.full(windows.count, dt / 2))

@@ -24,15 +24,13 @@ def displacement_bound(
     A method can be better than the bound of a window only by using more than the window, as
     smooth flows do, and is worse where the flow is not uniform in it.
 
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y)
-        Of the same texture.
-    noise : float or torch.Tensor, optional
-        Standard deviation of each image's noise, of all pixels or of each (of image 1, if the
+    image1, image2 (z, y): of the same texture.
+    noise: standard deviation of each image's noise, of all pixels or of each (of image 1, if the
         images differ in brightness). Default: from the images' spectra.
-    window, stride : int
-        Pixels: size of the square windows, step from one to the next.
+    window, stride: pixels: size of the square windows, step from one to the next.
+
+    Raises InputError: window, stride or noise out of range; images that differ in size or are not
+    finite.
 
     Returns
     -------
@@ -40,11 +38,6 @@ def displacement_bound(
         Variances along z and y and their covariance, px^2; infinite where a window has no texture
         (a covariance of zero then). Windows lie wholly inside the image, centred on (window - 1) /
         2 + stride * (row, column).
-
-    Raises
-    ------
-    InputError
-        Window, stride or noise out of range; images that differ in size or are not finite.
     """
     image_pair(image1, image2)
     for image in (image1, image2):

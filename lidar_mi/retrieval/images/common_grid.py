@@ -19,25 +19,18 @@ def resample(image: xr.DataArray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:
     spacing: structure of 8 px wavelength loses about 1 % of its amplitude half way between
     pixels, structure near 2 px is damped.
 
-    Parameters
-    ----------
-    image : xr.DataArray, two dims
-        With coordinates y and z in metres, finite and ascending: either one-dimensional, or
-        two-dimensional with y constant along one dim and z along the other (to 1e-3 of the
-        spacing), as planar gates give.
-    y, z : array, 1-D
-        Nodes wanted, m, ascending.
+    image (xr.DataArray, two dims): with coordinates y and z in metres, finite and ascending: either
+        one-dimensional, or two-dimensional with y constant along one dim and z along the other (to
+        1e-3 of the spacing), as planar gates give.
+    y, z (array, 1-D): nodes wanted, m, ascending.
+
+    Raises InputError: coordinates missing or not separable or not ascending; fewer than 4 pixels in
+    a direction; values not finite; nodes all outside.
 
     Returns
     -------
     xr.DataArray, dims (z, y)
         NaN at nodes outside the image; retrieval flags windows with such nodes.
-
-    Raises
-    ------
-    InputError
-        Coordinates missing or not separable or not ascending; fewer than 4 pixels in a
-        direction; values not finite; nodes all outside.
     """
     if image.ndim != 2:
         raise InputError(f"image: dims {tuple(image.dims)} are not two")

@@ -14,21 +14,14 @@ from lidar_mi.retrieval.quantity import Quantity
 class Displacement(NamedTuple):
     """Displacements of all windows from image 1 to image 2, tensors of shape `windows.count`.
 
-    Attributes
-    ----------
-    d : torch.Tensor, shape (components, *windows.count)
-        Pixels along the axes, (z, y) of images and (x, z, y) of volumes, positive toward higher
-        indices; NaN where no displacement was found.
-    score : torch.Tensor
-        How well the windows match: correlation or mismatch, depending on the method.
-    flag : torch.Tensor of int16
-        `flags.Flag` bits.
-    covariance : torch.Tensor, shape (components, components, *windows.count), optional
-        Of the components' errors, px^2, from methods that give it.
-    quantities : mapping, optional
-        Scalar quantities with standard errors, by name (`quantity.Quantity`).
-    attributes : mapping, optional
-        Further attributes of a method's result.
+    d (components, *windows.count): pixels along the axes, (z, y) of images and (x, z, y) of
+        volumes, positive toward higher indices; NaN where no displacement was found.
+    score: how well the windows match: correlation or mismatch, depending on the method.
+    flag (torch.Tensor of int16): `flags.Flag` bits.
+    covariance (components, components, *windows.count): of the components' errors, px^2, from
+        methods that give it.
+    quantities: scalar quantities with standard errors, by name (`quantity.Quantity`).
+    attributes: further attributes of a method's result.
     """
 
     d: torch.Tensor

@@ -50,13 +50,11 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
     `beam_time` is averaged with the same weights, within the times of the scan; where beams next
     to each other have very different times, a node's value mixes times (see `synchronised`).
 
-    Parameters
-    ----------
-    scan : xr.Dataset, dims (..., z, y)
-        With the nodes as coordinates (m, ascending) and `y_reported`, `z_reported` (z, y), m: the
-        beams in any order.
-    errors : bool
-        Whether to estimate what resampling adds to the noise, which takes most of the time.
+    scan (..., z, y): with the nodes as coordinates (m, ascending) and `y_reported`, `z_reported`
+        (z, y), m: the beams in any order.
+    errors: whether to estimate what resampling adds to the noise, which takes most of the time.
+
+    Raises InputError: places that are not finite, or fewer than three.
 
     Returns
     -------
@@ -64,11 +62,6 @@ def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
         Without the places. Fields without the dims z and y do not change, nor do values of beams
         that lie on their own node (to a thousandth of the spacing), bit by bit. NaN beyond the
         beams' convex hull and further than 1.5 spacings from any beam.
-
-    Raises
-    ------
-    InputError
-        Places that are not finite, or fewer than three.
     """
     steps = [float(np.ptp(scan[axis].values)) / max(scan.sizes[axis] - 1, 1) for axis in "zy"]
     reported = [scan[f"{axis}_reported"].transpose("z", "y").values.astype(float) for axis in "zy"]

@@ -20,14 +20,9 @@ def known_and_weight(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixels of known value and noise, and their weights by a map of the noise.
 
-    Parameters
-    ----------
-    stack : sequence of Tensor
-        Images or volumes of one size.
-    noise : float, Tensor or None
-        Standard deviation, in the unit of the images.
-    width : float
-        Standard deviation of the Gaussian that averages the map, px.
+    stack: images or volumes of one size.
+    noise: standard deviation, in the unit of the images.
+    width: standard deviation of the Gaussian that averages the map, px.
     """
     known_at = informative(stack)
     weight = torch.ones_like(stored(stack[0]))
@@ -54,16 +49,10 @@ def variance_of_residual(
     relative variance q. The rest, such as motion that a match does not resolve, does not follow the
     map. s is twice the noise's mean square, that of two images, over the residual's, at most 1.
 
-    Parameters
-    ----------
-    residual : torch.Tensor
-        Of the images' unit.
-    relative : torch.Tensor, same shape
-        q, with the mean 1.
-    use : torch.Tensor of bool, same shape
-        Where the residual is known.
-    noise : float, torch.Tensor or None
-        Standard deviation of an image's noise, in the same unit.
+    residual: of the images' unit.
+    relative (torch.Tensor, same shape): q, with the mean 1.
+    use (torch.Tensor of bool, same shape): where the residual is known.
+    noise: standard deviation of an image's noise, in the same unit.
     """
     if noise is None or not bool(use.any()):
         return relative

@@ -32,14 +32,9 @@ SMALL = 0.05
 class Texture(NamedTuple):
     """Texture of the templates, tensors of shape `windows.count`.
 
-    Attributes
-    ----------
-    slope : torch.Tensor
-        Rms slope in the direction where it is weakest, relative to the local mean; px^-1.
-    isotropy : torch.Tensor
-        That slope over the one in the strongest direction, 0 (parallel stripes) to 1.
-    mean : torch.Tensor
-        Mean of the template, in the image's unit.
+    slope: rms slope in the direction where it is weakest, relative to the local mean; px^-1.
+    isotropy: that slope over the one in the strongest direction, 0 (parallel stripes) to 1.
+    mean: mean of the template, in the image's unit.
     """
 
     slope: torch.Tensor
@@ -62,10 +57,8 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
       in 16 on a simulated wake with 5 % of texture, no noise, rms of the vector's error: 0.9 m/s
       where the isotropy is above 0.5, 4 m/s below 0.13.) So the ratio of the slopes is given too.
 
-    Parameters
-    ----------
-    image : torch.Tensor, shape (z, y)
-        Positive on the whole, as extinction and backscatter are: the contrast is relative.
+    image (z, y): positive on the whole, as extinction and backscatter are: the contrast is
+        relative.
     """
     image = working(image)
     gradient = spatial_gradient(image[None, None], mode="sobel")[0, 0]
@@ -97,10 +90,7 @@ def low_texture(
     cannot do better than 0.4 px. The texture `min_texture` (px^-1) is relative to the local mean,
     the isotropy 0 to 1; the noise is the standard deviation of each pixel.
 
-    Raises
-    ------
-    InputError
-        A threshold or the noise out of range, noise of another shape.
+    Raises InputError: a threshold or the noise out of range, noise of another shape.
     """
     if not min_texture >= 0:
         raise InputError(f"min_texture: {min_texture!r} px^-1 is not >= 0")

@@ -112,12 +112,8 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
     to 1.7 times as large as stated. All vectors are flagged where two thirds of those that have a
     displacement are: the others' errors are then up to 2.6 times as large as stated.
 
-    Parameters
-    ----------
-    wind : xr.Dataset
-        From `retrieve_wind`, with `template` among its attributes.
-    noise, with_it : xr.DataArray, dims (z, y)
-        Noise of an image, and the same with what resampling adds.
+    wind: from `retrieve_wind`, with `template` among its attributes.
+    noise, with_it (z, y): noise of an image, and the same with what resampling adds.
     """
     template = int(wind.attrs["template"])
     square = [field.fillna(0.0).transpose("z", "y").values ** 2 for field in (noise, with_it)]

@@ -32,14 +32,10 @@ _TOGETHER = 1 << 19
 class Spline(NamedTuple):
     """Cubic B-spline through images or volumes, on nodes half a pixel apart.
 
-    Attributes
-    ----------
-    coefficients : torch.Tensor, shape (images, ...)
-        Along each axis as many as there are nodes in the image and the margins around it.
-    shape : tuple of int
-        Of the images, (z, y), or (x, z, y) of volumes.
-    passed, excess, gain, efficiency, noisy_slopes
-        As in `band_limit.Filter`.
+    coefficients (images, ...): along each axis as many as there are nodes in the image and the
+        margins around it.
+    shape: of the images, (z, y), or (x, z, y) of volumes.
+    passed, excess, gain, efficiency, noisy_slopes: as in `band_limit.Filter`.
     """
 
     coefficients: torch.Tensor
@@ -226,37 +222,26 @@ def band_limited(
 ) -> tuple[Spline, float]:
     """Splines through the images, after the filter of `band_limit.best_filter`.
 
-    Parameters
-    ----------
-    images : torch.Tensor, shape (images, ...)
-        Non-finite pixels take the value of the nearest finite one, as a step to any other would
-        be structure at rest. They do not count in the power spectrum.
-    noise : float, optional
-        Standard deviation of the images' white noise. Default: from the lowest shell of the
+    images (images, ...): non-finite pixels take the value of the nearest finite one, as a step to
+        any other would be structure at rest. They do not count in the power spectrum.
+    noise: standard deviation of the images' white noise. Default: from the lowest shell of the
         power spectrum.
-    mismatch : torch.Tensor, shape (shells,), optional
-        Spectral density N of the differences of warped images, see `mismatch`. The filter is then
-        sqrt(noise^2 / N) of that for white noise (Hannan & Thomson 1973, Biometrika 60,
-        241-253), so that the mismatch is whitened.
-    weight : torch.Tensor, shape of an image, optional
-        Of the pixels, for the texture's spectrum.
-    blur : float, optional
-        Standard deviation, px, of a Gaussian that blurred the images. It is corrected by a Wiener
+    mismatch (shells,): spectral density N of the differences of warped images, see `mismatch`. The
+        filter is then sqrt(noise^2 / N) of that for white noise (Hannan & Thomson 1973, Biometrika
+        60, 241-253), so that the mismatch is whitened.
+    weight (shape of an image): of the pixels, for the texture's spectrum.
+    blur: standard deviation, px, of a Gaussian that blurred the images. It is corrected by a Wiener
         filter, S / (S + N / 2) / B with the Gaussian's transform B and the spectral density S of
         the blurred images.
-    settings : FilterSettings, optional
-        Default: those of images.
+    settings: default: those of images.
+
+    Raises InputError: a noise that is no standard deviation.
 
     Returns
     -------
     spline : Spline
     noise : float
         As given or estimated.
-
-    Raises
-    ------
-    InputError
-        A noise that is no standard deviation.
     """
     settings = settings or FilterSettings()
     chosen = filter_of(images, noise, mismatch, weight, blur, settings)
@@ -380,14 +365,9 @@ def _through_nodes(
 def mismatch(spline: Spline, residual: torch.Tensor, number: int | None = None) -> torch.Tensor:
     """Spectral density, by shells, of the differences of warped images, before their filter.
 
-    Parameters
-    ----------
-    spline : Spline
-        That the warped images were sampled from.
-    residual : torch.Tensor, shape (images, ...)
-        Each warped image less the mean of all; zero where not all are valid.
-    number : int, optional
-        Of warped images, where `residual` is only some. Default: as many as `residual`.
+    spline: that the warped images were sampled from.
+    residual (images, ...): each warped image less the mean of all; zero where not all are valid.
+    number: of warped images, where `residual` is only some. Default: as many as `residual`.
 
     Returns
     -------

@@ -6,18 +6,11 @@ from lidar_mi.errors import InputError
 def check_window_sizes(shape: tuple[int, ...], template: int, search: int, stride: int) -> None:
     """Refuse windows that are too small, or larger than an image or a volume.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        (z, y) of an image, (x, z, y) of a volume, pixels.
-    template, search, stride : int
-        Pixels, see `lidar_mi.retrieval.images.windows.Windows`.
+    shape: (z, y) of an image, (x, z, y) of a volume, pixels.
+    template, search, stride: pixels, see `lidar_mi.retrieval.images.windows.Windows`.
 
-    Raises
-    ------
-    InputError
-        A size out of its range, an image smaller than the search region, a volume smaller than a
-        template.
+    Raises InputError: a size out of its range, an image smaller than the search region, a volume
+    smaller than a template.
     """
     image = len(shape) == 2
     unit = "px" if image else "voxels"

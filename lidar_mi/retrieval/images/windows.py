@@ -47,18 +47,12 @@ class Windows:
     In an image the search regions lie wholly inside. In a volume, which is thin, the templates do,
     and the margin that the stride leaves is divided equally between both faces.
 
-    Attributes
-    ----------
-    shape : tuple of int
-        Size in pixels: (z, y) of an image, (x, z, y) of a volume.
-    template, search, stride : int
-        In pixels; template >= 2 (volumes: 4), search >= template + 2, stride >= 1.
+    shape: size in pixels: (z, y) of an image, (x, z, y) of a volume.
+    template, search, stride: in pixels; template >= 2 (volumes: 4), search >= template + 2, stride
+        >= 1.
 
-    Raises
-    ------
-    InputError
-        A size out of its range, an image smaller than the search region, a volume smaller than a
-        template.
+    Raises InputError: a size out of its range, an image smaller than the search region, a volume
+    smaller than a template.
     """
 
     shape: tuple[int, ...]
@@ -285,11 +279,8 @@ def candidates(values: torch.Tensor, windows: Windows) -> torch.Tensor:
 def image_pair(image1: torch.Tensor, image2: torch.Tensor, dims: Sequence[int] = (2,)) -> None:
     """Check that two tensors are images (of 2 dimensions) or volumes (of 3) of one size.
 
-    Raises
-    ------
-    InputError
-        Of other numbers of dimensions than `dims`, of different size or device, or not real
-        numbers.
+    Raises InputError: of other numbers of dimensions than `dims`, of different size or device, or
+    not real numbers.
     """
     for name, image in (("image1", image1), ("image2", image2)):
         if not isinstance(image, torch.Tensor):

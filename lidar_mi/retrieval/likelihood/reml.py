@@ -24,19 +24,12 @@ def most_likely(
     fractions of each step the likeliest is taken. Squares below `fixed` count as equal to it in
     these steps: beside a fixed variance absent terms come out positive, by up to 6 % of it.
 
-    Parameters
-    ----------
-    squares : np.ndarray, shape (squares,)
-        Above 0 somewhere.
-    terms : np.ndarray, shape (terms, squares)
-    limits : np.ndarray, shape (terms,)
-        Above 0; may be infinite.
-    number : np.ndarray or float
-        n / 2, of each square or of all: of complex numbers, how many.
-    fixed : np.ndarray or float
-        Variance that is known.
-    floor : float
-        Least square and least variance, over the mean of the squares.
+    squares (squares,): above 0 somewhere.
+    terms (terms, squares)
+    limits (terms,): above 0; may be infinite.
+    number: n / 2, of each square or of all: of complex numbers, how many.
+    fixed: variance that is known.
+    floor: least square and least variance, over the mean of the squares.
 
     Returns
     -------

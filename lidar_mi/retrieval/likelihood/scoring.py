@@ -99,19 +99,12 @@ def damped_scoring(
 ) -> tuple[P, bool]:
     """The point that damped steps lead to, and whether they have converged.
 
-    Parameters
-    ----------
-    point : Point
-        Start.
-    moved : callable
-        The point after a step (p,), or None: such a step may not be tried.
-    rise : callable
-        Of -2 ln likelihood from one point to another, of the same data.
-    steps : int
-        At most.
-    tolerance : float
-        Stop at a step of so many standard errors, squared, or at a short one that changes -2 ln
-        likelihood by less.
+    point: start.
+    moved: the point after a step (p,), or None: such a step may not be tried.
+    rise: of -2 ln likelihood from one point to another, of the same data.
+    steps: at most.
+    tolerance: stop at a step of so many standard errors, squared, or at a short one that changes -2
+        ln likelihood by less.
     """
     damping = _FIRST
     for _ in range(steps):
@@ -142,13 +135,9 @@ def damped_scoring(
 class Limits(NamedTuple):
     """When scoring ends.
 
-    Attributes
-    ----------
-    longest : torch.Tensor, shape (free,)
-        Longest step of each parameter: a longer one leaves the range in which the mean is linear.
-    close : float
-        Largest last step of a fit that has converged, standard deviations.
-    steps : int
+    longest (free,): longest step of each parameter: a longer one leaves the range in which the mean
+        is linear.
+    close: largest last step of a fit that has converged, standard deviations.
     """
 
     longest: torch.Tensor
@@ -173,19 +162,12 @@ def scoring(
 ) -> tuple[torch.Tensor, torch.Tensor, T]:
     """The parameters (fits, all) where the score is 0, the Fisher matrices there, and the rest.
 
-    Parameters
-    ----------
-    expanded : callable
-        From parameters to the Fisher matrices (fits, free, free) and scores (fits, free) of
+    expanded: from parameters to the Fisher matrices (fits, free, free) and scores (fits, free) of
         likelihood and priors, and whatever else the caller needs of the end.
-    advanced : callable
-        From parameters and a step (fits, free) to the next parameters inside their bounds, and to
-        which fits have ended at one of them, if any may.
+    advanced: from parameters and a step (fits, free) to the next parameters inside their bounds,
+        and to which fits have ended at one of them, if any may.
 
-    Raises
-    ------
-    InputError
-        A step that is not finite, fits that have not converged.
+    Raises InputError: a step that is not finite, fits that have not converged.
     """
     converged = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
     for _ in range(limits.steps):

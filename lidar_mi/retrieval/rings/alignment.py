@@ -26,20 +26,12 @@ def aligned(
 ) -> RingCurves:
     """The rings' geometry, to a fraction of their width.
 
-    Parameters
-    ----------
-    image : array, shape (height, width)
-    start : RingCurves
-        With a centre within about a third of a ring's width.
-    free : bool
-        Whether the centre is fitted.
-    hidden : Hidden, optional
-        Rings that do not count.
+    image (height, width)
+    start: with a centre within about a third of a ring's width.
+    free: whether the centre is fitted.
+    hidden: rings that do not count.
 
-    Raises
-    ------
-    InputError
-        Fewer than two rings, or a centre outside the image.
+    Raises InputError: fewer than two rings, or a centre outside the image.
     """
     geometry = start
     for number in range(8):
@@ -57,10 +49,7 @@ def aligned(
 def crests(sectors: Sectors) -> np.ndarray:
     """Annuli of the crests of the mean over circles.
 
-    Raises
-    ------
-    InputError
-        Fewer than two.
+    Raises InputError: fewer than two.
     """
     mean = sectors.profile
     smooth = _smooth(mean)

@@ -21,10 +21,7 @@ def prior_information(
 def free_names(model: RingModel, free: Sequence[str] | None) -> list[str]:
     """The named parameters in the order of `PARAMETERS`; all that the model has if None.
 
-    Raises
-    ------
-    InputError
-        A name that the model does not have, or v_los not among them.
+    Raises InputError: a name that the model does not have, or v_los not among them.
     """
     names = model.parameters if free is None else tuple(free)
     for name in names:

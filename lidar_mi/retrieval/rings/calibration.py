@@ -172,10 +172,7 @@ class Calibration(Tabular):
 def calibration_of(data: xr.Dataset) -> Calibration:
     """The calibration in a data set of `Calibration.to_dataset`.
 
-    Raises
-    ------
-    InputError
-        A data set that is none, or not whole.
+    Raises InputError: a data set that is none, or not whole.
     """
     try:
         single: dict[str, Any] = json.loads(data.attrs["calibration"])
@@ -205,10 +202,7 @@ def calibration_of(data: xr.Dataset) -> Calibration:
 def calibrated(model: RingModel, calibration: Calibration) -> RingModel:
     """The model of another line with the instrument as calibrated.
 
-    Raises
-    ------
-    InputError
-        A calibration of another camera or wavelength.
+    Raises InputError: a calibration of another camera or wavelength.
     """
     if tuple(model.shape) != tuple(calibration.shape):
         sizes = " and ".join(f"{h} x {w}" for h, w in (calibration.shape, model.shape))

@@ -77,28 +77,18 @@ def calibrate_rings(
 ) -> Calibration:
     """Fit one instrument to frames of one narrow line.
 
-    Parameters
-    ----------
-    frames : torch.Tensor, shape (frames, height, width)
-        Electrons; two frames or more, of one exposure each or means of several.
-    model : RingModel
-        Of the nominal instrument and the line.
-    noise : PixelNoise
-        Of a frame; Poisson alone if not given.
-    response : torch.Tensor, shape (height, width), optional
-        Of the pixels, from frames of even light; 0 leaves a pixel out.
-    tolerances : mapping
-        Standard deviations of `INSTRUMENT` about the nominal one, see `TOLERANCES`.
-    light_degree, background_degree : int
-        Of the illumination, the same in all frames, and of the background of each frame, 0 to 8.
-    max_chi_square : float
-        Frames that fit worse are refused.
+    frames (frames, height, width): electrons; two frames or more, of one exposure each or means of
+        several.
+    model: of the nominal instrument and the line.
+    noise: of a frame; Poisson alone if not given.
+    response (height, width): of the pixels, from frames of even light; 0 leaves a pixel out.
+    tolerances: standard deviations of `INSTRUMENT` about the nominal one, see `TOLERANCES`.
+    light_degree, background_degree: of the illumination, the same in all frames, and of the
+        background of each frame, 0 to 8.
+    max_chi_square: frames that fit worse are refused.
 
-    Raises
-    ------
-    InputError
-        Frames of another size, fewer than two, saturated or without two rings; tolerances that are
-        not above 0; frames that do not fit.
+    Raises InputError: frames of another size, fewer than two, saturated or without two rings;
+    tolerances that are not above 0; frames that do not fit.
     """
     for name in INSTRUMENT:
         if not tolerances.get(name, 0) > 0:

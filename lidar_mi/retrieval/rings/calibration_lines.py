@@ -39,32 +39,21 @@ def combined(
 ) -> Calibration:
     """The instrument of the first line, with its gap, from all lines.
 
-    Parameters
-    ----------
-    lines : sequence of Calibration
-        Two or more, all for the same nominal gap.
-    gap, gap_tolerance : float
-        The nominal gap times its refractive index, and its largest error, m.
-    mirror_orders : sequence of float
-        Of every line, by which the mirrors' phase shifts its orders.
-    wavelength_accuracy : float
-        Relative standard error of every wavelength.
-    achromatic : bool
-        Whether the lines share focal length and blur, too.
-    tolerances : mapping
-        Those of the calibrations.
+    lines: two or more, all for the same nominal gap.
+    gap, gap_tolerance: the nominal gap times its refractive index, and its largest error, m.
+    mirror_orders: of every line, by which the mirrors' phase shifts its orders.
+    wavelength_accuracy: relative standard error of every wavelength.
+    achromatic: whether the lines share focal length and blur, too.
+    tolerances: those of the calibrations.
+
+    Raises InputError: a line whose rings are those of another instrument or wavelength, fractions
+    that agree with no gap in range.
 
     Returns
     -------
     Calibration
         With the absolute order and its ``whole_orders``, or, where several ``gaps`` agree, with the
         nominal whole number.
-
-    Raises
-    ------
-    InputError
-        A line whose rings are those of another instrument or wavelength, fractions that agree with
-        no gap in range.
     """
     if not (math.isfinite(wavelength_accuracy) and 0 <= wavelength_accuracy <= 1e-5):
         raise InputError(

@@ -29,20 +29,12 @@ _AT_ONCE = 8
 class Cells:
     """Groups of pixels, tensors of shape (cells,), float64; pixels, x right, y down.
 
-    Attributes
-    ----------
-    index : torch.Tensor or None
-        Cell of every pixel, row by row; None where every pixel is a cell of its own.
-    count : torch.Tensor
-        Sum of the responses of the cell's pixels: their number where all are 1.
-    centre : (float, float)
-        Origin of x, y and r2: (x, y) from the top left pixel's centre.
-    x, y, r2 : torch.Tensor
-        Means over the cell's pixels.
-    spread : torch.Tensor, shape (cells, 3, 3), or None
-        Covariance of (x, y, r2) over the cell's pixels.
-    terms : torch.Tensor, shape (cells, names)
-        Means of the smooth terms that were asked for.
+    index: cell of every pixel, row by row; None where every pixel is a cell of its own.
+    count: sum of the responses of the cell's pixels: their number where all are 1.
+    centre: origin of x, y and r2: (x, y) from the top left pixel's centre.
+    x, y, r2: means over the cell's pixels.
+    spread (shape (cells, 3, 3), or None): covariance of (x, y, r2) over the cell's pixels.
+    terms (cells, names): means of the smooth terms that were asked for.
     """
 
     index: torch.Tensor | None
@@ -113,28 +105,17 @@ def annular_sectors(
 ) -> Cells:
     """Sectors of annuli about ``centre``, ``step`` px^2 wide in r^2.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Height and width of the images, pixels.
-    centre : (float, float)
-        (x, y), pixels; may lie outside.
-    step : float
-        px^2. Binning loses (2 pi n step / order)^2 / 12 of the information of the n-th harmonic of
-        the ring profile, with `order` the step of r^2 from ring to ring.
-    sectors : int
-        Per turn; 1 for whole annuli.
-    geometry : Geometry, optional
-        Of the camera; ideal if not given.
-    response : torch.Tensor, shape (height, width), optional
-        Of every pixel to light, 1 on average; 0 leaves a pixel out.
-    names : tuple of str
-        Smooth terms to average, see `lidar_mi.retrieval.rings.smooth.term_names`.
+    shape: height and width of the images, pixels.
+    centre: (x, y), pixels; may lie outside.
+    step: px^2. Binning loses (2 pi n step / order)^2 / 12 of the information of the n-th harmonic
+        of the ring profile, with `order` the step of r^2 from ring to ring.
+    sectors: per turn; 1 for whole annuli.
+    geometry: of the camera; ideal if not given.
+    response (height, width): of every pixel to light, 1 on average; 0 leaves a pixel out.
+    names: smooth terms to average, see `lidar_mi.retrieval.rings.smooth.term_names`.
 
-    Raises
-    ------
-    InputError
-        A step or number of sectors that is not above 0, a response that is negative or 0 all over.
+    Raises InputError: a step or number of sectors that is not above 0, a response that is negative
+    or 0 all over.
     """
     if not (math.isfinite(step) and step > 0):
         raise InputError(f"step: {step!r} px^2 is not allowed; expected above 0")

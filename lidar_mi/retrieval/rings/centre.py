@@ -26,10 +26,7 @@ def gradient_centre(
     gradient: below 0.1 % for the paper's 1.3e7 photons. Pixels of no ``response`` are masked. The
     point (x, y) may lie outside.
 
-    Raises
-    ------
-    InputError
-        An image without gradients, or with all of them along one direction.
+    Raises InputError: an image without gradients, or with all of them along one direction.
     """
     image = torch.as_tensor(image)
     block = max(1, min(image.shape) // 192)
@@ -71,10 +68,7 @@ def ring_centre(image: np.ndarray) -> tuple[float, float]:
     it. Candidates are from the image and from the image without its coarse structure; the one about
     which averages over circles have the largest contrast is the centre.
 
-    Raises
-    ------
-    InputError
-        An image without gradients, or with all of them along one direction.
+    Raises InputError: an image without gradients, or with all of them along one direction.
     """
     image = np.asarray(image, float)
     block = max(1, min(image.shape) // 192)
@@ -163,10 +157,7 @@ def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[floa
     distance to the centre, as averages about another point blur the rings. Its maximum is found
     by Newton's method, from differences over 1 px. The start is within about 1/3 of a ring's width.
 
-    Raises
-    ------
-    InputError
-        A contrast without a maximum: no rings about one centre.
+    Raises InputError: a contrast without a maximum: no rings about one centre.
     """
     # variances do not depend on an offset; sums of squares lose least without one
     image = np.asarray(image, float) - np.mean(image)
@@ -245,10 +236,7 @@ def midpoint_line_centre(
     The midpoints of all chords along x lie on the line x = x_c, those of chords along y on
     y = y_c; the lines are the means of the midpoints.
 
-    Raises
-    ------
-    InputError
-        No chord along one of the directions lies in the image.
+    Raises InputError: no chord along one of the directions lies in the image.
     """
     for _ in range(2):
         points = midpoint_points(image, start, radius, half_width)

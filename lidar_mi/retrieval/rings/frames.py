@@ -36,11 +36,8 @@ def checked(
     Pixels that are not ``used`` (height, width) may have any value; they become the least one.
     ``what`` names them in messages, ``shape`` (height, width) is that of their model.
 
-    Raises
-    ------
-    InputError
-        Other shapes, images below 16 px or not as large as the model, NaN or infinity, saturated
-        pixels.
+    Raises InputError: other shapes, images below 16 px or not as large as the model, NaN or
+    infinity, saturated pixels.
     """
     if not isinstance(images, torch.Tensor):
         images = np.array(images)

@@ -24,25 +24,15 @@ _STEPS = 12
 class Geometry:
     """Tilt of the camera and radial distortion of the lens.
 
-    Parameters
-    ----------
-    focal_pixels : float
-        Focal length over pixel pitch.
-    axis : (float, float)
-        (x, y) where the lens's axis meets the camera: pixels from the top left pixel's centre.
-    half_diagonal : float
-        Of the image, pixels.
-    tilt : (float, float)
-        Rotations of the camera about its y and x axis, rad: the sides of larger x, of larger y lie
-        farther from the lens where they are positive. A normal of the etalon that is not along the
-        lens's axis has the same effect on rings, to first order.
-    distortion : float
-        k of r = r_ideal (1 + k (r_ideal / half_diagonal)^2); above 0 is a pincushion.
+    focal_pixels: focal length over pixel pitch.
+    axis: (x, y) where the lens's axis meets the camera: pixels from the top left pixel's centre.
+    half_diagonal: of the image, pixels.
+    tilt: rotations of the camera about its y and x axis, rad: the sides of larger x, of larger y
+        lie farther from the lens where they are positive. A normal of the etalon that is not along
+        the lens's axis has the same effect on rings, to first order.
+    distortion: k of r = r_ideal (1 + k (r_ideal / half_diagonal)^2); above 0 is a pincushion.
 
-    Raises
-    ------
-    InputError
-        A tilt of 30 degrees or more, a distortion that folds the image.
+    Raises InputError: a tilt of 30 degrees or more, a distortion that folds the image.
     """
 
     focal_pixels: float

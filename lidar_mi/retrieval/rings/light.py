@@ -35,16 +35,11 @@ SMOOTH = 25  # annuli over which the scatter is averaged
 class Light:
     """The profile common to all sectors.
 
-    Attributes
-    ----------
-    profile : array (annuli,)
-        In units of the usual sector's light; interpolated where no sector determines it.
-    weight : array (annuli,)
-        Effective number of pixels, those of the usual sector counting 1.
-    noise : array (annuli,)
-        Variance of a pixel, from the scatter among sectors.
-    used : array (sectors, annuli) of bool
-        Cells that show rings, and are no outliers.
+    profile (annuli,): in units of the usual sector's light; interpolated where no sector determines
+        it.
+    weight (annuli,): effective number of pixels, those of the usual sector counting 1.
+    noise (annuli,): variance of a pixel, from the scatter among sectors.
+    used (array (sectors, annuli) of bool): cells that show rings, and are no outliers.
     """
 
     profile: np.ndarray

@@ -65,26 +65,18 @@ _OF_IMAGES = ("values", "std", "chi_square", "rings", "outliers", "sensitivity")
 class RingFit:
     """Retrieved values, tensors of shape (images,) unless stated, float64.
 
-    Attributes
-    ----------
-    values : torch.Tensor, shape (images, parameters)
-        All of `lidar_mi.retrieval.rings.model.PARAMETERS`; those that were not free have the
-        model's value. x and y are pixels from the top left pixel's centre.
-    std : torch.Tensor, shape (images, parameters)
-        Their random standard deviations, from the Fisher matrix with all other free parameters
-        unknown, times the root of chi_square where that is significantly above 1; 0 where one was
-        not free.
-    chi_square : torch.Tensor
-        Squared misfit over its expectation: 1 where model and noise are right.
-    rings : torch.Tensor
-        Rings that were detected.
-    outliers : torch.Tensor
-        Masked fraction: of the cells that do not fit, plus of the pixels in bright patches. Single
-        hot and dead pixels do not count.
-    sensitivity : torch.Tensor, shape (images, 8)
-        Change of v_los per error of the model's calibration (`RingModel.systematic`).
-    systematic : torch.Tensor, shape (8, 8)
-        Covariance of the calibration's error, in the order of `sensitivity`.
+    values (images, parameters): all of `lidar_mi.retrieval.rings.model.PARAMETERS`; those that were
+        not free have the model's value. x and y are pixels from the top left pixel's centre.
+    std (images, parameters): their random standard deviations, from the Fisher matrix with all
+        other free parameters unknown, times the root of chi_square where that is significantly
+        above 1; 0 where one was not free.
+    chi_square: squared misfit over its expectation: 1 where model and noise are right.
+    rings: rings that were detected.
+    outliers: masked fraction: of the cells that do not fit, plus of the pixels in bright patches.
+        Single hot and dead pixels do not count.
+    sensitivity (images, 8): change of v_los per error of the model's calibration
+        (`RingModel.systematic`).
+    systematic (8, 8): covariance of the calibration's error, in the order of `sensitivity`.
     """
 
     values: torch.Tensor

@@ -38,22 +38,13 @@ _LEVEL = PARAMETERS.index("level")
 class MatchedScore:
     """The score function of a reference.
 
-    Attributes
-    ----------
-    names : list of str
-        Parameters that are fitted.
-    waves, single : Waves
-        Of the cells about the reference's centre, and the same in single precision.
-    values : torch.Tensor, shape (`PARAMETERS`,)
-        Of the reference; x and y from the top left pixel's centre.
-    mean, dark : torch.Tensor, shape (cells,)
-        Of the reference, and of the same without its light.
-    score : torch.Tensor, shape (names, cells)
-        J^T W.
-    inverse : torch.Tensor, shape (names, names)
-        Of the Fisher matrix with the priors.
-    sensitivity, systematic : torch.Tensor
-        As of `RingFit`, of one image.
+    names: parameters that are fitted.
+    waves, single: of the cells about the reference's centre, and the same in single precision.
+    values (`PARAMETERS`,): of the reference; x and y from the top left pixel's centre.
+    mean, dark (cells,): of the reference, and of the same without its light.
+    score (names, cells): J^T W.
+    inverse (names, names): of the Fisher matrix with the priors.
+    sensitivity, systematic: as of `RingFit`, of one image.
     """
 
     model: RingModel
@@ -84,14 +75,10 @@ class MatchedScore:
 class MatchedRead:
     """Retrieved values, tensors of shape (images,) unless stated, float64.
 
-    Attributes
-    ----------
-    values, std : torch.Tensor, shape (images, `PARAMETERS`)
-        As of `RingFit`; infinite standard deviations where ``read`` is false.
-    read : torch.Tensor
-        False where an image does not follow the model near the reference: fit it on its own.
-    sensitivity, systematic : torch.Tensor
-        As of `RingFit`.
+    values, std (images, `PARAMETERS`): as of `RingFit`; infinite standard deviations where ``read``
+        is false.
+    read: false where an image does not follow the model near the reference: fit it on its own.
+    sensitivity, systematic: as of `RingFit`.
     """
 
     values: torch.Tensor
@@ -127,10 +114,7 @@ def matched_score(
 ) -> MatchedScore:
     """The score function at the mean of fitted images.
 
-    Parameters
-    ----------
-    fit : RingFit
-        By `fit_rings` with the same ``model``, ``noise``, ``free`` and ``response``.
+    fit: by `fit_rings` with the same ``model``, ``noise``, ``free`` and ``response``.
     """
     noise, names = noise or PixelNoise(), free_names(model, free)
     values = fit.values.mean(0)
@@ -170,10 +154,7 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
     they are not searched for hot pixels or saturated crests: an image with some is not ``read``
     where chi-square is too large. Images (images, height, width) are in electrons.
 
-    Raises
-    ------
-    InputError
-        Images of another size.
+    Raises InputError: images of another size.
     """
     if images.ndim != 3 or tuple(images.shape[1:]) != tuple(score.model.shape):
         height, width = score.model.shape

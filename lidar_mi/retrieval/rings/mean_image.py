@@ -41,14 +41,11 @@ SHAPE = ("temperature", "aerosol", "damping", "roughness")  # parameters of the 
 class Waves(NamedTuple):
     """Cells, and the harmonics of rings at rest about their centre.
 
-    Attributes
-    ----------
-    waves : torch.Tensor, shape (2 K, cells)
-        Real and imaginary parts of 2 exp(2 pi i n m), n from 1, averaged over the cells.
-    by_blur : torch.Tensor, shape (2 K, cells)
-        Their derivative by the squared radius of the blur, 1/px^2.
-    order, variance : torch.Tensor, shape (cells,)
-        m less its integer part at the centre; variance of r^2 over the pixels' areas, px^4.
+    waves (2 K, cells): real and imaginary parts of 2 exp(2 pi i n m), n from 1, averaged over the
+        cells.
+    by_blur (2 K, cells): their derivative by the squared radius of the blur, 1/px^2.
+    order, variance (cells,): m less its integer part at the centre; variance of r^2 over the
+        pixels' areas, px^4.
     """
 
     cells: Cells

@@ -49,43 +49,29 @@ _NEGLIGIBLE_AEROSOL = 1e-4
 class RingModel:
     """The properties of an instrument and a line on which the rings depend.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Height and width of the camera, pixels.
-    centre : (float, float)
-        Nominal centre of the rings: x to the right, y down, pixels from the top left pixel's
+    shape: height and width of the camera, pixels.
+    centre: nominal centre of the rings: x to the right, y down, pixels from the top left pixel's
         centre.
-    pixel, focal_length, wavelength : float
-        m.
-    order_at_centre : float
-        Order of interference of the unshifted line at the centre, with its fraction.
-    harmonics : array (T, K) or (K,), complex
-        A_0 ... A_{K-1} of each of the ``temperatures``; any scale, A_0 > 0.
-    temperatures : array (T,)
-        K, ascending, a few nodes: harmonics between them follow the polynomial through all. One
-        node, or none given: the temperature is not a parameter.
-    falloff : float
-        Of the illumination: exp(-falloff r^2 / R^2), R half the image's diagonal.
-    aerosol_harmonics : array (K,), complex, optional
-        Of the light that aerosol scatters: the laser's own line. With them the fraction of that
-        light is a parameter; ``harmonics`` are those of the other light.
-    tilt, distortion, blur
-        Of the camera and its lens, see `Geometry` and `INSTRUMENT`.
-    light : mapping
-        Values of terms of `LIGHT`; 0 where one is not given.
-    light_degree, background_degree : int
-        Terms of `LIGHT` and `BACKGROUND` up to this degree are unknown, 0 to 8.
-    priors : mapping of (mean, standard deviation)
-        Normal distributions of parameters, from other sources than the image.
-    systematic : array (8, 8), optional
-        Covariance of the calibration's error, the same in all images: of the speed at
-        which the rings are those of order_at_centre (m/s), then of `INSTRUMENT`.
+    pixel, focal_length, wavelength: m.
+    order_at_centre: order of interference of the unshifted line at the centre, with its fraction.
+    harmonics (array (T, K) or (K,), complex): A_0 ... A_{K-1} of each of the ``temperatures``; any
+        scale, A_0 > 0.
+    temperatures (T,): K, ascending, a few nodes: harmonics between them follow the polynomial
+        through all. One node, or none given: the temperature is not a parameter.
+    falloff: of the illumination: exp(-falloff r^2 / R^2), R half the image's diagonal.
+    aerosol_harmonics (array (K,), complex): of the light that aerosol scatters: the laser's own
+        line. With them the fraction of that light is a parameter; ``harmonics`` are those of the
+        other light.
+    tilt, distortion, blur: of the camera and its lens, see `Geometry` and `INSTRUMENT`.
+    light: values of terms of `LIGHT`; 0 where one is not given.
+    light_degree, background_degree: terms of `LIGHT` and `BACKGROUND` up to this degree are
+        unknown, 0 to 8.
+    priors (mapping of (mean, standard deviation)): normal distributions of parameters, from other
+        sources than the image.
+    systematic (8, 8): covariance of the calibration's error, the same in all images: of the speed
+        at which the rings are those of order_at_centre (m/s), then of `INSTRUMENT`.
 
-    Raises
-    ------
-    InputError
-        Numbers out of range, an etalon that transmits nothing or leaves no rings.
+    Raises InputError: numbers out of range, an etalon that transmits nothing or leaves no rings.
     """
 
     shape: tuple[int, int]
@@ -235,9 +221,7 @@ class RingModel:
     ) -> "tuple[torch.Tensor, dict[str, torch.Tensor]]":
         """Harmonics A_1 ... of images with these parameters, and their derivatives.
 
-        Parameters
-        ----------
-        parameters : torch.Tensor, shape (images, `PARAMETERS`)
+        parameters (images, `PARAMETERS`)
 
         Returns
         -------
@@ -299,15 +283,12 @@ def _relative(harmonics: np.ndarray, negligible: float) -> np.ndarray:
 class PixelNoise:
     """Noise of a pixel, photoelectrons.
 
-    Parameters
-    ----------
-    read_noise : float
-        Standard deviation of the noise that does not depend on the light: root sum of squares of
-        the read-out's and of 1 / sqrt(12) of a digitisation step, over the gain before them.
-    speckle_modes : float
-        M of the Gamma distribution that the laser light of a pixel follows; infinite without.
-    excess : float
-        Variance of a photoelectron number over Poisson's: the excess noise factor F^2 of a
+    read_noise: standard deviation of the noise that does not depend on the light: root sum of
+        squares of the read-out's and of 1 / sqrt(12) of a digitisation step, over the gain before
+        them.
+    speckle_modes: M of the Gamma distribution that the laser light of a pixel follows; infinite
+        without.
+    excess: variance of a photoelectron number over Poisson's: the excess noise factor F^2 of a
         multiplication before the read-out, 1 without.
 
     Raises

@@ -33,22 +33,13 @@ MOST_HARMONICS = 400  # of a line's shape
 class Pattern:
     """Lines of an etalon over the squared radius.
 
-    Attributes
-    ----------
-    spacing : float
-        px^2 per order.
-    fraction : array (lines,)
-        Fractional order at the centre, 0 to 1, ascending.
-    height : array (lines,)
-        Relative to the highest.
-    loss, spread : float
-        Of Airy's formula, see above.
-    unexplained : float
-        Weighted sum of squared residuals.
-    power : float
-        Weighted sum of squares of the pattern, less its background.
-    freedom : int
-        Annuli less parameters.
+    spacing: px^2 per order.
+    fraction (lines,): fractional order at the centre, 0 to 1, ascending.
+    height (lines,): relative to the highest.
+    loss, spread: of Airy's formula, see above.
+    unexplained: weighted sum of squared residuals.
+    power: weighted sum of squares of the pattern, less its background.
+    freedom: annuli less parameters.
     """
 
     spacing: float

@@ -13,25 +13,16 @@ def peaks(
 ) -> np.ndarray:
     """Positions of neighbouring peaks of one width, fitted together as they overlap.
 
-    Parameters
-    ----------
-    x, values : arrays (N,)
-        NaN values are masked.
-    starts : sequence of float
-        Approximate positions of the peaks, ascending.
-    reach : float
-        The fit goes from the first less ``reach`` to the last plus ``reach``.
-    slope : bool
-        Whether the background of the peaks may have a slope.
+    x, values (N,): NaN values are masked.
+    starts: approximate positions of the peaks, ascending.
+    reach: the fit goes from the first less ``reach`` to the last plus ``reach``.
+    slope: whether the background of the peaks may have a slope.
+
+    Raises InputError: a peak that is not within 0.7 ``reach`` of its start.
 
     Returns
     -------
     array, as many as ``starts``
-
-    Raises
-    ------
-    InputError
-        A peak that is not within 0.7 ``reach`` of its start.
     """
     first_guess = np.asarray(starts, float)
     failed = InputError(

@@ -60,10 +60,7 @@ def find_centre(
     Both start from `lidar_mi.retrieval.rings.centre.gradient_centre`; ``radius`` is that of the
     innermost ring (px), which midpoint lines need.
 
-    Raises
-    ------
-    InputError
-        No rings, or a centre outside the image.
+    Raises InputError: no rings, or a centre outside the image.
     """
     start = gradient_centre(image)
     inside(*start, image.shape)
@@ -102,29 +99,19 @@ def ring_radius(
 ) -> float:
     """Radius of the innermost ring, px.
 
-    Parameters
-    ----------
-    image : array, shape (height, width)
-    centre : (float, float)
-        (x, y), px.
-    method : {"ca", "ml", "sg"}
-        Circular average; mean distance of crests along midpoint lines; mean of radial cuts
-        after a Savitzky-Golay filter.
-    coordinate : {"r", "r2"}
-        Coordinate of the Gaussian; ``ml`` fits along lines across the ring, in r only.
-    radius : float, optional
-        Approximate radius of the ring, px; detected if not given.
-    piece : float
-        Half width of the fitted piece of the profile, in radii; for r2, of nearly the same piece,
-        symmetric in r^2.
-    average : tuple of arrays, optional
-        The image's `lidar_mi.retrieval.rings.centre.circular_average` about the centre, where it
-        is known already.
+    image (height, width)
+    centre: (x, y), px.
+    method {"ca", "ml", "sg"}: circular average; mean distance of crests along midpoint lines; mean
+        of radial cuts after a Savitzky-Golay filter.
+    coordinate {"r", "r2"}: coordinate of the Gaussian; ``ml`` fits along lines across the ring, in
+        r only.
+    radius: approximate radius of the ring, px; detected if not given.
+    piece: half width of the fitted piece of the profile, in radii; for r2, of nearly the same
+        piece, symmetric in r^2.
+    average: the image's `lidar_mi.retrieval.rings.centre.circular_average` about the centre, where
+        it is known already.
 
-    Raises
-    ------
-    InputError
-        No ring, or an unknown method.
+    Raises InputError: no ring, or an unknown method.
     """
     if method not in METHODS:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")

@@ -34,10 +34,7 @@ from lidar_mi.errors import InputError
 class Filling:
     """Disc of even light in the etalon's pupil; lengths over the pupil's radius.
 
-    Parameters
-    ----------
-    shift : float
-        Of the disc's middle, along the wedge. The disc is not cut where it exceeds the pupil.
+    shift: of the disc's middle, along the wedge. The disc is not cut where it exceeds the pupil.
     """
 
     radius: float = 1.0
@@ -65,25 +62,14 @@ class Filling:
 class ReferenceUncertainty:
     """What is known of the differences between the reference shot and the echo.
 
-    Parameters
-    ----------
-    wavelength, gap : float
-        m; the gap's optical length.
-    laser_drift : float
-        Rms change of the laser's frequency between reference and echo, Hz.
-    etalon_drift : float
-        Rms change of the etalon's temperature between them, K.
-    expansion : float
-        Of the gap's spacers, 1/K; fused silica if not given.
-    bow, wedge : float
-        Rms over the full pupil of a quadratic and of a linear deviation of the gap, m.
-    scrambling : float
-        Of both before the etalon: 0 none, 1 perfect.
+    wavelength, gap: m; the gap's optical length.
+    laser_drift: rms change of the laser's frequency between reference and echo, Hz.
+    etalon_drift: rms change of the etalon's temperature between them, K.
+    expansion: of the gap's spacers, 1/K; fused silica if not given.
+    bow, wedge: rms over the full pupil of a quadratic and of a linear deviation of the gap, m.
+    scrambling: of both before the etalon: 0 none, 1 perfect.
 
-    Raises
-    ------
-    InputError
-        Numbers out of range.
+    Raises InputError: numbers out of range.
     """
 
     wavelength: float
@@ -125,10 +111,7 @@ class ReferenceUncertainty:
     def scrambling_for(self, limit: float) -> float:
         """Least scrambling with which the total does not exceed ``limit`` (m/s).
 
-        Raises
-        ------
-        InputError
-            A limit below what drifts alone cause.
+        Raises InputError: a limit below what drifts alone cause.
         """
         drifts = replace(self, scrambling=1.0).total
         unscrambled = replace(self, scrambling=0.0).terms()

@@ -34,20 +34,14 @@ TWO_RINGS = 2.2  # orders, least extent of a sector whose height may change with
 class CurveFit:
     """Rings, with the covariance of everything fitted.
 
-    Attributes
-    ----------
-    order, line : arrays (rings,) of int
-    square : array (rings,)
-        Squared mean radius, px^2.
-    square_covariance : array (rings, rings)
-    geometry_covariance : array (6, 6)
-        Of centre, ellipticity and tilt; 0 for what is not fitted.
-    model_covariance : array (rings, rings)
-        For white noise of variance 1, which gives the weights of the rings.
-    roundness : float
-        Rms deviation of the crests from the curves, px.
-    uneven : bool
-        Whether deviations of neighbouring sectors' crests correlate.
+    order, line (arrays (rings,) of int)
+    square (rings,): squared mean radius, px^2.
+    square_covariance (rings, rings)
+    geometry_covariance (6, 6): of centre, ellipticity and tilt; 0 for what is not fitted.
+    model_covariance (rings, rings): for white noise of variance 1, which gives the weights of the
+        rings.
+    roundness: rms deviation of the crests from the curves, px.
+    uneven: whether deviations of neighbouring sectors' crests correlate.
     """
 
     geometry: RingCurves
@@ -74,10 +68,7 @@ def fit_all(
 
     Ellipticity and tilt are fitted if two rings are in half of the sectors.
 
-    Raises
-    ------
-    InputError
-        Fewer than two rings, or a centre outside the image.
+    Raises InputError: fewer than two rings, or a centre outside the image.
     """
     deviation: dict[tuple[int, int], float] = {}
     for number in range(ROUNDS):

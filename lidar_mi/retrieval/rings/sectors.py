@@ -59,11 +59,9 @@ class RingCurves:
 class Hidden:
     """Rings that something hides in some of the sectors.
 
-    Attributes
-    ----------
-    spacing, fraction : float
-        Of the intervals of r^2 from half an order before to half an order behind each ring.
-    which : array (SECTORS, intervals) of bool
+    spacing, fraction: of the intervals of r^2 from half an order before to half an order behind
+        each ring.
+    which (array (SECTORS, intervals) of bool)
     """
 
     spacing: float
@@ -82,22 +80,16 @@ class Sectors:
     They extend to where the last sector leaves the image. Sectors cut by the edge have no pixels,
     as they would average another part of the image.
 
-    Attributes
-    ----------
-    angle : array (SECTORS,)
-    step : float
-        px^2.
-    r2 : array (annuli,)
-        The annuli's middles.
-    count, value, offset : arrays (SECTORS, annuli)
-        Number of pixels; their mean; mean of their squared radius less the annulus's middle.
-    used : array (SECTORS, annuli)
-        Number of pixels of cells that show rings and are no outliers.
-    profile, profile_r2 : arrays (annuli,)
-        Common part of all sectors (`light.common_light`), and the mean squared radius; interpolated
-        where no pixel is.
-    profile_count, profile_noise : arrays (annuli,)
-        Effective number of pixels of the profile, and the variance of one.
+    angle (SECTORS,)
+    step: px^2.
+    r2 (annuli,): the annuli's middles.
+    count, value, offset (SECTORS, annuli): number of pixels; their mean; mean of their squared
+        radius less the annulus's middle.
+    used (SECTORS, annuli): number of pixels of cells that show rings and are no outliers.
+    profile, profile_r2 (annuli,): common part of all sectors (`light.common_light`), and the mean
+        squared radius; interpolated where no pixel is.
+    profile_count, profile_noise (annuli,): effective number of pixels of the profile, and the
+        variance of one.
     """
 
     def __init__(self, image: np.ndarray, geometry: RingCurves, hidden: Hidden | None = None):

@@ -21,10 +21,7 @@ MOST_DEGREE = 8
 def term_names(kind: str, degree: int) -> tuple[str, ...]:
     """Names of the terms of ``light`` or ``background`` up to a degree: kind_n_m, m < 0 the sine.
 
-    Raises
-    ------
-    InputError
-        A degree that is not 0 to `MOST_DEGREE`.
+    Raises InputError: a degree that is not 0 to `MOST_DEGREE`.
     """
     if degree not in range(MOST_DEGREE + 1):
         raise InputError(f"{kind} degree: {degree!r} is not allowed; expected 0 to {MOST_DEGREE}")

@@ -81,15 +81,9 @@ def with_reasons(
 ) -> VortexPairFit:
     """The fit with the reasons for which it is not accepted.
 
-    Parameters
-    ----------
-    pair : VortexPairFit
-    solution : Solution
-        That it was made of.
-    y, z : ndarray
-        Axes of the region, m.
-    further : float
-        Chi-square of one more vortex.
+    solution: that it was made of.
+    y, z: axes of the region, m.
+    further: chi-square of one more vortex.
     """
     theta, covariance = pair.parameters, pair.covariance
     reasons = []

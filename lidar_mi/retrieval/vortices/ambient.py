@@ -47,16 +47,10 @@ _APART = (-(3**-0.5), 0.0, 3**-0.5)
 class AmbientWind(NamedTuple):
     """Wind around a pair in addition to its mean wind; m, m/s.
 
-    Attributes
-    ----------
-    gradient : torch.Tensor, shape (4,)
-        dv/dy, dv/dz, dw/dy, dw/dz, 1/s.
-    centre : (float, float)
-        y and z of its zero: half way between the vortices.
-    eddies : torch.Tensor, shape (2, rows, columns)
-        v and w of the turbulence in the middle of blocks.
-    z, y : torch.Tensor
-        Of the blocks.
+    gradient (4,): dv/dy, dv/dz, dw/dy, dw/dz, 1/s.
+    centre: y and z of its zero: half way between the vortices.
+    eddies (2, rows, columns): v and w of the turbulence in the middle of blocks.
+    z, y: of the blocks.
     """
 
     gradient: torch.Tensor
@@ -92,22 +86,14 @@ class AmbientWind(NamedTuple):
 class Elimination(NamedTuple):
     """What the errors by an ambient wind follow from; winds (2 n,) in blocks, v before w.
 
-    Attributes
-    ----------
-    blocks : _Blocks
-    y, z : torch.Tensor
-        Of the residuals, m.
-    dt : float
-    parameters : torch.Tensor
-        At which the fit is linear.
-    variances : torch.Tensor
-        Of turbulence of each of `LENGTHS`, m^2 s^-2.
-    covariance : torch.Tensor, shape (2 n, 2 n)
-        Of turbulence relative to the wind at the pair.
-    free, push : torch.Tensor, shapes (2 n, 2 n) and (2 n,)
-        Stiffness and force of winds, as the parameters follow them.
-    prior : torch.Tensor
-        Inverse variance of parameters and gradients.
+    blocks (_Blocks)
+    y, z: of the residuals, m.
+    parameters: at which the fit is linear.
+    variances: of turbulence of each of `LENGTHS`, m^2 s^-2.
+    covariance (2 n, 2 n): of turbulence relative to the wind at the pair.
+    free, push (torch.Tensor, shapes (2 n, 2 n) and (2 n,)): stiffness and force of winds, as the
+        parameters follow them.
+    prior: inverse variance of parameters and gradients.
     """
 
     blocks: "_Blocks"
@@ -125,15 +111,9 @@ class Elimination(NamedTuple):
 class Ambient(NamedTuple):
     """A fit in its ambient wind.
 
-    Attributes
-    ----------
-    solution : Solution
-        With the four gradients after the parameters. Its derivatives lack what turbulence explains,
-        its residuals the estimated turbulence.
-    wind : AmbientWind
-    rms, length : float
-        Of the turbulence, posterior means: m/s and m.
-    elimination : Elimination
+    solution: with the four gradients after the parameters. Its derivatives lack what turbulence
+        explains, its residuals the estimated turbulence.
+    rms, length: of the turbulence, posterior means: m/s and m.
     """
 
     solution: Solution
@@ -146,14 +126,9 @@ class Ambient(NamedTuple):
 class AmbientErrors(NamedTuple):
     """Errors of a fit by its ambient wind.
 
-    Attributes
-    ----------
-    covariance : torch.Tensor, shape (10, 10)
-        Of the parameters' error by turbulence, and by the gradients' prior.
-    ahead : torch.Tensor, shape (10, 10)
-        Covariance of that error with that of a slab `ALONG` further along the path.
-    further : float
-        Largest chi-square (one degree of freedom) of a further vortex anywhere.
+    covariance (10, 10): of the parameters' error by turbulence, and by the gradients' prior.
+    ahead (10, 10): covariance of that error with that of a slab `ALONG` further along the path.
+    further: largest chi-square (one degree of freedom) of a further vortex anywhere.
     """
 
     covariance: torch.Tensor
@@ -166,16 +141,10 @@ def in_ambient_wind(
 ) -> Ambient:
     """The solution of a fit with the ambient wind in its model, linear in it.
 
-    Parameters
-    ----------
-    calm : Solution
-        Without it. Its first ten parameters are those of a pair, without a prior.
-    y, z : torch.Tensor, shape (z, y)
-        Of the residuals, m.
-    dt : float
-        Displacements per wind, as those of `Misfit.slope`, s: 1 of vectors.
-    known : AmbientWind, optional
-        With which the residuals were computed.
+    calm: without it. Its first ten parameters are those of a pair, without a prior.
+    y, z (z, y): of the residuals, m.
+    dt: displacements per wind, as those of `Misfit.slope`, s: 1 of vectors.
+    known: with which the residuals were computed.
     """
     misfit = calm.misfit
     # one scale: weights may state less or more noise than the residuals have
@@ -439,14 +408,9 @@ def _spread(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Covariance (q, q) of sum_x R(x) . t(x), in one plane and between planes `ALONG` apart.
 
-    Parameters
-    ----------
-    response : torch.Tensor, shape (q, 2, z, y)
-        R.
-    parameters : torch.Tensor
-        Of the pair, the wind at which is no part of t.
-    variances : torch.Tensor
-        Of turbulence of each length.
+    response (q, 2, z, y): R.
+    parameters: of the pair, the wind at which is no part of t.
+    variances: of turbulence of each length.
     """
     blocks = _blocks(y, z, 2 if y.numel() > _FEW else 1)
     response = blocks.sums(response).to(response)

@@ -122,12 +122,8 @@ def curvature(solution: Solution, spacing: tuple[float, float]) -> float:
     of the sum of r^2 it takes a quarter of the sum of its squared slopes. Images of nothing in
     common have a slope of their mean, but no minimum.
 
-    Parameters
-    ----------
-    solution : Solution
-        Of images (z, y).
-    spacing : (float, float)
-        Of the pixels along y and z, m.
+    solution: of images (z, y).
+    spacing: of the pixels along y and z, m.
     """
     residual, weight = solution.misfit.residual, solution.weight
     steep = 0.0
@@ -151,10 +147,8 @@ def _neighbours(field: torch.Tensor, axis: int) -> list[torch.Tensor]:
 def change_by_flow(solution: Solution, flow: torch.Tensor) -> np.ndarray:
     """Change (10,) of the parameters by a small flow that the model does not have.
 
-    Parameters
-    ----------
-    flow : torch.Tensor, shape (2, z, y)
-        Along y and z: displacements (m) of images, winds (m/s) of vectors, at the residuals.
+    flow (2, z, y): along y and z: displacements (m) of images, winds (m/s) of vectors, at the
+        residuals.
     """
     misfit = solution.misfit
     flow = flow if misfit.slope.ndim == 3 else flow[:, None]

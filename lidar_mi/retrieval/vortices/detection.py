@@ -18,12 +18,8 @@ _LOG_ODDS = (-6.86, -0.54, 0.12, 0.67, 0.67, 2.33, 10.29)
 class Detection(NamedTuple):
     """What matched filters say of two images.
 
-    Attributes
-    ----------
-    probability : float
-        That at least one vortex of a wake is in the image, if before the images it is 1/2.
-    pair : torch.Tensor, shape (10,), optional
-        Parameters of the likeliest pair; None where no pair lowers the misfit.
+    probability: that at least one vortex of a wake is in the image, if before the images it is 1/2.
+    pair (10,): parameters of the likeliest pair; None where no pair lowers the misfit.
     """
 
     probability: float

@@ -53,19 +53,11 @@ class NearbyFit(NamedTuple):
 class StartedFit:
     """A fit near an expected pair that lacks its second image; see `start_fit`.
 
-    Attributes
-    ----------
-    start : VortexPairFit
-    theta : torch.Tensor, shape (16,)
-        Parameters of the start.
-    uncertain : float
-        Of the displacements at the start, px.
-    make : Builder
-        Of the first image, with the filter of both.
-    first : View
-        The first image, unblurred, at the start.
-    second : Path
-        Of the air to the second one.
+    theta (16,): parameters of the start.
+    uncertain: of the displacements at the start, px.
+    make: of the first image, with the filter of both.
+    first: the first image, unblurred, at the start.
+    second: of the air to the second one.
     """
 
     start: VortexPairFit
@@ -103,15 +95,9 @@ def fit_from(started: StartedFit, make: Builder, limits: Limits, lags: float) ->
     the start's model error if it has one; that of the fit is estimated from the residuals. The last
     step is linear, and so are its residuals.
 
-    Parameters
-    ----------
-    started : StartedFit
-    make : Builder
-        Of both images.
-    limits : callable
-        (parameters, step) -> whether such a step may be tried.
-    lags : float
-        Over which the noise correlates, px.
+    make: of both images.
+    limits: (parameters, step) -> whether such a step may be tried.
+    lags: over which the noise correlates, px.
     """
     known, error = (started.first, started.second), started.start.model_error * make.dt
     departure = error**2 if np.isfinite(error) else None

@@ -20,21 +20,13 @@ from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
 class Acquisition(NamedTuple):
     """How two images were acquired, and the model that is fitted to them.
 
-    Attributes
-    ----------
-    z, y : ndarray
-        Of the pixels, m.
-    dt : float
-        s.
-    noise : float or torch.Tensor, optional
-        Standard deviation of all pixels or of each (z, y).
-    profile : {"lamb_oseen", "burnham_hallock"}
-    frozen : bool
-        Whether the vortices are at rest during dt.
-    times : sequence of ndarray (z, y), optional
-        From `lidar_mi.retrieval.images.beam_times.checked_times`.
-    telescope : (float, float, float), optional
-        x, y, z, m.
+    z, y: of the pixels, m.
+    dt: s.
+    noise: standard deviation of all pixels or of each (z, y).
+    profile {"lamb_oseen", "burnham_hallock"}
+    frozen: whether the vortices are at rest during dt.
+    times (z, y): from `lidar_mi.retrieval.images.beam_times.checked_times`.
+    telescope: x, y, z, m.
     """
 
     z: np.ndarray

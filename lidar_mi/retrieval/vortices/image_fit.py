@@ -190,21 +190,16 @@ def detected_fit(
     probability of a vortex, and the fit starts there, as from an expected pair. There is no search
     and, as in `started_fit`, no mask of non-advected structure.
 
-    Parameters
-    ----------
-    image1, image2, dt, noise, profile, frozen, times, telescope, device
-        As `fit_vortices` takes them.
+    image1, image2, dt, noise, profile, frozen, times, telescope, device: as `fit_vortices` takes
+        them.
+
+    Raises InputError: as `fit_vortices`.
 
     Returns
     -------
     VortexPairFit
         With its `probability`. Not a success where that is below 0.05, or where the fit is not
         accepted; of no fit at all the parameters are those of the likeliest pair.
-
-    Raises
-    ------
-    InputError
-        As `fit_vortices`.
     """
     stack, noise = checked_stack([image1, image2], noise)
     taken = _checked_acquisition(stack, dt, noise, profile, frozen, times, telescope, device)

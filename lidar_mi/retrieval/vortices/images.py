@@ -44,18 +44,11 @@ SAME_BRIGHTNESS = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 class Path(NamedTuple):
     """The path of the air at the pixels at mid-time to one image, tensors (..., z, y).
 
-    Attributes
-    ----------
-    steady : torch.Tensor, shape (10,)
-        The flow in the frame that moves with the pair.
-    middle : torch.Tensor
-        Of the path, in that frame, m.
-    place : torch.Tensor
-        Its end in the image: row and column.
-    time : torch.Tensor
-        Of its end, s; negative to the first image.
-    imaged : ImagedAir, optional
-        Of pixels with times of their own.
+    steady (10,): the flow in the frame that moves with the pair.
+    middle: of the path, in that frame, m.
+    place: its end in the image: row and column.
+    time: of its end, s; negative to the first image.
+    imaged: of pixels with times of their own.
     """
 
     steady: torch.Tensor
@@ -68,16 +61,10 @@ class Path(NamedTuple):
 class View(NamedTuple):
     """One image where it shows the air that is at the pixels at mid-time, tensors (z, y).
 
-    Attributes
-    ----------
-    place : torch.Tensor, shape (2, z, y)
-        Row and column, px.
-    valid : torch.Tensor of bool
-        Whether that is on the image.
-    value, whole : torch.Tensor
-        After the filter, and without one.
-    jacobian : torch.Tensor, shape (10, z, y)
-        Derivatives of `value` with respect to the parameters of the pair.
+    place (2, z, y): row and column, px.
+    valid: whether that is on the image.
+    value, whole: after the filter, and without one.
+    jacobian (10, z, y): derivatives of `value` with respect to the parameters of the pair.
     """
 
     place: torch.Tensor
@@ -317,30 +304,17 @@ def spectrum_of(images: torch.Tensor) -> PowerSpectrum:
 class Builder:
     """Builds the images of the levels, from coarse to fine.
 
-    Attributes
-    ----------
-    pair : torch.Tensor, shape (2, z, y)
-        Normalised to one mean and contrast.
-    bad : torch.Tensor of bool, shape (z, y)
-        Masked pixels.
-    z, y : ndarray
-        m.
-    dt : float
-        s.
-    level : float, optional
-        Standard deviation of the noise, in the unit of `pair`; None: from the spectrum.
-    map : torch.Tensor, optional
-        Of each pixel, in any unit.
-    profile : {"lamb_oseen", "burnham_hallock"}
-    frozen : bool
-    telescope : (float, float, float), optional
-        m, as `image_fit.fit_vortices` takes it.
-    times : PixelTimes, optional
-        None: -dt / 2 and dt / 2.
-    of_first : Splines, optional
-        Of the first image, computed without the second one: its filter is that of both.
-    ambient : AmbientWind, optional
-        In addition to the wind of the pair.
+    pair (2, z, y): normalised to one mean and contrast.
+    bad (z, y): masked pixels.
+    z, y: m.
+    dt: s.
+    level: standard deviation of the noise, in the unit of `pair`; None: from the spectrum.
+    map: of each pixel, in any unit.
+    profile {"lamb_oseen", "burnham_hallock"}
+    telescope: m, as `image_fit.fit_vortices` takes it.
+    times: none: -dt / 2 and dt / 2.
+    of_first: of the first image, computed without the second one: its filter is that of both.
+    ambient: in addition to the wind of the pair.
     """
 
     pair: torch.Tensor

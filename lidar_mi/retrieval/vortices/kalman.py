@@ -21,14 +21,10 @@ def updated(
 ) -> tuple[np.ndarray, np.ndarray]:
     """State and covariance after a measurement.
 
-    Parameters
-    ----------
-    state, covariance : ndarray, shapes (n,) and (n, n)
-        Before.
-    measured, error : ndarray, shapes (m,) and (m, m)
-        The measurement and its covariance; its error is independent of that of the state.
-    observed : ndarray, shape (m, n)
-        Derivatives H of the measurement by the state.
+    state, covariance (ndarray, shapes (n,) and (n, n)): before.
+    measured, error (ndarray, shapes (m,) and (m, m)): the measurement and its covariance; its error
+        is independent of that of the state.
+    observed (m, n): derivatives H of the measurement by the state.
     """
     cross = observed @ covariance
     # K = P H^T S^-1
@@ -69,16 +65,10 @@ def smoothed(
     G = P F^T (F P F^T + Q)^-1 the covariance P + G (P' - F P F^T - Q) G^T is written as
     (1 - G F) P (1 - G F)^T + G (Q + P') G^T.
 
-    Parameters
-    ----------
-    filtered : (n,), (n, n)
-        State and covariance P after the update of this step.
-    transition, noise : ndarray, shape (n, n)
-        F and Q from this step to the next.
-    predicted : ndarray, shape (n,)
-        State of the next step before its update.
-    later : (n,), (n, n)
-        Smoothed state and covariance P' of the next step.
+    filtered (n,), (n, n): state and covariance P after the update of this step.
+    transition, noise (n, n): F and Q from this step to the next.
+    predicted (n,): state of the next step before its update.
+    later (n,), (n, n): smoothed state and covariance P' of the next step.
     """
     state, covariance = filtered
     cross = transition @ covariance

@@ -30,14 +30,10 @@ _MODEL_ERROR = 0.25
 class Likelihoods(NamedTuple):
     """What the filters say of two images.
 
-    Attributes
-    ----------
-    log_ratio : float
-        Natural logarithm of the likelihood of any pair of opposite sense over that of a smooth
-        wind, if residuals are white.
-    pair : torch.Tensor, shape (10,), optional
-        Parameters of the likeliest pair, of no mean wind; m from the first pixel. None where no
-        pair lowers the misfit.
+    log_ratio: natural logarithm of the likelihood of any pair of opposite sense over that of a
+        smooth wind, if residuals are white.
+    pair (10,): parameters of the likeliest pair, of no mean wind; m from the first pixel. None
+        where no pair lowers the misfit.
     """
 
     log_ratio: float
@@ -47,23 +43,16 @@ class Likelihoods(NamedTuple):
 class _Lattice(NamedTuple):
     """Observations and places of vortices of images of one size, and what links them.
 
-    Attributes
-    ----------
-    stride : int
-        Distance of the observations, px.
-    blur, slope : tensors
-        Of rows (observations, rows) and of columns: weights of the pixels in blurred values, and
-        in their slopes, per px.
-    place : torch.Tensor, shape (places, 2)
-        y and z, m from the first pixel.
-    swirl : torch.Tensor, shape (2, places, observations)
-        v and w of vortices of unit circulation.
-    linear, quadratic : torch.Tensor, shapes (3, observations) and (6, observations)
-        Polynomials of y and z, which are from -1 to 1.
-    allowed : torch.Tensor of bool, shape (places, places)
-        Pairs three core radii or more apart, at least one vortex in the image.
-    radius : float
-        m.
+    stride: distance of the observations, px.
+    blur, slope: of rows (observations, rows) and of columns: weights of the pixels in blurred
+        values, and in their slopes, per px.
+    place (places, 2): y and z, m from the first pixel.
+    swirl (2, places, observations): v and w of vortices of unit circulation.
+    linear, quadratic (torch.Tensor, shapes (3, observations) and (6, observations)): polynomials of
+        y and z, which are from -1 to 1.
+    allowed (places, places): pairs three core radii or more apart, at least one vortex in the
+        image.
+    radius: m.
     """
 
     stride: int
@@ -85,17 +74,11 @@ def matched_filter(
     Mean wind, its first and second derivatives and changes of brightness are fitted with every
     pair and without one.
 
-    Parameters
-    ----------
-    pair : torch.Tensor, shape (2, z, y)
-        Finite, with normalised intensity.
-    spacing : (float, float)
-        Along y and z, m.
-    dt : float
-        s.
-    noise : float
-        Standard deviation of the white noise of each image, in their unit.
-    profile : {"lamb_oseen", "burnham_hallock"}
+    pair (2, z, y): finite, with normalised intensity.
+    spacing: along y and z, m.
+    dt: s.
+    noise: standard deviation of the white noise of each image, in their unit.
+    profile {"lamb_oseen", "burnham_hallock"}
     """
     lattice = _lattice(tuple(pair.shape[1:]), spacing, profile)
     along, value = _observations(pair.cpu().float(), lattice, spacing, dt, noise)

@@ -96,14 +96,9 @@ def widened(theta: torch.Tensor, width: float) -> torch.Tensor:
 class Rotation(NamedTuple):
     """Rotation of the air at places about one vortex, tensors (...).
 
-    Attributes
-    ----------
-    dy, dz, square : torch.Tensor
-        From its axis, m, and their squares' sum.
-    unit, omega : torch.Tensor
-        Angular velocity per circulation, m^-2, and itself, s^-1.
-    omega_slope : torch.Tensor
-        Derivative of `omega` by half of `square`, m^-2 s^-1.
+    dy, dz, square: from its axis, m, and their squares' sum.
+    unit, omega: angular velocity per circulation, m^-2, and itself, s^-1.
+    omega_slope: derivative of `omega` by half of `square`, m^-2 s^-1.
     """
 
     dy: torch.Tensor

@@ -29,12 +29,8 @@ _SIDE, _LARGE = 4, 64
 class ModelError:
     """Covariance of each component of the flow's departure from the model.
 
-    Attributes
-    ----------
-    variances : tuple of float
-        a_j, m^2 (of displacements) or m^2 s^-2 (of winds).
-    lengths : tuple of float
-        L_j, steps of the grid.
+    variances: a_j, m^2 (of displacements) or m^2 s^-2 (of winds).
+    lengths: L_j, steps of the grid.
     """
 
     variances: tuple[float, ...] = ()
@@ -66,14 +62,9 @@ class ModelError:
 class Lags:
     """Correlations of fields on a (z, y) grid, by Fourier transforms padded against wrapping.
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Of the grid.
-    like : torch.Tensor
-        Of the type and device to work in.
-    reach : float
-        Lags (steps of the grid) that do not wrap. Default: all of the grid.
+    shape: of the grid.
+    like: of the type and device to work in.
+    reach: lags (steps of the grid) that do not wrap. Default: all of the grid.
     """
 
     shape: tuple[int, int]
@@ -158,24 +149,16 @@ def model_error(
     the correlation sum q(x) . q(x + h); noise that differs from pixel to pixel adds nothing at
     h > 0. The variances a_j >= 0 follow by least squares over the lags.
 
-    Parameters
-    ----------
-    force : torch.Tensor, shape (2, z, y)
-        q; zero where there is no residual.
-    stiffness : torch.Tensor, shape (3, z, y)
-        A: yy, yz, zz.
-    shortest : float
-        Lags below this (steps of the grid) are not used, as noise may correlate over them.
-    change : torch.Tensor, optional
-        Correlation by another cause, of unknown amplitude, by the lags of `lags_used`; see
+    force (2, z, y): q; zero where there is no residual.
+    stiffness (3, z, y): A: yy, yz, zz.
+    shortest: lags below this (steps of the grid) are not used, as noise may correlate over them.
+    change: correlation by another cause, of unknown amplitude, by the lags of `lags_used`; see
         `of_change`.
-    response : Response, optional
-        Of the fit. With it the departure is that before the fit, which absorbs part of it: the
-        residuals lack the expected part of a departure of each length (restricted maximum
-        likelihood: Patterson & Thompson 1971, Biometrika 58, 545-554). Without it, the departure
-        is that in the residuals.
-    tested : bool
-        Whether a departure that is not significant is none; with `change` only.
+    response: of the fit. With it the departure is that before the fit, which absorbs part of it:
+        the residuals lack the expected part of a departure of each length (restricted maximum
+        likelihood: Patterson & Thompson 1971, Biometrika 58, 545-554). Without it, the departure is
+        that in the residuals.
+    tested: whether a departure that is not significant is none; with `change` only.
     """
     lags = lags_used(force)
     observed = lags.autocorrelation(force, (1.0, 1.0))
@@ -256,14 +239,9 @@ def _lengths(shape: tuple[int, int]) -> list[float]:
 class Response:
     """How the parameters of a fit follow a departure d of the flow: by H^-1 sum_x P(x) . d(x).
 
-    Attributes
-    ----------
-    force : torch.Tensor, shape (p, 2, z, y)
-        P: weight times slope times derivative by each parameter.
-    inverse : torch.Tensor, shape (p, p)
-        H^-1.
-    even : torch.Tensor, shape (z, y)
-        Factor by which the forces are multiplied that are correlated; 1 by default.
+    force (p, 2, z, y): P: weight times slope times derivative by each parameter.
+    inverse (p, p): H^-1.
+    even (z, y): factor by which the forces are multiplied that are correlated; 1 by default.
     """
 
     force: torch.Tensor
@@ -338,12 +316,9 @@ def of_change(residual: torch.Tensor, slope: torch.Tensor, valid: torch.Tensor) 
     the lag h they add R(h) sum s(x) . s(x + h) with the residuals' autocorrelation R and the
     weighted slopes s. Texture without long correlation has next to none of this at large lags.
 
-    Parameters
-    ----------
-    residual : torch.Tensor, shape (z, y)
-    slope : torch.Tensor, shape (2, z, y)
-        Weighted.
-    valid : torch.Tensor of bool, shape (z, y)
+    residual (z, y)
+    slope (2, z, y): weighted.
+    valid (z, y)
     """
     lags = lags_used(residual)
     # pairs of pixels at every lag

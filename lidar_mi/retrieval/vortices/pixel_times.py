@@ -72,13 +72,8 @@ def imaged_air(
 ) -> ImagedAir:
     """Where and when image 0 or 1 shows the air that is at places (...) at mid-time.
 
-    Parameters
-    ----------
-    times : PixelTimes
-    steady : torch.Tensor, shape (10,)
-        The flow in the frame that moves with the pair.
-    moving : torch.Tensor, shape (2,)
-        Velocity of that frame, m/s.
+    steady (10,): the flow in the frame that moves with the pair.
+    moving (2,): velocity of that frame, m/s.
     """
     began = wind(steady, y, z, profile)
     speed = began + moving[:, None, None]

@@ -16,19 +16,12 @@ _HUBER = 3.0
 class Misfit(NamedTuple):
     """Residuals of a model and their derivatives, tensors of shape (..., z, y).
 
-    Attributes
-    ----------
-    residual : torch.Tensor
-    jacobian : torch.Tensor, shape (p, ..., z, y)
-        Derivatives of the residual with respect to the parameters.
-    slope : torch.Tensor, shape (2, ..., z, y)
-        Change of the residual per metre (per m/s) of the model flow's error along y, z.
-    valid : torch.Tensor of bool
-        Which residuals exist.
-    variance : torch.Tensor
-        Of the noise, for its effect on the parameters.
-    scatter : torch.Tensor
-        Of the noise in a residual (less than `variance` after a filter).
+    jacobian (p, ..., z, y): derivatives of the residual with respect to the parameters.
+    slope (2, ..., z, y): change of the residual per metre (per m/s) of the model flow's error along
+        y, z.
+    valid: which residuals exist.
+    variance: of the noise, for its effect on the parameters.
+    scatter: of the noise in a residual (less than `variance` after a filter).
     """
 
     residual: torch.Tensor

@@ -21,17 +21,10 @@ _AT_ONCE = 2048
 class Observations(NamedTuple):
     """Observed components of the wind: value = along . wind + noise, tensors of shape (n,).
 
-    Attributes
-    ----------
-    y, z : torch.Tensor
-        m.
-    along : torch.Tensor, shape (2, n)
-        The component observed, times the conversion to the value's unit.
-    value : torch.Tensor
-    weight : torch.Tensor
-        1 / variance, up to a factor.
-    brightness : torch.Tensor, shape (m, n), optional
-        Changes of the values that are no wind, of unknown amplitudes.
+    y, z: m.
+    along (2, n): the component observed, times the conversion to the value's unit.
+    weight: 1 / variance, up to a factor.
+    brightness (m, n): changes of the values that are no wind, of unknown amplitudes.
     """
 
     y: torch.Tensor

@@ -57,36 +57,24 @@ _MEAN_SLOPES = np.array([[0.5, 0, 0.5, 0], [0, 0.5, 0, 0.5]])
 class TrackSettings:
     """What a track assumes, accepts, and when it is lost.
 
-    Attributes
-    ----------
-    wandering : Wandering
-        How much the wake departs from a straight, steady pair.
-    slope, unlike_slope : float
-        Standard deviations of the slopes before a second slab: of their mean over both vortices,
-        and of each from it. 1 allows for crossing angles up to 60 degrees; 0.15 for Crow waves of
-        20 % of the separation, or vortices that converge by 9 degrees.
-    gate : float
-        Probability up to which the normalised innovation is accepted: of correct fits 1 in 1000 is
-        rejected.
-    patience : int
-        The track is lost after so many slabs without an update: 5 at 10 Hz are 0.5 s, the time
-        there is to act.
-    window : int
-        Newest slabs whose innovations are compared with what is stated, see `Track.inflation`.
-    memory : int
-        Slabs that are stored to predict planes behind the newest: 64 at 7.5 m are 480 m.
-    least_updates : int
-        Of a usable track: with two the slopes have no redundancy, and no innovation tested them.
-    circulation_error, place_error : float
-        Largest standard errors of a usable track, relative and in m. An error of 10 % of the
-        circulation leaves 10 % of the rolling moment. With 1 m of place the moment on an elliptic
-        wing of 29 m errs by up to 16 % of its largest (core radius 3 m). Both together leave 19 %,
-        so that four fifths are removed.
+    wandering: how much the wake departs from a straight, steady pair.
+    slope, unlike_slope: standard deviations of the slopes before a second slab: of their mean over
+        both vortices, and of each from it. 1 allows for crossing angles up to 60 degrees; 0.15 for
+        Crow waves of 20 % of the separation, or vortices that converge by 9 degrees.
+    gate: probability up to which the normalised innovation is accepted: of correct fits 1 in 1000
+        is rejected.
+    patience: the track is lost after so many slabs without an update: 5 at 10 Hz are 0.5 s, the
+        time there is to act.
+    window: newest slabs whose innovations are compared with what is stated, see `Track.inflation`.
+    memory: slabs that are stored to predict planes behind the newest: 64 at 7.5 m are 480 m.
+    least_updates: of a usable track: with two the slopes have no redundancy, and no innovation
+        tested them.
+    circulation_error, place_error: largest standard errors of a usable track, relative and in m. An
+        error of 10 % of the circulation leaves 10 % of the rolling moment. With 1 m of place the
+        moment on an elliptic wing of 29 m errs by up to 16 % of its largest (core radius 3 m). Both
+        together leave 19 %, so that four fifths are removed.
 
-    Raises
-    ------
-    InputError
-        A value out of range.
+    Raises InputError: a value out of range.
     """
 
     wandering: Wandering = field(default_factory=Wandering)
@@ -118,22 +106,16 @@ class TrackSettings:
 class Slab:
     """The state of a track in one slab, and its transition from the slab before.
 
-    Attributes
-    ----------
-    x, time : float
-        m and s.
-    state, covariance : ndarray, shapes (24,) and (24, 24)
-        Parameters, slopes and shared errors after the update of the slab, if there was one.
-    predicted : ndarray, shape (24,)
-        Before it.
-    transition, noise : ndarray, shape (24, 24)
-        Derivatives of the prediction by the state of the slab before, and the covariance that the
-        random walks add.
-    innovation : float or None
-        Normalised square of the fit's departure from the prediction, also of a rejected fit; None
-        where there is nothing to compare.
-    by_kind : tuple of float
-        The same of circulations, core radii, places and mean wind alone; empty where it is None.
+    x, time: m and s.
+    state, covariance (ndarray, shapes (24,) and (24, 24)): parameters, slopes and shared errors
+        after the update of the slab, if there was one.
+    predicted (24,): before it.
+    transition, noise (24, 24): derivatives of the prediction by the state of the slab before, and
+        the covariance that the random walks add.
+    innovation: normalised square of the fit's departure from the prediction, also of a rejected
+        fit; None where there is nothing to compare.
+    by_kind: the same of circulations, core radii, places and mean wind alone; empty where it is
+        None.
     """
 
     x: float
@@ -151,17 +133,10 @@ class Slab:
 class Track:
     """A pair of vortices followed from slab to slab.
 
-    Attributes
-    ----------
-    slabs : tuple of Slab
-        The newest last.
-    fit : VortexPairFit
-        The last that was used.
-    settings : TrackSettings
-    updates, rejected : int
-        Fits used, and fits beyond the gate or of a pair of the opposite sense.
-    missed : int
-        Slabs since the last update.
+    slabs: the newest last.
+    fit: the last that was used.
+    updates, rejected: fits used, and fits beyond the gate or of a pair of the opposite sense.
+    missed: slabs since the last update.
     """
 
     slabs: tuple[Slab, ...]
@@ -248,23 +223,16 @@ class Track:
         uncertain by the difference of this slab's mutual induction from the mean over all. Beyond
         the newest slab this is the prediction of the filter.
 
-        Parameters
-        ----------
-        x : float
-            m along the path, anywhere.
-        time : float
-            s; that of the wing's arrival in the plane, say.
+        x: m along the path, anywhere.
+        time: s; that of the wing's arrival in the plane, say.
+
+        Raises InputError: values that are not finite.
 
         Returns
         -------
         VortexPairFit
             With the mean slopes of both vortices. Model error and correlation are those of the last
             fit that was used. Not a success where the track is lost.
-
-        Raises
-        ------
-        InputError
-            Values that are not finite.
         """
         _check_finite(x=x, time=time)
         nearest = int(np.argmin([abs(slab.x - x) for slab in self.slabs]))
@@ -294,10 +262,7 @@ class Track:
     def parameters_at(self, x: ArrayLike, time: ArrayLike) -> np.ndarray:
         """The parameters of `pair_at` alone, in many planes and at many times at once.
 
-        Parameters
-        ----------
-        x, time : array_like, shape (...)
-            m and s; they broadcast.
+        x, time (...): m and s; they broadcast.
 
         Returns
         -------
@@ -341,19 +306,11 @@ def first_track(
 ) -> Track:
     """A track that begins with the fit of one slab.
 
-    Parameters
-    ----------
-    pair : VortexPairFit
-        Accepted, with the port vortex of positive circulation.
-    x, time : float
-        Plane of the slab, m, and time at which the fit is valid, s.
-    settings : TrackSettings, optional
+    pair: accepted, with the port vortex of positive circulation.
+    x, time: plane of the slab, m, and time at which the fit is valid, s.
 
-    Raises
-    ------
-    InputError
-        A fit that is not accepted or has no covariance, circulations of the wrong signs, numbers
-        that are not finite.
+    Raises InputError: a fit that is not accepted or has no covariance, circulations of the wrong
+    signs, numbers that are not finite.
     """
     _check_finite(x=x, time=time)
     if not _is_fit(pair):
@@ -387,21 +344,14 @@ def first_track(
 def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> Track:
     """The track after one more slab.
 
-    Parameters
-    ----------
-    track : Track
-    pair : VortexPairFit or None
-        The slab's fit. None, a fit that is not accepted, or one without a positive definite
+    pair: the slab's fit. None, a fit that is not accepted, or one without a positive definite
         covariance: the track is predicted only. The same holds for a fit beyond the gate or of
         circulations of the wrong signs, which counts as rejected. After `patience` such slabs the
         track is lost, and the next accepted fit begins a new one, whose counts of fits begin anew.
-    x, time : float
-        Plane of the slab, m, and time at which its fit is valid, s, after that of the last slab.
+    x, time: plane of the slab, m, and time at which its fit is valid, s, after that of the last
+        slab.
 
-    Raises
-    ------
-    InputError
-        Time that does not advance, numbers that are not finite, another profile.
+    Raises InputError: time that does not advance, numbers that are not finite, another profile.
     """
     _check_finite(x=x, time=time)
     if not time > track.time:

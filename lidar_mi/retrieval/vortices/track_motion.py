@@ -41,39 +41,27 @@ class Wandering:
 
     A walk per root of metre grows to 7 times its value over 50 m, about a separation.
 
-    Attributes
-    ----------
-    circulation : float
-        Of each circulation along the path, relative, m^-1/2: 1.4 % over 50 m. Simulated vortices
-        in weak turbulence vary along their axis by some per cent (Hennemann and Holzäpfel 2011,
-        J. Aerosp. Eng. 24).
-    log_radius : float
-        Of each core radius along the path, relative, m^-1/2: 3.5 % over 50 m.
-    place : float
-        Of each coordinate along the path, m^1/2: curvature finer than the slabs resolve, 7 cm over
-        50 m.
-    slope : float
-        Of each slope along the path, m^-1/2: a sine of amplitude A and wave number k changes its
-        slope by A k over a quarter of its wavelength. 0.02 over 100 m are those of Crow waves of
-        3 % of the separation (8.6 separations of 47 m).
-    dissipation : float
-        Of turbulent energy, m^2 s^-3: the mean wind over the pair varies along the path as
+    circulation: of each circulation along the path, relative, m^-1/2: 1.4 % over 50 m. Simulated
+        vortices in weak turbulence vary along their axis by some per cent (Hennemann and Holzäpfel
+        2011, J. Aerosp. Eng. 24).
+    log_radius: of each core radius along the path, relative, m^-1/2: 3.5 % over 50 m.
+    place: of each coordinate along the path, m^1/2: curvature finer than the slabs resolve, 7 cm
+        over 50 m.
+    slope: of each slope along the path, m^-1/2: a sine of amplitude A and wave number k changes its
+        slope by A k over a quarter of its wavelength. 0.02 over 100 m are those of Crow waves of 3
+        % of the separation (8.6 separations of 47 m).
+    dissipation: of turbulent energy, m^2 s^-3: the mean wind over the pair varies along the path as
         Kolmogorov's transverse structure function at 50 m, 8/3 (dissipation r)^(2/3), and in the
         air that drifts with the wake as that of fluid particles, 6.5 dissipation t. 1e-5 is a calm
         atmosphere at cruise or in the evening; 1e-3 a convective boundary layer.
-    decay : float
-        Unknown relative rate of both circulations, s^-1: between those of slow diffusion, about
+    decay: unknown relative rate of both circulations, s^-1: between those of slow diffusion, about
         1/400 s^-1, and of rapid decay, about 1/60 s^-1 (Holzäpfel 2003, J. Aircr. 40, 323-331).
         Enters as rate times time in predictions: what changes steadily is no random walk.
-    departure : float
-        Unknown departure of each vortex's velocity from the drift of a straight pair, m/s, likewise
-        times time: curved and oblique vortices induce others. Crow waves of 3 % of the separation
-        grow by 0.8 per time of descent (Crow 1970), 0.035 m/s.
+    departure: unknown departure of each vortex's velocity from the drift of a straight pair, m/s,
+        likewise times time: curved and oblique vortices induce others. Crow waves of 3 % of the
+        separation grow by 0.8 per time of descent (Crow 1970), 0.035 m/s.
 
-    Raises
-    ------
-    InputError
-        A value that is not a number of 0 or more.
+    Raises InputError: a value that is not a number of 0 or more.
     """
 
     circulation: float = 0.002
@@ -105,11 +93,8 @@ def advected(
     First along the slopes at the same time, then with the drift of the pair in that plane: exact
     for straight vortices that are parallel, as the drift depends on their distance alone.
 
-    Parameters
-    ----------
-    state : ndarray, shape (14,)
-    dx, dt : float
-        m and s; of either sign.
+    state (14,)
+    dx, dt: m and s; of either sign.
 
     Returns
     -------

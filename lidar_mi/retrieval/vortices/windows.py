@@ -27,19 +27,12 @@ def vortex_windows(
 ) -> Displacement:
     """The wind of a fitted pair at the windows' centres, as displacement in dt.
 
-    Parameters
-    ----------
-    image1, image2 : torch.Tensor, shape (z, y)
-    template, search, stride : int
-        Pixels; only the positions of the vectors depend on them.
-    axes : (array, array)
-        z and y of the pixels, m.
-    dt : float
-        s.
-    noise : float or torch.Tensor, optional
-        As `fit_vortices`.
-    times : sequence of ndarray, optional
-        Of the pixels, from `lidar_mi.retrieval.images.beam_times.checked_times`.
+    image1, image2 (z, y)
+    template, search, stride: pixels; only the positions of the vectors depend on them.
+    axes (array, array): z and y of the pixels, m.
+    dt: s.
+    noise: as `fit_vortices`.
+    times: of the pixels, from `lidar_mi.retrieval.images.beam_times.checked_times`.
 
     Returns
     -------

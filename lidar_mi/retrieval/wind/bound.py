@@ -31,15 +31,12 @@ def wind_bound(
     uses more than a template and may be better. Noise below 0.001 of the map's median is raised to
     that value.
 
+    Raises InputError: as `retrieve_wind`.
+
     Returns
     -------
     xr.Dataset, dims (z, y)
         `v_bound`, `w_bound`.
-
-    Raises
-    ------
-    InputError
-        As `retrieve_wind`.
     """
     dt = positive("dt", dt)
     (image1, image2), checked = checked_stack([image1, image2], noise)

@@ -63,15 +63,9 @@ def winds(
     Standard errors and correlations are NaN where there is no displacement or the method gives
     none.
 
-    Parameters
-    ----------
-    displacement : Displacement
-    axes : sequence of str
-        Of its components.
-    steps : sequence of float
-        Pixel spacing along them, m.
-    dt : float or ndarray
-        Of all vectors or of each, s.
+    axes: of its components.
+    steps: pixel spacing along them, m.
+    dt: of all vectors or of each, s.
     """
     names = {COMPONENTS[axis]: (number, axis) for number, axis in enumerate(axes)}
     names = dict(sorted(names.items()))

@@ -15,27 +15,17 @@ from lidar_mi.retrieval.vortices.windows import vortex_windows
 class Method:
     """A way to find displacements.
 
-    Attributes
-    ----------
-    find : callable
-        (image1, image2, template, search, stride, **options) -> Displacement, in pixels.
-    score : (str, str)
-        What its `Displacement.score` is: name in the data set, meaning.
-    options : tuple of str
-        Keywords of `retrieve_wind` it takes, `min_correlation` and `noise` among them.
-    centred : bool
-        Vectors belong to the windows' centres, not half their displacement further on.
-    local : bool
-        A vector depends on its window only, and is flagged without texture there or as an outlier
-        among its neighbours. A field fitted as a whole has standard errors of its own.
-    reach : int
-        Range of its first displacements over that of its windows. 0: the method checks by itself
+    find: (image1, image2, template, search, stride, **options) -> Displacement, in pixels.
+    score: what its `Displacement.score` is: name in the data set, meaning.
+    options: keywords of `retrieve_wind` it takes, `min_correlation` and `noise` among them.
+    centred: vectors belong to the windows' centres, not half their displacement further on.
+    local: a vector depends on its window only, and is flagged without texture there or as an
+        outlier among its neighbours. A field fitted as a whole has standard errors of its own.
+    reach: range of its first displacements over that of its windows. 0: the method checks by itself
         whether the images are related.
-    bootstrapped : bool
-        Standard errors are from the retrieval of a known motion (`bootstrap`). Else the method
-        states its errors by itself.
-    name : str
-        As data sets have it.
+    bootstrapped: standard errors are from the retrieval of a known motion (`bootstrap`). Else the
+        method states its errors by itself.
+    name: as data sets have it.
     """
 
     find: Callable[..., Displacement]

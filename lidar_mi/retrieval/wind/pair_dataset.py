@@ -22,16 +22,10 @@ _AXES = ("z", "y")
 class Vectors(NamedTuple):
     """What was retrieved from images.
 
-    Attributes
-    ----------
-    displacement : Displacement
-        With all flags.
-    texture : Texture
-        Of the templates of image 1.
-    pattern : Standing
-        The faint pattern at rest whose bias was removed.
-    copy : Copy
-        Of one image in the other, at rest, that was removed.
+    displacement: with all flags.
+    texture: of the templates of image 1.
+    pattern: the faint pattern at rest whose bias was removed.
+    copy: of one image in the other, at rest, that was removed.
     """
 
     displacement: Displacement

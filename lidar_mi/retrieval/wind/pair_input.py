@@ -18,22 +18,13 @@ from lidar_mi.retrieval.wind.options import WindowSizes
 class PairInput(NamedTuple):
     """Two images of the same air, or a burst of more.
 
-    Attributes
-    ----------
-    images : list of xr.DataArray, dims (z, y)
-        On one grid.
-    pixels : list of torch.Tensor, shape (z, y)
-        Their values.
-    dt : float
-        From reference time to reference time, s.
-    noise : float or torch.Tensor, optional
-        Standard deviation in image 1.
-    times : list of np.ndarray, shape (z, y), optional
-        When each pixel of two images was seen, s from its image's reference time.
-    blur, blur_px : float
-        Standard deviation of the instrument's blur, m and px.
-    same : str
-        Which images are the same, bit for bit, in words; empty: none.
+    images (z, y): on one grid.
+    pixels (z, y): their values.
+    dt: from reference time to reference time, s.
+    noise: standard deviation in image 1.
+    times (z, y): when each pixel of two images was seen, s from its image's reference time.
+    blur, blur_px: standard deviation of the instrument's blur, m and px.
+    same: which images are the same, bit for bit, in words; empty: none.
     """
 
     images: list[xr.DataArray]

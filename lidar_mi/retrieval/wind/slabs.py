@@ -43,18 +43,13 @@ def wind_of_slab(
 ) -> tuple[xr.Dataset, Flow | None]:
     """The wind by the method "variational", and the flow from which the next one may start.
 
-    Parameters
-    ----------
-    image1, image2 : DataArray, dims (z, y)
-    dt : float
-        s.
-    start : Flow or ExpectedFlow, optional
-        The flow expected, see `Flow.moved`, or what `expected_wind` made of it and of image 1: the
-        retrieval starts there, with the prior and the noise learnt before, and from scratch only
-        where the images do not fit to these. They are not searched again for structure at rest,
-        changes of illumination and unrelated air.
-    **options
-        Of `retrieve_wind`.
+    image1, image2 (z, y)
+    dt: s.
+    start: the flow expected, see `Flow.moved`, or what `expected_wind` made of it and of image 1:
+        the retrieval starts there, with the prior and the noise learnt before, and from scratch
+        only where the images do not fit to these. They are not searched again for structure at
+        rest, changes of illumination and unrelated air.
+    **options: of `retrieve_wind`.
 
     Returns
     -------

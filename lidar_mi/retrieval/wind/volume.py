@@ -251,16 +251,10 @@ def without_attenuation(
     The brightness is fitted to the means of the gates, so that attenuation through the volume
     causes no displacement. Non-finite voxels stay so.
 
-    Parameters
-    ----------
-    volumes : sequence of torch.Tensor, shape (x, z, y)
-    noise : float or torch.Tensor, optional
-        Of a voxel of the first volume, in its unit.
+    volumes (x, z, y)
+    noise: of a voxel of the first volume, in its unit.
 
-    Raises
-    ------
-    InputError
-        A volume that is not bright in some gate; noise below 0.
+    Raises InputError: a volume that is not bright in some gate; noise below 0.
     """
     brightness = [_brightness(volume, n) for n, volume in enumerate(volumes, 1)]
     if noise is not None:
