@@ -68,8 +68,8 @@ class FlightData:
     """The data sets of an encounter's flights.
 
     series (flight, time): states, loads and commands.
-    track (slab): estimates, track and truth; None without a lidar.
-    slabs (slab, z, y): images and wind vectors; None without a lidar.
+    track (slab) and (source, slab): estimates, track and truth; None without a lidar.
+    slabs (slab, z, y) and (slab, image_z, image_y): images and wind vectors; None without a lidar.
     """
 
     series: xr.Dataset

@@ -33,10 +33,10 @@ _LARGEST_DECAY = 0.8  # of which `BEFORE` samples hold 87 %
 class FilterFit:
     """A filter and its noise.
 
-    parameters, covariance (4,): c, G, r, s. A decay at the edge of what is allowed, 0, has no
-        error.
+    parameters, covariance (4,) and (4, 4): c, G, r, s. A decay at the edge of what is allowed, 0,
+        has no error.
     after: samples after a sample that have a weight.
-    lags, lags_covariance (p,): a.
+    lags, lags_covariance (p,) and (p, p): a.
     innovations (n,): e; NaN where input or output are missing.
     count: innovations.
     """

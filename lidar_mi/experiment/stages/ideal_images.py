@@ -45,8 +45,8 @@ def ideal_scan(
 ) -> xr.Dataset:
     """The air as the beams of a scan see it, where they were reported to look, on the nodes.
 
-    air (z, y): images of the air on the plan's nodes or around them, at equally spaced times (s)
-        from the scan's reference time.
+    air (z, y) or (time, z, y): images of the air on the plan's nodes or around them, at equally
+        spaced times (s) from the scan's reference time.
     plan: with its true and its reported beams. Without beams: all at once, to the nodes.
     lidar: whose beams average the air, see `blur_by_beam`. Default: beams without width.
     depth: of the gate, m.
