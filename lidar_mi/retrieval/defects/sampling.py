@@ -42,7 +42,8 @@ _AROUND, _CLIPPED = 8.0, 4.0
 _ORDINATES, _LEAKED = 10, 2
 # Longest period, px, of which lines of one kind resolve the air.
 _THINNED = 4
-# Largest mean square of second differences between samples that are interpolated, over that at one.
+# Mean square of second differences between samples over that at them: 0 but for rounding where
+# lines are interpolated linearly, 1 where all are alike. Half-way.
 _BETWEEN = 0.5
 
 
