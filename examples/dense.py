@@ -19,6 +19,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.inversion.extinction import LayeredAir, invert_extinction
 from lidar_mi.rendering.backscatter import ScanRenderer
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.extinction.klett import klett
@@ -33,6 +34,7 @@ LIDAR = BackscatterLidar(
 )
 PLAN = ScanPlan(np.zeros(1), np.zeros(1), NEAR, FAR, "spherical", GATES, 0.0)
 DROPLETS = {"type": "hg", "g": 0.85}
+AROUND = ScatteringAir(1e-6, DROPLETS, 1.0)
 BRIGHTEST, BACKGROUND = 1e5, 10.0  # counts of a gate
 
 
@@ -59,7 +61,7 @@ def observe(truth: xr.DataArray, samples: int, seed: int) -> tuple[np.ndarray, f
     sides = np.array([-120.0, 120.0])
     air = truth.expand_dims(y=sides, z=sides).transpose("x", "y", "z").copy()
     use_variant("llvm_ad_mono")
-    renderer = ScanRenderer(air, PLAN, LIDAR, 1e-6, DROPLETS, 1.0, settings(samples))
+    renderer = ScanRenderer(air, PLAN, LIDAR, AROUND, settings(samples))
     scan = renderer.render(air, PLAN, seed)
     signal = scan["S0"].values.astype(float)
     per_signal = BRIGHTEST / signal.max()

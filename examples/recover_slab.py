@@ -21,6 +21,7 @@ from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, scene_dict
+from lidar_mi.rendering.phase import ScatteringAir
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.schema import reading as config
@@ -44,10 +45,10 @@ def recover(truth: xr.DataArray, steps: int, samples: int, learning_rate: float 
     The first guess is the solution of the lidar equation for the image: the blurred extinction.
     """
     (plan,) = plan_scans(Scan(), truth["y"].values, truth["z"].values, [0.0])
-    phase = {"type": "rayleigh_polarized"}
+    around = ScatteringAir(ENVIRONMENT, {"type": "rayleigh_polarized"}, 1.0)
     settings = RenderSettings(samples_per_beam=samples, max_order=1)
     air = extrude(truth, plan, LIDAR)
-    scene = mi.load_dict(scene_dict(air, plan, LIDAR, ENVIRONMENT, phase, 1.0, settings))
+    scene = mi.load_dict(scene_dict(air, plan, LIDAR, around, settings))
     parameters = mi.traverse(scene)
 
     image = np.array(mi.render(scene, spp=64 * samples, seed=1))[..., 0]

@@ -6,6 +6,7 @@ description that the package index would not show.
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -64,6 +65,16 @@ def _unpacked(folder, installed):
 def _files(folder):
     packed = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     return {name for name in packed if name.startswith("lidar_mi/")}
+
+
+def test_every_folder_of_modules_is_packed():
+    """As listed: building a wheel takes long."""
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        packages = tomllib.load(file)["tool"]["setuptools"]["packages"]
+    folders = {path.parent for room in ROOMS for path in (ROOT / room).rglob("__init__.py")}
+    names = {".".join(folder.relative_to(ROOT).parts) for folder in folders}
+    expected = {n if n.startswith("lidar_mi") else f"lidar_mi.{n}" for n in names}
+    assert expected == {name for name in packages if name != "lidar_mi.scenes.instruments"}
 
 
 @pytest.mark.slow

@@ -15,19 +15,29 @@ SKIPPED = "skipped, as the computer was busy with earlier slabs"
 class Estimate:
     """Wind and vortices of one slab of air, from the two scans that hold it.
 
-    time: when the wind and the vortices are valid: half way between both scans, s.
-    delivered: time at which the vortices are delivered, from the second scan's reference time on,
-        s.
-    x: plane of the slab along the flight path, m.
-    wind (z, y): v, w (m/s) with v_stderr, w_stderr, vw_correlation and flag; where there is a
+    Attributes
+    ----------
+    time : float
+        When the wind and the vortices are valid: half way between both scans, s.
+    delivered : float
+        Time at which the vortices are delivered, from the second scan's reference time on, s.
+    x : float
+        Plane of the slab along the flight path, m.
+    wind : xr.Dataset or None
+        v, w (z, y), m/s, with v_stderr, w_stderr, vw_correlation and flag; where there is a
         Doppler lidar, u, v, w and their covariance from both (`combined.combine`). None before a
         second scan.
-    pair: the vortices in the slab's plane, at `time`; look at its `success` and `reasons` first.
-    flags: limitations of the estimate; empty if there are none.
-    seconds: duration of each part of the estimate, s, without the rendering.
-    lines (line): speeds along the lines of sight, in the frame of the aircraft half way between
-        both scans. None without a Doppler lidar.
-    wind_delivered: time at which the wind is delivered, s; None: with the vortices.
+    pair : VortexPairFit or None
+        The vortices in the slab's plane, at `time`; look at its `success` and `reasons` first.
+    flags : tuple of str
+        Limitations of the estimate; empty if there are none.
+    seconds : mapping
+        Duration of each part of the estimate, s, without the rendering.
+    lines : xr.Dataset or None
+        Speeds along the lines of sight (line), in the frame of the aircraft half way between both
+        scans. None without a Doppler lidar.
+    wind_delivered : float or None
+        Time at which the wind is delivered, s; None: with the vortices.
     """
 
     time: float
