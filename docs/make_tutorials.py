@@ -30,7 +30,7 @@ SEEN = {
     ),
     "own_lidar": (
         "Backscatter image with the noise of the detector, and the retrieved wind",
-        "Error and fraction of valid vectors against the divergence of the beam, at two ranges",
+        "Error and fraction of valid vectors against the energy of a pulse, at two ranges",
     ),
     "own_controller": ("Bank angles of four flights through the wake, against time",),
     "own_scene": (
