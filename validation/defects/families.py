@@ -93,7 +93,7 @@ def denoised(random, air, images):
 # --- sampling
 
 
-def _enlarged(air: Air, random, factors, order: int):
+def _enlarged(air: Air, random, factors, order: int | Literal["lanczos"]):
     """What fewer pixels see, enlarged: the air's places and motion are those of the new pixels."""
     small = [-(-n // f) for n, f in zip(air.shape, factors, strict=True)]
     places = np.meshgrid(
@@ -104,11 +104,21 @@ def _enlarged(air: Air, random, factors, order: int):
     places = np.stack(places).astype(float) + np.reshape(middle, (-1, *[1] * len(small)))
     images = air.noisy(random, air.at(0, places), air.at(1, places))
     at = [(np.arange(n) - m) / f for n, m, f in zip(air.shape, middle, factors, strict=True)]
+    if order == "lanczos":
+        down, across = (_lanczos(a, n) for a, n in zip(at, small, strict=True))
+        return [down @ image @ across.T for image in images]
     if order == 0:
         grid = np.meshgrid(*(np.rint(a).astype(int) for a in at), indexing="ij")
         return [image[tuple(grid)] for image in images]
     grid = np.meshgrid(*at, indexing="ij")
     return [ndimage.map_coordinates(i, grid, order=order, mode="nearest") for i in images]
+
+
+def _lanczos(at: np.ndarray, number: int) -> np.ndarray:
+    """Weights (places, samples) of a kernel of 6 samples."""
+    off = at[:, None] - np.arange(number)
+    weights = np.where(np.abs(off) < 3, np.sinc(off) * np.sinc(off / 3), 0.0)
+    return weights / weights.sum(1, keepdims=True)
 
 
 def repeated(random, air):
@@ -124,6 +134,12 @@ def repeated_rows(random, air):
 def interpolated(random, air):
     air = _coarse(random, air)
     return air, _enlarged(air, random, [random.uniform(1.5, 3.0)] * 2, int(random.choice([1, 3])))
+
+
+def windowed(random, air):
+    """Other kernels and factors than `interpolated`, and other ones by axis."""
+    air = _coarse(random, air)
+    return air, _enlarged(air, random, random.uniform(1.2, 3.5, 2), "lanczos")
 
 
 def _coarse(random, air: Air) -> Air:
@@ -195,11 +211,16 @@ def quantised(random, air, images):
     return _quantised([100 * image for image in images], random.uniform(5, 40))
 
 
-def _quantised(images: Images, step: float) -> Images:
-    """Cosine transforms of blocks of 8 px, in steps that grow with the wave number."""
-    steps = step * (1 + np.add.outer(np.arange(8), np.arange(8)) / 4)
+def other_blocks(random, air, images):
+    side = int(random.choice([4, 16]))
+    return _quantised([100 * image for image in images], random.uniform(5, 40), side)
+
+
+def _quantised(images: Images, step: float, side: int = 8) -> Images:
+    """Cosine transforms of blocks, in steps that grow with the wave number."""
+    steps = step * (1 + 2 / side * np.add.outer(np.arange(side), np.arange(side)))
     for image in images:
-        blocks = _in_blocks(image, 8)
+        blocks = _in_blocks(image, side)
         waves = fft.dctn(blocks, axes=(2, 3), norm="ortho")
         blocks[:] = np.round(fft.idctn(steps * np.round(waves / steps), axes=(2, 3), norm="ortho"))
     return images
@@ -464,6 +485,7 @@ FAMILIES = (
     Family(
         "sampling", "interpolated", "enlarged by 1.5 to 3, linear or cubic", "judge", interpolated
     ),
+    Family("sampling", "windowed", "enlarged by 1.2 to 3.5, Lanczos", "judge", windowed),
     Family("sampling", "nearest gates", "gates of a scan on a grid", "judge", nearest_gates),
     Family(
         "compression",
@@ -478,6 +500,13 @@ FAMILIES = (
         "cosines of blocks of 8 px in steps",
         "judge",
         of_images(quantised),
+    ),
+    Family(
+        "compression",
+        "other blocks",
+        "cosines of blocks of 4 or 16 px in steps",
+        "judge",
+        of_images(other_blocks),
     ),
     Family("compression", "copied and encoded", "both", "judge", of_images(copied_and_encoded)),
     Family("noise", "correlated", "1 to 6 %, Gaussian of 0.6 to 1.8 px", "build", correlated),
