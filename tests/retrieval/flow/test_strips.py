@@ -48,6 +48,26 @@ def changing_images(columns, rows, seed):
     return images, level
 
 
+@pytest.mark.slow
+def test_few_steps_solve_a_system_where_texture_fades(monkeypatch):
+    """The flow there follows from texture strips away: narrow overlaps take a hundred steps."""
+    images, level = changing_images(columns=60, rows=560, seed=2)
+    numbers, solve = [], strips.conjugate_gradients
+
+    def counted(applied, *system):
+        numbers.append(0)
+
+        def once(flows):
+            numbers[-1] += 1
+            return applied(flows)
+
+        return solve(once, *system)
+
+    monkeypatch.setattr(strips, "conjugate_gradients", counted)
+    variational(*images, noise=level, settings=IN_STRIPS)
+    assert len(numbers) > 20 and 2 < max(numbers) < 40
+
+
 @pytest.fixture(scope="module")
 def systems():
     """The arguments of the steps at both levels of an image of 4 strips, and their posteriors."""
