@@ -368,9 +368,10 @@ def _period(
         return period, None
     if energy is None:
         return period, 0 if whole == 2 else None
-    # between samples that are interpolated linearly there is no second difference
+    # between samples that are interpolated linearly there is no second difference; two lines of
+    # each block of a codec have one
     means = [np.mean(energy[start::whole]) for start in range(whole)]
-    if whole > 2 and min(means) > _BETWEEN * max(means):
+    if whole > 2 and sorted(means)[-2] > _BETWEEN * max(means):
         return period, None
     return period, (int(np.argmax(means)) + 1) % whole
 

@@ -154,6 +154,28 @@ def test_blocks_of_cosines_have_no_samples(seed):
     assert structure.spoilt and structure.steps == (1, 1)
 
 
+@pytest.mark.parametrize("side", [3, 4])
+def test_planes_of_blocks_have_no_samples(side):
+    """Mean and slopes of each block remain: no line between its edges has second differences."""
+
+    def planes(image):
+        rows, columns = (side * (n // side) for n in image.shape)
+        blocks = image[:rows, :columns].reshape(rows // side, side, -1, side).swapaxes(1, 2)
+        off = np.arange(side) - (side - 1) / 2
+        slopes = [(blocks * part).sum((2, 3)) for part in (off[:, None], off)]
+        mean = blocks.mean((2, 3), keepdims=True)
+        size = side * (off**2).sum()
+        flat = mean + sum(
+            slope[..., None, None] / size * part
+            for slope, part in zip(slopes, (off[:, None], off), strict=True)
+        )
+        return flat.swapaxes(1, 2).reshape(rows, columns)
+
+    x = found([planes(image) for image in pair(1, length=3.0)])
+    assert x.said.count(f"a period of {side} px") == 2
+    assert x.spoilt and not x.thinned
+
+
 def test_gates_on_a_grid_are_flagged():
     """Each pixel has the value of the nearest gate of a scan from 40 m below."""
     off = np.indices(SHAPE) + np.reshape([80.0, -56.0], (2, 1, 1))
