@@ -41,12 +41,6 @@ class Pair:
     vortices: tuple[Vortex, ...]
     noise: float = 0.0
 
-    def beyond_cores(self, radii: float = 2.0) -> np.ndarray:
-        """Which pixels (z, y) lie further than so many core radii from both cores."""
-        z, y = np.meshgrid(self.v["z"], self.v["y"], indexing="ij")
-        distance = [np.hypot(y - o.y, z - o.z) / o.core_radius for o in self.vortices]
-        return np.min(distance, axis=0) > radii
-
 
 def vortex_pair_images(
     noise: float = 0.0,

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import torch
 from torch.nn.functional import pad
@@ -140,16 +139,8 @@ class Mesh:
 
     def slopes(self, coefficients: torch.Tensor) -> list[torch.Tensor]:
         """First derivatives along every axis."""
-        return [self.field(coefficients, order) for order in self._first]
-
-    def slopes_transposed(self, values: Sequence[torch.Tensor]) -> torch.Tensor:
-        """The transpose of `slopes`: coefficients from one field for each axis."""
-        pairs = zip(values, self._first, strict=True)
-        return reduce(torch.add, (self.transposed(part, order) for part, order in pairs))
-
-    @property
-    def _first(self) -> list[tuple[int, ...]]:
-        return [tuple(int(a == axis) for a in range(self.dims)) for axis in range(self.dims)]
+        orders = [tuple(int(a == axis) for a in range(self.dims)) for axis in range(self.dims)]
+        return [self.field(coefficients, order) for order in orders]
 
     def fitted(self, flow: torch.Tensor) -> torch.Tensor:
         """Coefficients of the splines nearest to a flow (components, *shape)."""
