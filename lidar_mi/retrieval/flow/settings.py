@@ -61,7 +61,7 @@ class StripSettings:
     solved_core, solved_overlap : int
         The same for the preconditioner. Where texture fades a flow is informed from far away: an
         overlap of 12 takes up to 60 steps, one of 4 more than 200, in images of 200 x 800 to
-        2400 x 120 px.
+        120 x 2400 px.
     tolerance : float
         Residual over the first one at which conjugate gradients end: each round solves again.
     loose : float
