@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+import lidar_mi
+
 ROOT = Path(__file__).parents[1]
 PYTHON_BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LINES_OF_SHELLS = re.compile(r"^[%!].*$", re.MULTILINE)
@@ -44,8 +46,7 @@ def imported(tree):
             for name in node.names:
                 if name.name.partition(".")[0] == "lidar_mi":
                     module = importlib.import_module(name.name)
-                    whole = importlib.import_module("lidar_mi")
-                    found[name.asname or "lidar_mi"] = module if name.asname else whole
+                    found[name.asname or "lidar_mi"] = module if name.asname else lidar_mi
         elif isinstance(node, ast.ImportFrom) and not node.level:
             if (node.module or "").partition(".")[0] == "lidar_mi":
                 module = importlib.import_module(node.module)
