@@ -229,9 +229,9 @@ def killer(cluster, random, every):
 
 @pytest.mark.slow
 def test_workers_and_clients_that_are_killed_cost_nothing(tmp_path):
-    # 120 points; a worker is killed every 16 of them, which no point meets three times
+    # 200 points; a worker is killed every 16 of them, which no point meets three times
     sweep = {"retrieval.template": list(range(4, 14)), "platform.dt": ["0.05 s", "0.1 s"]}
-    path = described(tmp_path, sweep=sweep, members=6)
+    path = described(tmp_path, sweep=sweep, members=10)
     random = np.random.default_rng(1)
     settings = {"distributed.scheduler.allowed-failures": 10**6}
     program = f"""
@@ -240,7 +240,7 @@ if __name__ == "__main__":
     run_campaign({str(path)!r}, {str(tmp_path / "out")!r})
 """
     (tmp_path / "start.py").write_text(program)
-    for some in (20, 40):  # the client is killed twice
+    for some in (40, 80):  # the client is killed twice
         process = subprocess.Popen([sys.executable, tmp_path / "start.py"], start_new_session=True)
         while len(list((tmp_path / "out").glob("points/*/*/metrics.json"))) < some:
             assert process.poll() is None
@@ -248,7 +248,7 @@ if __name__ == "__main__":
         process.kill()
         process.wait()
     done = campaign_status(tmp_path / "out").done
-    assert 0 < done < 120
+    assert 0 < done < 200
     with (
         dask.config.set(settings),
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
